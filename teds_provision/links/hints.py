@@ -1,4 +1,4 @@
-"""What a node's initial NFC message says beside who it is: its charge, and where it is in the air. Hints, all of it."""
+"""Hints from a node's initial NFC message beside its identity: its charge, and its address over the air."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ ChargingState = Literal["full", "charging", "wanted", "no", "error"]
 
 @dataclass(frozen=True)
 class Charging:
-    """What a node says of its battery and of being charged (NFC Forum WLC 2.0); unauthenticated.
+    """A node's report about its battery and charging (NFC Forum WLC 2.0); unauthenticated.
 
     ``battery_percent`` 0 to 100; ``battery_celsius`` and ``node_celsius`` whole degrees; ``raw`` every field as it
     came, by name: power, voltage and current have no public unit.
@@ -49,7 +49,7 @@ class Charging:
 
 @dataclass(frozen=True)
 class BleAddress:
-    """A Bluetooth LE device address, 6 octets as people write them; ``random`` as its type says."""
+    """A Bluetooth LE device address, 6 octets as people write them; ``random`` is its type."""
 
     octets: bytes
     random: bool

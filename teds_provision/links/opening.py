@@ -1,4 +1,4 @@
-"""The registry of links, and the one way to open a port: a place ``LINK:WHERE``, e.g. ``can:socketcan:can0``.
+"""The registry of links, and the only way to open a port: a place ``LINK:WHERE``, e.g. ``can:socketcan:can0``.
 
 A new link touches its own folder, a line of :data:`LINKS`, and a check of the doctor. Its library is loaded when its
 first port is opened.
@@ -19,7 +19,7 @@ from teds_provision.links.ports import BLE, CAN, NFC, Capabilities, LinkSettings
 class LinkKind:
     """One kind of link: ``module`` has a function ``open_port(where, trace)``; ``example`` is a place of that kind.
 
-    ``needs`` is what to say where the place is left out and there is no default.
+    ``needs`` is the message if the place is left out and there is no default.
     """
 
     name: str
@@ -46,9 +46,9 @@ LINKS: Final = {
 
 
 def open_place(place: str, trace: Trace | None = None) -> Port:
-    """Open the reader or bus at ``LINK:WHERE``; raises NoReaderError with the cure, or UsageError.
+    """Open the reader or bus at ``LINK:WHERE``; raises NoReaderError with the remedy, or UsageError.
 
-    What goes over it is written to ``trace``.
+    Its frames are written to ``trace``.
     """
     name, _, where = place.partition(":")
     kind = LINKS.get(name)
@@ -76,7 +76,7 @@ def open_port(settings: LinkSettings) -> Port:
 
 
 def open_ports(settings: LinkSettings) -> list[Port]:
-    """Open every reader or bus that ``settings`` name; where one does not open, none stays open."""
+    """Open every reader or bus that ``settings`` name; if one fails to open, none stays open."""
     ports: list[Port] = []
     try:
         for place in settings.places:

@@ -18,10 +18,10 @@ NoticeKind = Literal[
 
 @dataclass(frozen=True)
 class Notice:
-    """Something a person should see while a port works: what is waited for, or what came by that is not a node.
+    """A message for people while a port works: what it waits for, or something that came and is no node.
 
-    Units: ``seconds`` is how long this wait may still last, None for as long as it takes. ``uuid`` is the node that is
-    spoken of, where there is one.
+    Units: ``seconds`` is how long this wait may still last, None for as long as it takes. ``uuid`` is the node
+    concerned, if there is one.
     """
 
     kind: NoticeKind
@@ -36,7 +36,7 @@ Direction = Literal["out", "in"]
 
 
 class Trace(Protocol):
-    """Where what goes over a link is written down (``--trace``). Thread-safe; never raises, whatever the disk does."""
+    """Recorder of a link's frames and messages (``--trace``). Thread-safe; never raises, whatever the disk does."""
 
     def frame(
         self,
@@ -48,7 +48,10 @@ class Trace(Protocol):
         fd: bool = False,
         at: float | None = None,
     ) -> None:
-        """A frame as the link carried it; ``at`` is its arrival in seconds of ``time.monotonic()``, None for now."""
+        """Record a frame as the link carried it.
+
+        ``at`` is its arrival in seconds of ``time.monotonic()``, None for now.
+        """
 
     def message(
         self,
@@ -61,15 +64,15 @@ class Trace(Protocol):
         sealed: bool = False,
         opened: bytes | None = None,
     ) -> None:
-        """A whole command or reply, with what it says in words, and its plain form where it was sealed."""
+        """Record a whole command or reply with its description, and its plain form if it was sealed."""
 
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a link can do, so that nobody asks for its name.
+    """What a link can do, so that callers never check for its name.
 
-    ``tapped``: somebody holds the node to this reader, so that a key that comes this way may be pinned and agreed.
-    ``wired``: who answers hangs on this very wire, so that a new node's first key may be taken for its own.
+    ``tapped``: a person holds the node to this reader, so that a key that comes this way may be pinned and agreed.
+    ``wired``: an answer comes over this very wire, so that a new node's first key may be accepted as its own.
     ``streams``: data messages of measuring nodes can be heard. ``many``: several nodes are there at once, and may be
     talked to from one thread each, ``max_parallel`` of them at a time.
     """
@@ -97,7 +100,7 @@ class Link(Protocol):
 
     @property
     def capabilities(self) -> Capabilities:
-        """What this link can do."""
+        """Capabilities of this link."""
 
     def exchange(self, frame: bytes) -> bytes:
         """Send one whole command frame and return the whole reply frame that belongs to it.
@@ -123,7 +126,7 @@ class ResendLink(Protocol):
 
 @runtime_checkable
 class MultiStationLink(Protocol):
-    """A node's line on a bus, where others can ask it as well (CAN): under the addresses of other base stations.
+    """The link to a node on a bus, where other stations can ask it as well (CAN): under their addresses.
 
     ``address`` is the node's; a node that has moved is asked at its new one once this is set.
     """
@@ -131,24 +134,27 @@ class MultiStationLink(Protocol):
     address: int
 
     def beside(self, source: int) -> Link:
-        """A line to the same node from another station's address (0xF1 to 0xF7), over the same adapter."""
+        """Return a link to the same node from another station's address (0xF1 to 0xF7), over the same adapter."""
 
     def everyone(self) -> bytes:
-        """Ask everyone, from this line's own station, who is there; this node's reply frame, empty where none came."""
+        """Send a functional Identify from this link's own station.
+
+        Return this node's reply frame, empty if none came.
+        """
 
     def there(self, address: int) -> Identity | None:
-        """Who answers Identify at this address within a second; None for nobody."""
+        """Return the Identify at this address within a second; None if there is no answer."""
 
     def begin(self, octets: int) -> bytes:
         """Announce a request of so many octets and send nothing of it but its first frame.
 
-        Returns the data of the frame that the node answers with (ISO-TP, its first octet says which), empty for none.
+        Returns the data of the frame that the node answers with (ISO-TP, its first octet is the type), empty for none.
         """
 
 
 @runtime_checkable
 class AnnouncingLink(Protocol):
-    """A link on which the node says beforehand how it wants to be talked to (NFC: the record ``Tp``)."""
+    """A link on which the node announces its parameters (NFC: the record ``Tp``)."""
 
     @property
     def announced(self) -> dict[str, int]:
@@ -168,10 +174,10 @@ class DeadlineLink(Protocol):
 
 @runtime_checkable
 class TimestampedLink(Protocol):
-    """A link that knows better than who asks when messages left and came, in seconds of ``time.monotonic()``.
+    """A link that records when messages left and came, in seconds of ``time.monotonic()``.
 
     ``left``: a moment just before the first request left since this was last set to 0. ``came``: when the last reply
-    was whole, by the kernel's time stamp where there is one; 0 where none came since.
+    was whole, by the kernel's time stamp if there is one; 0 if none came since.
     """
 
     left: float
@@ -187,18 +193,18 @@ class PacedLink(Protocol):
 
 @runtime_checkable
 class CancellableLink(Protocol):
-    """A link whose exchange is given up (NodeSilentError) as soon as ``hopeless()`` says that no reply will come."""
+    """A link whose exchange is abandoned (NodeSilentError) as soon as ``hopeless()`` returns True."""
 
     hopeless: Callable[[], bool]
 
 
 @dataclass(frozen=True)
 class Contact:
-    """A node that was found: its unauthenticated Identify, its link, and where it was found.
+    """A found node: its unauthenticated Identify, its link, and its place.
 
-    ``address`` is its CAN address, ``connection`` the number of its BLE connection. ``charging`` and ``ble`` are what
-    its initial NFC message says beside; hints, as unauthenticated as the rest. ``trace`` is where the messages with it
-    are written down, ``bus`` the place of the bus or the air (``can:socketcan:can0``), "" at a reader.
+    ``address`` is its CAN address, ``connection`` the number of its BLE connection. ``charging`` and ``ble`` are hints
+    of its initial NFC message, as unauthenticated as the rest. ``trace`` records its messages, ``bus`` is the place of
+    the bus or the air (``can:socketcan:can0``), "" at a reader.
     """
 
     identity: Identity
@@ -213,7 +219,7 @@ class Contact:
 
     @property
     def line(self) -> int:
-        """What its data messages are told apart by on its port: CAN address, or number of the connection."""
+        """What identifies its data messages on its port: CAN address, or number of the connection."""
         return self.address or self.connection or 0
 
     def note(
@@ -225,9 +231,9 @@ class Contact:
         sealed: bool = False,
         opened: bytes | None = None,
     ) -> None:
-        """Write a whole message with this node to the trace, where there is one; see ``Trace.message``.
+        """Write a whole message with this node to the trace, if there is one; see ``Trace.message``.
 
-        ``words`` may be what finds them, which is called only there.
+        ``words`` may be a function, which is called only if there is a trace.
         """
         if self.trace is not None:
             uuid, said = self.identity.uuid, words if isinstance(words, str) else words()
@@ -247,11 +253,11 @@ class Port(Protocol):
 
     @property
     def place(self) -> str:
-        """Where this port is, as it was opened: ``nfc:usb:072f:2200``, ``can:socketcan:can0``."""
+        """Place of this port, as it was opened: ``nfc:usb:072f:2200``, ``can:socketcan:can0``."""
 
     @property
     def capabilities(self) -> Capabilities:
-        """What this link can do."""
+        """Capabilities of this link."""
 
     def find(
         self, wanted: Callable[[Identity], bool], *, seconds: float, notice: NoticeSink, address: int | None = None
@@ -263,10 +269,10 @@ class Port(Protocol):
         """
 
     def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
-        """Wait until any node is tapped, or answers on the bus: there, all that answer. Raises NoNodeError.
+        """Wait until any node is tapped, or answers on the bus; return all that answer. Raises NoNodeError.
 
-        Where a link carries many, it listens for ``listen`` seconds at least, however soon the first ones answered;
-        a node that is named by its address is not waited past.
+        A link that carries many listens for at least ``listen`` seconds, however soon the first ones answered; a node
+        that is named by its address ends the wait.
         """
 
     def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
@@ -287,8 +293,8 @@ class LinkSettings:
     """The user's link options, unparsed: ``--via``, ``--nfc``, ``--can`` (one or several), ``--ble``, ``--timeout``.
 
     ``timeout`` in seconds; ``listen`` is how long a command that collects nodes listens at least: 3 s, or ``--timeout``
-    where that was given. ``nfc`` None or ``auto``: the one reader that is there. ``trace`` is an open one (--trace).
-    ``via_chosen``: somebody said which kind of link is meant, so that no other is looked at.
+    if that was given. ``nfc`` None or ``auto``: the only reader. ``trace`` is an open one (--trace). ``via_chosen``:
+    the kind of link was given, so that no other is searched.
     """
 
     via: str = "nfc"
@@ -302,11 +308,11 @@ class LinkSettings:
 
     @property
     def is_open(self) -> bool:
-        """Whether nobody said over which link, and no reader is named: any that the node may be on will do."""
+        """True if neither a link nor a reader was given: any that the node may be on will do."""
         return self.via == "nfc" and self.nfc is None and not self.via_chosen
 
     def at(self, place: str) -> LinkSettings:
-        """The same patience and trace at another place, ``LINK:WHERE``."""
+        """Return the same settings at another place, ``LINK:WHERE``."""
         via, _, where = place.partition(":")
         there = replace(self, via=via, via_chosen=True)
         if via == "can":
@@ -315,23 +321,23 @@ class LinkSettings:
 
     @property
     def buses(self) -> tuple[str, ...]:
-        """The places of every bus and the air that are named, whatever ``via`` says."""
+        """The places of every named bus and of the air, whatever ``via`` is."""
         return tuple(place for via in ("can", "ble") if getattr(self, via) for place in replace(self, via=via).places)
 
     @property
     def places(self) -> tuple[str, ...]:
-        """Every place that ``via`` names, as ``LINK:WHERE``; WHERE is empty where the option was left out."""
+        """Every place that ``via`` names, as ``LINK:WHERE``; WHERE is empty if the option was left out."""
         named = getattr(self, self.via, None)
         wheres = (named,) if isinstance(named, str) else named or ("",)
         return tuple(f"{self.via}:{where}" for where in wheres)
 
     @property
     def onward(self) -> str | None:
-        """The place to go on at once a key is agreed on: BLE, where a reader is named beside it; else None."""
+        """The place to continue at after the agreement: BLE, if a reader is named beside it; else None."""
         return f"ble:{self.ble}" if self.via == "nfc" and self.nfc and self.ble else None
 
     def after_agreeing(self) -> LinkSettings:
-        """The links of a command that needs no tap: BLE, where a reader is named beside it."""
+        """Return the links of a command that needs no tap: BLE, if a reader is named beside it."""
         return replace(self, via="ble") if self.onward else self
 
 
@@ -339,7 +345,7 @@ class LinkSettings:
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    """A port of 127.0.0.1 that nothing uses now; another program may take it in the next moment."""
+    """Return a port of 127.0.0.1 that is free now; another program may take it in the next moment."""
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -97,7 +97,7 @@ class FlashFile:
 
     @property
     def name(self) -> str:
-        """What its maker called it."""
+        """The name that its maker chose."""
         return str(self._document["name"])
 
     @property
@@ -170,9 +170,9 @@ class FlashFile:
 
 
 def _migrated(document: dict[str, Any]) -> dict[str, Any]:
-    """A flash whose node spoke KeyAgreement 1, as the board is after firmware that speaks 2: in factory state.
+    """Return a flash of KeyAgreement 1 as the board is after firmware that uses 2: in factory state.
 
-    Identity key, UUID, epoch, sequence and address stay, and the other TEDS, which count as unsigned. What was agreed
+    Identity key, UUID, epoch, sequence and address stay, and the other TEDS, which count as unsigned. Everything agreed
     under KeyAgreement 1 goes: link key, CA, station, and the Security TEDS that names it. Written with the next commit.
     """
     if document["format"] not in _OLDER:

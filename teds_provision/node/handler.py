@@ -1,4 +1,4 @@
-"""What a node's link servers (NFC tag, CAN) need from the node behind them."""
+"""The interface of a node towards its link servers (NFC tag, CAN)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class NodeHandler(Protocol):
         """
 
     def lost(self, link: str) -> None:
-        """The field or link is gone: its session, half-open Open and pending agreement end."""
+        """End session, half-open Open and pending agreement: the field or link is gone."""
 
     def identify(self) -> bytes:
         """Return the 23 octets of Identify as they are now (renewed into the NFC id record)."""
@@ -33,14 +33,17 @@ class NodeHandler(Protocol):
         """Have another CAN address until the restart: another node claimed this one (profile.md, "CAN")."""
 
     def actuator_claimed(self) -> bool:
-        """Whether a session claims an actuator, so that the node keeps its CAN address whoever claims it."""
+        """Return True if a session claims an actuator, so that the node keeps its CAN address."""
 
 
 class MeasuringHandler(Protocol):
-    """What a bus tells a node that measures, beside its commands (operation.md, sections 3 to 6). Thread-safe."""
+    """Events that a bus passes to a measuring node, beside its commands (operation.md, sections 3 to 6).
+
+    Thread-safe.
+    """
 
     def tick(self, at: float = 0.0) -> int:
-        """The tick of the node's clock, ns: the present one, or that of ``at`` (time.monotonic) a moment ago."""
+        """Return the tick of the node's clock, ns: the present one, or that of ``at`` (time.monotonic) a moment ago."""
 
     def request_received(
         self,
@@ -59,26 +62,26 @@ class MeasuringHandler(Protocol):
         """
 
     def reply_left(self, link: str) -> None:
-        """The last reply on this link has left (or will not any more): data may follow."""
+        """Let data follow: the last reply on this link has left (or will not any more)."""
 
     def trigger(self, link: str, token: bytes, tick: int) -> None:
-        """A trigger frame of this link's station ended at ``tick``."""
+        """Handle a trigger frame of this link's station that ended at ``tick``."""
 
     def drive(self, link: str, data: bytes) -> None:
-        """A Drive frame of this link's station came."""
+        """Handle a Drive frame of this link's station."""
 
 
 class BleHandler(NodeHandler, MeasuringHandler, Protocol):
-    """What a node's BLE asks beside (profile.md, "BLE")."""
+    """What a node's BLE needs in addition (profile.md, "BLE")."""
 
     def in_factory_state(self) -> bool:
-        """Whether the node holds no key."""
+        """Return True if the node holds no key."""
 
     def in_session(self, link: str) -> bool:
-        """Whether a session is open on this link."""
+        """Return True if a session is open on this link."""
 
     def unheard(self, link: str) -> None:
-        """The station has disabled data messages on this link: its streams end."""
+        """End the streams of this link: the station has disabled data messages on it."""
 
 
 # A bounded crew of threads for all nodes of a process; what comes by one line is done one after another.
@@ -94,8 +97,8 @@ Job = Callable[[], None]
 class WorkerPool:
     """At most ``most`` threads, made as they are needed.
 
-    Not concurrent.futures: a request has nobody who waits for its end, and what a Future costs stands between each
-    request and its reply.
+    Not concurrent.futures: no caller waits for the end of a request, and the cost of a Future would be added between
+    each request and its reply.
     """
 
     def __init__(self, most: int = MOST_THREADS) -> None:

@@ -21,13 +21,13 @@ from teds_provision.teds.sheet import Sheet
 
 @dataclass(frozen=True)
 class NodeTemplate:
-    """TEDS of one node, without Security TEDS; ``uuid`` is what they say, None where they say none (or all zeros)."""
+    """TEDS of one node, without Security TEDS; ``uuid`` is the one in them, None if they have none (or all zeros)."""
 
     blocks: Mapping[BlockId, bytes]
     uuid: bytes | None = None
 
     def with_uuid(self, uuid: bytes) -> NodeTemplate:
-        """The same node under another UUID: field 4 of a Meta-TEDS of the 2007 form says that one."""
+        """Return the same node under another UUID, also in field 4 of a Meta-TEDS of the 2007 form."""
         return NodeTemplate(under(self.blocks, uuid), uuid)
 
 
@@ -56,7 +56,7 @@ def _placed(path: Path) -> dict[BlockId, bytes]:
 
 
 def from_profile(profile: str, folders: tuple[Path, ...] | None, uuid: bytes, name: str = "") -> NodeTemplate:
-    """The TEDS of a type, without calibration; raises NotFoundError and BadDataError."""
+    """Return the TEDS of a type, without calibration; raises NotFoundError and BadDataError."""
     made = load_profile(profile, folders).build(uuid, name=name or None)
     return NodeTemplate({key: teds for key, teds in made.blocks.items() if key != SECURITY}, uuid)
 
@@ -73,7 +73,7 @@ def create(
 ) -> FlashFile:
     """Make a node, or open the one that was made so before. Its UUID: the one given, else the file's, else random.
 
-    Raises UsageError (another node lies there), NotFoundError, BadDataError, StoreError.
+    Raises UsageError (the folder holds another node), NotFoundError, BadDataError, StoreError.
     """
     described = from_file(teds) if teds is not None else None
     wanted = uuid or (described.uuid if described is not None else None)

@@ -1,4 +1,4 @@
-"""The virtual transducer: one Tim behind its link servers, as slow as it is told to be, in real time."""
+"""The virtual transducer: one Tim behind its link servers, as slow as configured, in real time."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ class Delays:
 
 
 class LinkServer(Protocol):
-    """One link of the node, served in threads of its own."""
+    """One link of the node, served in threads."""
 
     def start(self) -> None:
-        """Open the link; raises a LinkError where it cannot."""
+        """Open the link; raises a LinkError if it cannot."""
 
     def stop(self) -> None:
         """Close it; never raises."""
@@ -201,34 +201,34 @@ class VirtualNode:
         return reply
 
     def reply_left(self, link: str) -> None:
-        """Data may follow; see Measuring."""
+        """Let data follow; see MeasuringHandler."""
         with self._core.interrupt():
             self.tim.reply_left(link)
         self._wake()
 
     def lost(self, link: str) -> None:
-        """The link is gone; see NodeHandler."""
+        """Handle a lost link; see NodeHandler."""
         with self._core.command():
             self.tim.link_lost(link)
 
     def trigger(self, link: str, token: bytes, tick: int) -> None:
-        """A trigger came; see Measuring."""
+        """Handle a trigger; see MeasuringHandler."""
         with self._core.interrupt():
             self.tim.trigger(link, token, tick)
         self._wake()
 
     def drive(self, link: str, data: bytes) -> None:
-        """A Drive frame came; see Measuring."""
+        """Handle a Drive frame; see MeasuringHandler."""
         with self._core.interrupt():
             self.tim.drive(link, data)
 
     def unheard(self, link: str) -> None:
-        """Data messages were disabled; see BleHandler."""
+        """Handle disabled data messages; see BleHandler."""
         with self._core.interrupt():
             self.tim.unheard(link)
 
     def in_session(self, link: str) -> bool:
-        """Whether a session is open; see BleHandler."""
+        """Return True if a session is open; see BleHandler."""
         with self._core.interrupt():
             return self.tim.in_session(link)
 
@@ -245,11 +245,11 @@ class VirtualNode:
         self.tim.take_can_address(address)
 
     def actuator_claimed(self) -> bool:
-        """Whether an actuator is claimed; see NodeHandler."""
+        """Return True if an actuator is claimed; see NodeHandler."""
         return self.tim.actuator_claimed()
 
     def tick(self, at: float = 0.0) -> int:
-        """The present tick, or that of ``at`` (see Measuring); 0 for a node without clock."""
+        """Return the present tick, or that of ``at`` (see MeasuringHandler); 0 for a node without clock."""
         if self.board is None:
             return 0
         # A simulation's clock stands between its lines: what is a moment ago was the same tick.
@@ -259,7 +259,7 @@ class VirtualNode:
     # -- its own life ----------------------------------------------------------------------------------------------
 
     def in_factory_state(self) -> bool:
-        """Whether the node holds no key."""
+        """Return True if the node holds no key."""
         return self.tim.flash.state == NodeState.FACTORY
 
     def reset_by_hand(self) -> None:
@@ -311,7 +311,7 @@ class VirtualNode:
             at = min(real, at + max(round(wait * NANOSECONDS), _STEP))
 
     def _tell_misses(self, board: Board) -> None:
-        """Say now and then how many messages were lost here, and the rest once no stream runs any more."""
+        """Report now and then how many messages were lost here, and the rest once no stream runs any more."""
         with self._core.interrupt():
             missed, streaming = self.tim.missed, self.tim.streaming
         now = time.monotonic()
@@ -362,13 +362,13 @@ class VirtualNode:
                 time.sleep(seconds)
 
     def _one_time(self) -> PrivateKey:
-        """A key pair for one Open; the chip makes the next one while it has nothing else to do."""
+        """Return a key pair for one Open; the chip makes the next one while it is idle."""
         self._sleep(self._one_time_at - time.monotonic())
         self._one_time_at = time.monotonic() + self._delays.crypto
         return _SlowKey(SoftwareKey.generate(), self._work)
 
     def _simulated(self) -> None:
-        """A simulation moved the clock: take what fell due, and let full messages leave before it goes on."""
+        """Take the samples that fell due when a simulation moved the clock, and let full messages leave first."""
         until = time.monotonic() + _SIMULATION_WAITS
         while (wait := self.beat()) is not None and time.monotonic() < until:
             if self._sampled >= self.tick() and self.tim.next_frame_in() is None:

@@ -23,7 +23,7 @@ LONGEST = 64
 ALL = "all"
 """Means every node that comes (``ncap run --measure all``): no group is called so."""
 _NO_PATHS: Final = (".", "..")
-"""Groups are paths of the API, where a browser takes these two away."""
+"""Names that are no groups: groups are paths of the API, and browsers remove these two."""
 _SHOWN: Final = 10
 _CREATE: Final = "teds-provision group create NAME UUID …"
 
@@ -63,11 +63,11 @@ class Groups:
         return found
 
     def find(self, name: str) -> Group | None:
-        """One group, None where there is none of exactly this name."""
+        """Return one group, None if there is none of exactly this name."""
         return self._store.group(name)
 
     def create(self, name: str, uuids: Sequence[bytes]) -> Group:
-        """Make a group, or give the one that is there back where it has the same members; raises UsageError."""
+        """Make a group, or return the existing one if it has the same members; raises UsageError."""
         if not is_valid_name(name):
             raise UsageError(
                 f"{name!r} is not a valid group name.",
@@ -101,7 +101,7 @@ class Groups:
         return self.get(name)
 
     def delete(self, name: str) -> bool:
-        """Delete a group; False where there is none. Raises FrozenError while it is measured."""
+        """Delete a group; False if there is none. Raises FrozenError while it is measured."""
         if self.find(name) is None:
             return False
         with self.frozen(name), self._store.together():
@@ -128,13 +128,13 @@ class Groups:
         return names
 
     def _report_member(self, name: str, uuids: Iterable[bytes], *, member: bool) -> None:
-        """Tell the plant who came into a group, or left it."""
+        """Report to the plant which nodes joined or left a group."""
         for uuid in uuids:
             self._plant.record_event("grouped", uuid, group=name, member=member)
 
     @contextmanager
     def frozen(self, name: str) -> Iterator[None]:
-        """Hold a group as it is; raises FrozenError where another process does."""
+        """Hold a group as it is; raises FrozenError if another process does."""
         digest = hashlib.sha256(
             name.encode()
         ).hexdigest()  # 64 characters of any script are more than a file name takes

@@ -31,18 +31,18 @@ class StationIdentity:
     # -- facts -----------------------------------------------------------------------------------------------------
 
     def is_complete(self) -> bool:
-        """Whether init was finished: a key, a CA and its signature are there."""
+        """True if init was finished: a key, a CA and its signature are there."""
         facts = self._store.facts()
         return facts is not None and facts.point is not None
 
     @property
     def requested(self) -> bytes | None:
-        """P(base station) for which a certificate was asked for, None where none was."""
+        """P(base station) for which a certificate was requested, None if none was."""
         facts = self._store.facts()
         return facts.requested if facts is not None else None
 
     def establish(self, name: str | None, keystore: str, keystore_why: str, *, requested: bytes | None = None) -> None:
-        """Keep where the secrets of a new station lie, and the key for which it asks a certificate, if it does."""
+        """Store where the secrets of a new station are, and the key for which it requests a certificate, if it does."""
         self._store.put_facts(
             self._row_macs.facts(StationRecord(name or DEFAULT_NAME, keystore, keystore_why, requested))
         )
@@ -95,7 +95,7 @@ class StationIdentity:
 
     @property
     def keystore(self) -> str:
-        """Where the secrets lie: ``keyring``, ``file`` or a ``pkcs11:`` URI."""
+        """Keystore of the secrets: ``keyring``, ``file`` or a ``pkcs11:`` URI."""
         return self._facts.keystore
 
     @property
@@ -105,12 +105,12 @@ class StationIdentity:
 
     @property
     def rewrapping(self) -> int | None:
-        """Number of the master key that the link keys are being wrapped under anew, None where no such run is open."""
+        """Number of the next master key during a change, None if no change is in progress."""
         return self._facts.rewrapping
 
     @property
     def master(self) -> int:
-        """Number of the master key that wraps link keys now, 1 where it was never changed."""
+        """Number of the master key that wraps link keys now, 1 if it was never changed."""
         return self._facts.master
 
     def begin_rewrapping(self, number: int) -> None:
@@ -126,7 +126,10 @@ class StationIdentity:
     # -- certificates ----------------------------------------------------------------------------------------------
 
     def certify(self, point: bytes) -> bytes:
-        """SIG104 of this owner's CA over another station's key; raises NotFoundError where the CA key is not here."""
+        """Return SIG104 of this owner's CA over another station's key.
+
+        Raises NotFoundError if the CA key is not here.
+        """
         ca = self._vault().ca()
         if ca is None or ca.point != self.ca:
             raise NotFoundError("The CA key is not in this vault.", hint="Run this on the station that has the CA key.")
@@ -142,7 +145,7 @@ class StationIdentity:
         return self._store.certificate(keys.fingerprint(ca), keys.fingerprint(point))
 
     def keep_certificate(self, ca: bytes, point: bytes, signature: bytes) -> None:
-        """Keep a SIG104; raises NotAuthenticError where it does not verify."""
+        """Keep a SIG104; raises NotAuthenticError if it does not verify."""
         if not keys.verify(ca, keys.station_key_message(point), signature):
             raise NotAuthenticError(
                 f"The CA {keys.fingerprint(ca)[:16]} did not sign the station {keys.fingerprint(point)[:16]}."
@@ -151,7 +154,7 @@ class StationIdentity:
             self._store.put_certificate(keys.fingerprint(ca), keys.fingerprint(point), signature)
 
     def signature_under(self, ca: bytes) -> bytes:
-        """SIG104 of ``ca`` over this station's key; raises PolicyError where there is none."""
+        """Return SIG104 of ``ca`` over this station's key; raises PolicyError if there is none."""
         facts = self._facts
         signature = self._certificate(facts, ca, self._required(facts.point))
         if signature is None:
@@ -162,6 +165,6 @@ class StationIdentity:
         return signature
 
     def credentials(self, ca: bytes | None = None) -> wire_agreement.Credentials:
-        """What the station shows and signs with under ``ca``, the owner's where none is named."""
+        """Return the credentials that the station shows under ``ca``, by default the owner's."""
         under = self.ca if ca is None else ca
         return wire_agreement.Credentials(self._vault().identity(), self.signature_under(under), under)

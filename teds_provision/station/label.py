@@ -34,7 +34,7 @@ _LAYOUTS: Final = {
     "Greek": "ΑΒΨΔΕΦΤΣ",
     "Turkish F": "UÇVEĞAOİ",
 }
-"""What layouts make of the letters of a label when a scanner presses the keys of a US keyboard, in the order of _KEYS.
+"""Characters that a scanner typing on a US keyboard gives under other layouts, in the order of _KEYS.
 
 Dvorak's E without Shift is a full stop; digits are the same but on a French layout, which needs Shift for them.
 """
@@ -45,7 +45,7 @@ _MODULE, _QUIET = 8, 4
 
 @dataclass(frozen=True)
 class Label:
-    """What stands on a label: the node's UUID, the whole fingerprint of its key (64 hex digits), and its name."""
+    """Content of a label: the node's UUID, the whole fingerprint of its key (64 hex digits), and its name."""
 
     uuid: bytes
     fingerprint: str
@@ -58,14 +58,14 @@ class Label:
 
     @property
     def lines(self) -> list[str]:
-        """What people read beside the code."""
+        """The text beside the code."""
         first = [self.name] if self.name else []
         digits = self.fingerprint
         return [*first, self.uuid.hex(), *(digits[start : start + 16] for start in range(0, len(digits), 16))]
 
 
 def label_of(station: Station, uuid: bytes) -> Label:
-    """The label of a node whose key is pinned; raises NotFoundError where it is not."""
+    """Return the label of a node whose key is pinned; raises NotFoundError if it is not."""
     pinned = station.pins.pinned(uuid)
     if pinned is None or len(pinned) != _FINGERPRINT_DIGITS:
         raise NotFoundError(
@@ -105,7 +105,7 @@ _TABLES: Final = tuple(_table(layout, letters) for layout, letters in _LAYOUTS.i
 def write_label(label: Label, path: Path) -> None:
     """Write the label as SVG or PNG, by the suffix; raises UsageError (another one).
 
-    Raises TedsProvisionError where segno, or for a PNG Pillow, is missing.
+    Raises TedsProvisionError if segno, or for a PNG Pillow, is missing.
     """
     suffix = path.suffix.lower()
     if suffix not in (".svg", ".png"):

@@ -3,7 +3,7 @@
 Each kept measurement has an owner. One of ``ncap``, the page or a token of the API is kept until it is deleted, and
 ``ncap run`` carries it on after ``kill -9``, power loss or a restart. One of a ``measure`` command is kept while that
 command lives, which a lock shows: the next reader removes the row of a dead one. Only ``measure GROUP`` without options
-takes over its settings, as a measurement of its own. A topic's name may be changed while its node is not measured.
+takes over its settings, as a separate measurement. A topic's name may be changed while its node is not measured.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from teds_provision.store.records import COMMAND, DetectionMode, KeptMeasurement
 FOLDER = "measuring"  # of the home: who measures what now
 
 STATION = bytes(10)
-"""Stands for the station in :attr:`Measurements.names`: the first part of every topic."""
+"""Key of the station in :attr:`Measurements.names`: the first part of every topic."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class Measurements:
             return found, tuple(kept)
 
     def nodes_of(self, measurement: KeptMeasurement) -> tuple[bytes, ...]:
-        """UUIDs of its nodes, 10 octets each; raises NotFoundError where its group is gone."""
+        """Return the UUIDs of its nodes, 10 octets each; raises NotFoundError if its group is gone."""
         return measurement.uuids if measurement.group is None else self._groups.get(measurement.group).uuids
 
     def keep(self, measurement: KeptMeasurement) -> KeptMeasurement:
@@ -161,7 +161,7 @@ class Measurements:
                 self.forget(owned.id)
 
     def forget(self, measurement_id: str) -> bool:
-        """Measure it no more after the next start; False where it is not there. Ends nothing that runs."""
+        """Remove a kept measurement, from the next start on; False if there is none. Ends nothing that runs."""
         return self._store.remove_measurement(measurement_id)
 
     def hand_on(self, old: bytes, new: bytes | None) -> HandedOn:
@@ -231,8 +231,8 @@ class Measurements:
     def running(self, uuids: Iterable[bytes], *, group: str | None = None, what: str = "measure") -> Iterator[None]:
         """Hold these nodes (and their group) as they are while they are measured.
 
-        The marks are locks of the system: they go with the process, however that ends. Raises PolicyError where the
-        group is being measured already, or one of the nodes is being renamed.
+        The marks are locks of the system: they end with the process, however that ends. Raises PolicyError if the group
+        is being measured already, or one of the nodes is being renamed.
         """
         with ExitStack() as stack:
             if group is not None:
@@ -245,7 +245,7 @@ class Measurements:
             yield
 
     def is_running(self, uuid: bytes) -> bool:
-        """Whether a measurement of this station holds the node, in this process or another one."""
+        """True if a measurement of this station holds the node, in this process or another one."""
         return self._mark(uuid).is_taken
 
     def holder(self, uuid: bytes) -> str | None:
@@ -256,10 +256,10 @@ class Measurements:
         return UsageLock(self._home / FOLDER / f"{uuid.hex()}.lock", command=what, shared=True)
 
     def source(self, bus: str, source: int, *, command: str = "", shared: bool = False) -> UsageLock:
-        """The mark of who uses a source address on a bus: to be entered by ``with``, which raises Taken (7).
+        """Return the usage lock of a source address on a bus, to be entered by ``with``, which raises Taken (7).
 
         A session belongs to a pair of addresses, and a second Open on it ends the first (operation.md section 6).
-        ``bus`` is ``CanSpec.wire``. Who has one short session after another takes it ``shared``.
+        ``bus`` is ``CanSpec.wire``. A user with one short session after another takes it ``shared``.
         """
         name = hashlib.sha256(f"{bus}\0{source}".encode()).hexdigest()[:16]
         return UsageLock(self._home / FOLDER / f"bus-{name}.lock", command=command, shared=shared)
@@ -268,7 +268,7 @@ class Measurements:
 
     @property
     def detection(self) -> DetectionMode:
-        """How nodes are detected; ``whitelist`` unless somebody asked otherwise."""
+        """How nodes are detected; ``whitelist`` by default."""
         return self._store.detection() or "whitelist"
 
     @detection.setter
@@ -303,10 +303,10 @@ class Measurements:
             self._store.put_frame(uuid, channel, frame)
 
     def rename(self, uuid: bytes, channel: int, name: str | None) -> None:
-        """Publish a channel (0: the node's part) under this name from the next measurement on; None: as it was made.
+        """Publish a channel (0: the node's part) under this name from the next measurement on; None: the default name.
 
-        The caller has checked that it can be a topic. Raises FrozenError while the node is measured, UsageError
-        where another one has the name.
+        The caller has checked that it can be a topic. Raises FrozenError while the node is measured, UsageError if
+        another one has the name.
         """
         if self.is_running(uuid):
             raise FrozenError(

@@ -77,7 +77,7 @@ class NodeKeys:
         self._reopened = reopened
 
     def keys_of(self, uuid: bytes) -> list[KeyRecord]:
-        """The keys of a node, wrapped, in the order to try them: newest pending first, the active one last."""
+        """Return the keys of a node, wrapped, in the order to try them: newest pending first, the active one last."""
         return self._store.keys(uuid)
 
     def all(self) -> Iterator[KeyRecord]:
@@ -89,7 +89,7 @@ class NodeKeys:
         return self._store.all_key_names()
 
     def held(self, uuid: bytes) -> bool:
-        """Whether any key is held for a node."""
+        """True if any key is held for a node."""
         return bool(self._store.keys(uuid))
 
     def unwrapped(self, uuid: bytes) -> Iterator[NodeKey]:
@@ -115,18 +115,18 @@ class NodeKeys:
         return next((record.epoch for record in self._store.keys(uuid) if record.state == "active"), 0)
 
     def get_many(self, uuids: Sequence[bytes]) -> list[KeyRecord]:
-        """The keys of a page of nodes, wrapped, in the order they came."""
+        """Return the keys of a batch of nodes, wrapped, in the order they came."""
         return self._store.keys_of(uuids)
 
     def slots_of(self, uuids: Sequence[bytes]) -> dict[bytes, int]:
-        """The last slot given to the keys of each node of a page."""
+        """Return the last slot given to the keys of each node of a batch."""
         return self._store.slots_of(uuids)
 
     def add_pending(self, uuid: bytes, *, key: bytes, key_id: bytes, epoch: int) -> None:
         """Store a new key durably as pending; of the others only the oldest pending one goes, beyond eight.
 
-        The newest are tried first, and a node knows one key at most that was never proven: whoever makes a station
-        agree again and again fills no disk.
+        The newest are tried first, and a node knows one unproven key at most. The limit keeps an attacker who forces
+        agreements from filling the disk.
         """
         with self._store.together():
             self.refresh()
@@ -141,7 +141,7 @@ class NodeKeys:
             )
 
     def refresh(self) -> None:
-        """Read the vault again where another process has changed the master key (vault rewrap).
+        """Read the vault again if another process has changed the master key (vault rewrap).
 
         To be called inside a transaction, before keys are wrapped in it: then no such change comes in between.
         """
@@ -163,7 +163,7 @@ class NodeKeys:
         """Return a link key in the clear.
 
         A record that was read before another command changed the master key is read again, and so is the vault. Raises
-        VaultError where it is damaged or of another vault.
+        VaultError if it is damaged or of another vault.
         """
         try:
             return self._unwrapped(record, self._vault())
@@ -183,11 +183,11 @@ class NodeKeys:
         return vault.unwrap(record.wrapped, context=context)
 
     def outdated(self, record: KeyRecord) -> list[KeyRecord]:
-        """The keys of a node that a good Open under ``record`` shows to be of no use any more.
+        """Return the keys of a node that a good Open under ``record`` makes obsolete.
 
         A newer agreement may still become good: its Confirm can be held back on the way, until the node has forgotten
-        the Request (60 seconds). Such a key stays, else a Confirm that arrives late would leave a node whose key
-        nobody has.
+        the Request (60 seconds). Such a key stays, else a late Confirm would leave a node with a key that no station
+        has.
         """
         late = (datetime.now(UTC) - CONFIRM_MAY_ARRIVE).strftime("%Y-%m-%dT%H:%M:%SZ")
         return [
@@ -227,7 +227,7 @@ class NodeKeys:
             return self._store.remove_keys(uuid)
 
     def _tell_forgotten(self, uuid: bytes, gone: Sequence[KeyRecord]) -> None:
-        """Tell the plant that no key up to these epochs is left here."""
+        """Report to the plant that no key up to these epochs is left here."""
         if gone and self._plant.joined is not None:
             self._plant.record_event("forgot", uuid, epoch=max(record.epoch for record in gone))
 
@@ -245,9 +245,11 @@ class NodeKeys:
             return removed
 
     def correct_epoch(self, record: KeyRecord, epoch: int) -> KeyRecord:
-        """Note the true epoch of a key whose epoch was hearsay, as a node told it in a session; the key stays.
+        """Correct the epoch of a key, which was unverified, to the one that a node reported in a session.
 
-        The wrapped form is bound to the epoch, so it is made anew, in one transaction.
+        The key stays.
+
+        The wrapped form is bound to the epoch, so it is made again, in one transaction.
         """
         with self._store.together():
             self.refresh()
@@ -342,7 +344,7 @@ class NodeKeys:
         return {uuid for uuid, mark in marks.items() if mark.rotation is not None}
 
     def restored(self, uuid: bytes) -> bool:
-        """Whether the keys of a node came back from a backup and none was agreed since."""
+        """True if the keys of a node came back from a backup and none was agreed since."""
         return (self.rotation_due(uuid) or "").startswith(RESTORED)
 
     def stolen(self, uuid: bytes) -> str | None:

@@ -1,4 +1,4 @@
-"""What is known of nodes: names and states, the datasheet that each had last, and the one that it is being given."""
+"""Nodes: names and states, the last datasheet of each, and the draft that it is being given."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ class Nodes:
         return self._store.all_shown_keys()
 
     def get_many(self, uuids: Sequence[bytes]) -> dict[bytes, NodeRecord]:
-        """What is known of a page of nodes, by UUID."""
+        """Return the records of a batch of nodes, by UUID."""
         return self._store.nodes_of(uuids)
 
     def exported_many(self, uuids: Sequence[bytes]) -> dict[bytes, ExportedNode]:
-        """What a bundle says of a page of nodes, by UUID."""
+        """Return a bundle's facts about a batch of nodes, by UUID."""
         return self._store.exported_nodes_of(uuids)
 
     def bearers_of(self, names: Sequence[str]) -> dict[str, bytes]:
@@ -62,7 +62,7 @@ class Nodes:
         return self._store.bearers_of(names)
 
     def get(self, uuid: bytes) -> NodeRecord | None:
-        """What is known of a node, None if nothing is."""
+        """Return the record of a node, None if there is none."""
         return self._store.node(uuid)
 
     def put(self, record: NodeRecord) -> None:
@@ -84,7 +84,7 @@ class Nodes:
         return changed
 
     def _seal(self, uuid: bytes, point: object, present: NodeRecord | None) -> bytes | None:
-        """The seal of an identity key, new where the vault is open; without one it is a hint."""
+        """Return the row MAC of an identity key, new if the vault is open; without one it is a hint."""
         if not isinstance(point, bytes):
             return None
         if present is not None and present.point == point and present.point_mac is not None:
@@ -92,20 +92,20 @@ class Nodes:
         return self._row_macs.point(uuid, point)
 
     def met_at(self, uuid: bytes, place: str) -> None:
-        """A session with this node was opened at ``place`` (``LINK:WHERE``): there it is looked for next time.
+        """Record that a session with this node was opened at ``place`` (``LINK:PORT``), for the next search.
 
-        A hint: nobody waits for the disk or fails because of it; what is forgotten is seen again in the next session.
+        A hint: it neither waits for the disk nor fails because of it; a lost one comes back in the next session.
         """
         if place and self._store.last_places([uuid]).get(uuid) != place:
             with suppress(StoreError), self._store.transaction(later=True):
                 self._store.put_last_place(uuid, place)
 
     def last_places(self, uuids: Sequence[bytes]) -> dict[bytes, str]:
-        """Where each of these nodes was met last, as ``LINK:WHERE``; without those that never were."""
+        """Return the last place of each of these nodes, as ``LINK:PORT``; without those never met."""
         return {uuid: place for page in chunks(uuids) for uuid, place in self._store.last_places(page).items()}
 
     def resolve(self, text: str) -> bytes:
-        """The UUID that ``text`` (a UUID, a prefix of it, or a name) means; raises NotFoundError, UsageError."""
+        """Return the UUID for ``text`` (a UUID, a prefix of it, or a name); raises NotFoundError, UsageError."""
         return self._store.resolve(text)
 
     def beginning_with(self, text: str, most: int) -> list[tuple[str, str]]:
@@ -121,30 +121,30 @@ class Nodes:
         return self._store.overview(uuids)
 
     def is_known(self, uuid: bytes) -> bool:
-        """Whether anything at all is known of a node."""
+        """True if anything is known of a node."""
         return self._store.is_known(uuid)
 
     def named(self, name: str) -> bytes | None:
-        """UUID of the one node of exactly this name, None where none or several have it."""
+        """Return the UUID of the only node of exactly this name, None if none or several have it."""
         return self._store.named(name)
 
     def all_named(self, name: str) -> list[bytes]:
-        """The UUIDs that have exactly this name, as a node or on the whitelist."""
+        """Return the UUIDs that have exactly this name, as a node or on the whitelist."""
         return self._store.all_named(name)
 
     # -- datasheets ------------------------------------------------------------------------------------------------
 
     def datasheet(self, uuid: bytes) -> Image | None:
-        """The image that a node had when it was last read or written whole, None if it never was."""
+        """Return the image of a node when it was last read or written whole, None if it never was."""
         record = self._store.datasheet(uuid)
         return record.image if record is not None and is_whole(record.image) else None
 
     def keep_datasheet(self, image: Image, profile: str | None = None) -> None:
-        """Remember what a node has: every TEDS as it was read or written; the one before goes into its history.
+        """Keep the present datasheet of a node, as it was read or written; the one before goes into its history.
 
-        A draft of the same content is done with. ``profile`` names the type, where that is known. What is not a whole
-        datasheet (a Security TEDS alone, or a TEDS of its field 108 missing) is not kept: it would stand in for octets
-        that nobody read.
+        A draft of the same content is removed. ``profile`` names the type, if it is known. An incomplete datasheet (a
+        Security TEDS alone, or a TEDS of its field 108 missing) is not kept: it would replace octets that were not
+        read.
         """
         if not is_whole(image):
             return
@@ -157,31 +157,31 @@ class Nodes:
                 self._store.set_due(image.uuid, _first_due(image))
 
     def history(self, uuid: bytes) -> list[DatasheetRecord]:
-        """The datasheets that a node had, newest first: the present one and at most ten older ones.
+        """Return the datasheets that a node had, newest first: the present one and at most ten older ones.
 
-        What was read of a node before this station knew more than its Security TEDS is not among them.
+        Readings of the Security TEDS alone are not among them.
         """
         return [record for record in self._store.history(uuid) if record.image.unsigned_blocks()]
 
     # -- readings --------------------------------------------------------------------------------------------------
 
     def reading(self, uuid: bytes) -> NodeReading | None:
-        """What was read of a node last, which its verdict is judged from; None where nothing was."""
+        """Return the last reading of a node, from which its verdict is derived; None if there is none."""
         return self._store.reading_of(uuid)
 
     def reads_well(self, uuid: bytes) -> bool:
-        """Whether a node's datasheet was read in a session and nothing in it was wrong: a hint, trust is not asked."""
+        """True if a node's datasheet was read in a session and was free of faults: a hint, without trust."""
         row = self.reading(uuid)
         return row is not None and row.in_session and not row.failed
 
     def readings_of(self, uuids: Sequence[bytes]) -> dict[bytes, NodeReading]:
-        """What was read last of a page of nodes, by UUID."""
+        """Return the last readings of a batch of nodes, by UUID."""
         return self._store.readings_of(uuids)
 
     def keep_reading(self, reading: NodeReading, image: Image | None = None, profile: str | None = None) -> bool:
-        """Keep what was read of a node, with the datasheet where that is worth keeping, at one moment.
+        """Keep a reading of a node, with the datasheet if that is worth keeping, at one moment.
 
-        Only a reading in a session replaces one made in a session: False where it did not.
+        Only a reading in a session replaces one made in a session: False if it did not.
         """
         with self._store.together():
             kept = self._store.put_reading(reading)
@@ -190,15 +190,15 @@ class Nodes:
         return kept
 
     def started_anew(self, uuid: bytes, c: bytes) -> None:
-        """A session with this ``c`` (8 octets) shows that the node has started since it was read.
+        """Record a restart of the node since its reading, as a session with this ``c`` (8 octets) shows.
 
-        Nobody waits for the disk: what a crash forgets is seen again in the next session.
+        Does not wait for the disk: a record lost in a crash comes back in the next session.
         """
         with self._store.transaction(later=True):
             self._store.put_start(uuid, c)
 
     def forget_reading(self, uuid: bytes) -> None:
-        """The node was reset: what was read of it is not there any more."""
+        """Forget the reading of a node that was reset."""
         self._store.drop_reading(uuid)
 
     def drafts(self) -> list[Draft]:
@@ -206,7 +206,7 @@ class Nodes:
         return self._store.drafts()
 
     def draft(self, uuid: bytes) -> Draft | None:
-        """The image that a node is being given, and how far it came."""
+        """Return the image that a node is being given, and how far the write has come."""
         return self._store.draft(uuid)
 
     def keep_draft(self, draft: Draft) -> None:
@@ -219,7 +219,7 @@ class Nodes:
 
 
 def is_whole(image: Image) -> bool:
-    """Whether an image is a whole datasheet: more than a Security TEDS, and every TEDS of field 108 is in it."""
+    """True if an image is a whole datasheet: more than a Security TEDS, with every TEDS of field 108."""
     if not image.unsigned_blocks():
         return False
     if image.security is None:
@@ -231,7 +231,7 @@ def is_whole(image: Image) -> bool:
 
 
 def _first_due(image: Image) -> str | None:
-    """The day (ISO 8601) on which the first calibration of a datasheet ends, None where none does."""
+    """Return the day (ISO 8601) on which the first calibration of a datasheet ends, None if none does."""
     if not any(code == AccessCode.CALIBRATION for _, code in image):
         return None
     ends = [channel.due for channel in sheet.Sheet.from_image(image).channels if channel.due is not None]

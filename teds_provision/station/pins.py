@@ -19,8 +19,11 @@ else:  # cryptography: not for commands that only list
     wire_agreement, keys = late("teds_provision.protocol.wire_agreement"), late("teds_provision.protocol.keys")
 
 RECORD_AGAIN: Final = 600.0
-"""Seconds in which a process records one wrong key of a UUID: anybody on a bus can show wrong keys, and a new one each
-time; a service that looks at each would fill the disk with its audit log."""
+"""Seconds in which a process records one wrong key of a UUID.
+
+Any device on a bus can show wrong keys, and a new one each time; a service that looks at each would fill the disk with
+its audit log.
+"""
 
 
 class Pins:
@@ -37,9 +40,9 @@ class Pins:
         self._recorded: dict[bytes, tuple[float, int]] = {}
 
     def pinned(self, uuid: bytes) -> str | None:
-        """Fingerprint of the key that this UUID has to show, None where none is known yet.
+        """Return the fingerprint of the key that this UUID has to show, None if none is known yet.
 
-        Its first 32 digits or more where a person gave no more and the node was not met since.
+        Its first 32 digits or more if an operator gave no more and the node was not met since.
         """
         entry = self.entry(uuid)
         pin = entry.fingerprint if entry is not None else None
@@ -52,7 +55,10 @@ class Pins:
         return _wholer(pin, keys.fingerprint(node.point))
 
     def all(self, nodes: Iterable[NodeRecord] | None = None) -> dict[bytes, str]:
-        """Fingerprint of every pinned UUID; ``nodes`` are all of the store where they have been read already."""
+        """Return the fingerprint of every pinned UUID.
+
+        ``nodes`` are all of the store if they have been read already.
+        """
         return self.pinned_among(self._store.nodes() if nodes is None else nodes, self.whitelist())
 
     def pinned_among(
@@ -70,7 +76,7 @@ class Pins:
         return pins
 
     def check(self, uuid: bytes, point: bytes) -> None:
-        """Raise KeyMismatchError where this UUID is known with another key than ``point``."""
+        """Raise KeyMismatchError if this UUID is known with another key than ``point``."""
         pinned = self.pinned(uuid)
         if pinned is not None and not same_key(pinned, keys.fingerprint(point)):
             self._record(uuid, keys.fingerprint(point), pinned)
@@ -105,11 +111,11 @@ class Pins:
         return entry
 
     def entry(self, uuid: bytes) -> WhitelistEntry | None:
-        """The whitelist entry of a node, None where it is not on it."""
+        """Return the whitelist entry of a node, None if it is not on it."""
         return self._row_macs.check_entry(self._store.whitelisted(uuid))
 
     def get_many(self, uuids: Sequence[bytes]) -> dict[bytes, WhitelistEntry]:
-        """The entries of a page of nodes, by UUID."""
+        """Return the entries of a batch of nodes, by UUID."""
         return {uuid: self._checked(entry) for uuid, entry in self._store.whitelist_of(uuids).items()}
 
     def put(self, *entries: WhitelistEntry) -> None:
@@ -121,7 +127,7 @@ class Pins:
             self._store.put_whitelist_entries(self._row_macs.entry(entry) for entry in entries)
 
     def _report_pin(self, entry: WhitelistEntry) -> None:
-        """Tell the plant of a pin of this station's own, where it is a new one."""
+        """Report a new pin of this station to the plant."""
         before = self._store.whitelisted(entry.uuid)
         if entry.name != (before.name if before is not None else None):
             self._plant.record_name(entry.uuid, entry.name)
@@ -159,16 +165,16 @@ class Pins:
         return 0 if former and pinned and not same_key(former, pinned) else self._keys.active_epoch(uuid)
 
     def is_unsettled(self, uuid: bytes) -> bool:
-        """Whether the link keys that are held may belong to a board that was replaced since."""
+        """True if the held link keys may belong to a board that was replaced since."""
         return self._keys.former(uuid) is not None
 
     def settled(self, uuid: bytes) -> None:
-        """A session is open: the key in use belongs to the board that lies there."""
+        """Record that a session is open: the key in use belongs to the present board."""
         self._keys.set_former(uuid, None)
 
 
 def _wholer(pin: str | None, seen: str | None) -> str:
-    """The pin of the whitelist goes before the key that was seen, unless it is the beginning of that one."""
+    """Return the pin of the whitelist, or the key that was seen if the pin is only its beginning."""
     if pin is None or (seen is not None and same_key(pin, seen)):
         return seen or ""
     return pin

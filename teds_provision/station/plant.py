@@ -1,6 +1,6 @@
-"""What this station has to do with a plant: the registry that it joined, the roster that counts, what it tells others.
+"""A station's part in a plant: the registry that it joined, the current roster, and its reports to others.
 
-Whoever joined none tells nothing, and nobody's word counts but as before (contract/plant.md, rule 1).
+A station that joined none reports nothing, and statements of others count as before (contract/plant.md, rule 1).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class SignerRules:
     words: Callable[[bytes], Collection[signer.SignatureClaim]]
 
     def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> signer.SignerVerdict | None:
-        """Judge who signed a datasheet; None where the roster has no say: another owner's CA, and a key not in it."""
+        """Judge who signed a datasheet; None if the roster does not apply: another owner's CA, and a key not in it."""
         key = keys.fingerprint(station_key)
         if key not in self.roster.by_key and certifier != self.ca:
             return None
@@ -66,13 +66,13 @@ class SignerRules:
 
 
 class PlantConflictError(PolicyError):
-    """Stations of the plant say different things of a node."""
+    """Stations of the plant contradict each other about a node."""
 
     code = "conflict"
 
 
 def new_home(home: Path) -> None:
-    """Give a home a name of its own, in a file beside the store that is in no backup."""
+    """Give a home an identifier, in a file beside the store that is in no backup."""
     write_whole(home / HOME_FILE, secrets.token_hex(8).encode() + b"\n")
 
 
@@ -96,15 +96,15 @@ class Plant:
 
     @property
     def joined(self) -> PlantRecord | None:
-        """What this station joined and has not left; None where others' words count as if there were no plant."""
+        """What this station joined and has not left; None if others' statements count as without a plant."""
         record = self.tables.plant()
         return record if record is not None and record.left is None else None
 
     @property
     def roster(self) -> roster.Roster | None:
-        """The roster that counts, None if none was joined. Raises StoreChangedError if another program put it there.
+        """The current roster, None if none was joined. Raises StoreChangedError if another program put it there.
 
-        It is the CA's word, whatever became of the row; the seal tells one that was put back.
+        The CA signed it, whatever became of the row; the row MAC detects an old one that was put back.
         """
         record, row = self.joined, self.tables.held_roster()
         if record is None or row is None:
@@ -119,15 +119,15 @@ class Plant:
         return self._read[1]
 
     def require_role(self, role: Role, what: str, hint: str) -> None:
-        """Raise PolicyError where a plant was joined and its roster does not give this station a role."""
+        """Raise PolicyError if a plant was joined and its roster does not give this station a role."""
         held = self.roster
         if held is not None and not held.has(self._identity.fingerprint, role):
             raise PolicyError(f"This station does not have the role {role} in {held.name}, so it {what}.", hint=hint)
 
     def require_undisputed(self, uuid: bytes) -> None:
-        """Raise PlantConflictError where stations know two keys of a node that this one would key for the first time.
+        """Raise PlantConflictError if stations know two keys of a node that this one would key for the first time.
 
-        Until a keeper pins one, or a person does here.
+        It holds until a keeper, or an operator here, pins one.
         """
         if self.joined is None:
             return
@@ -153,7 +153,7 @@ class Plant:
         )
 
     def signer_rules(self) -> SignerRules | None:
-        """Whose signatures count; None where none was joined."""
+        """Return whose signatures count; None if no plant was joined."""
         held = self.roster
         if held is None:
             return None
@@ -180,16 +180,16 @@ class Plant:
         ]
 
     def record_event(self, act: str, uuid: bytes | None = None, **members: object) -> None:
-        """Tell the plant what was done, in the transaction of the act itself: both are on the disk, or neither.
+        """Queue an event for the plant in the transaction of the act itself: both are on the disk, or neither.
 
-        Members as ``protocol.plant.event.FORMS`` has them. Nothing is written where none was joined.
+        Members as in ``protocol.plant.event.FORMS``. Nothing is written if no plant was joined.
         """
         if self.joined is None:
             return
         self.queue_event(event.made(act, secrets.token_hex(8), utc_now(), uuid, members))
 
     def record_name(self, uuid: bytes, name: object) -> None:
-        """Tell a node's name, where it is one that a plant can say: 1 to 100 printable characters."""
+        """Report a node's name, if it is valid in a plant: 1 to 100 printable characters."""
         if self.joined is not None and document.is_name(name):
             self.record_event("named", uuid, name=name)
 
@@ -202,7 +202,7 @@ class Plant:
     # -- the login at a registry -----------------------------------------------------------------------------------
 
     def login(self) -> tuple[bytes, bytes] | None:
-        """The secret of this station's login (the vault opens), and the request that was made with it."""
+        """Return the secret of this station's login (the vault opens), and the request that was made with it."""
         kept = self.tables.login()
         return None if kept is None else (self._vault().unwrap(kept[0], context=self._context()), kept[1])
 
@@ -224,7 +224,7 @@ class Plant:
 
     @property
     def home(self) -> str:
-        """16 digits that tell this home from a copy of it; made where they are missing. Raises StoreError."""
+        """16 digits that distinguish this home from a copy of it; made if they are missing. Raises StoreError."""
         path = self._store.home / HOME_FILE
         if not path.exists():
             new_home(self._store.home)
@@ -235,7 +235,7 @@ class Plant:
 
     @property
     def restored(self) -> bool:
-        """Whether a backup rebuilt this home and it has not adopted yet what it had said since that backup."""
+        """True if a backup rebuilt this home and it has not yet adopted its pages since that backup."""
         record = self.joined
         if record is None or record.restored is None:
             return False
@@ -249,7 +249,7 @@ class Plant:
             self.tables.put_plant(replace(record, restored=at, restored_mac=self._row_macs.note("restored", at)))
 
     def end_restored(self) -> None:
-        """Note that this home knows again what it said."""
+        """Record that this home has its own pages again."""
         record = self.tables.plant()
         if record is not None and record.restored is not None:
             self.tables.put_plant(replace(record, restored=None, restored_mac=None))

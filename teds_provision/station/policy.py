@@ -65,21 +65,21 @@ class Policy:
         return sorted([*others, *members], key=lambda trusted: trusted.name)
 
     def in_roster(self, fingerprint: str) -> bool:
-        """Whether the plant's roster names this key, as a member or as one that left."""
+        """True if the plant's roster names this key, as a member or as one that left."""
         roster = self._plant.roster
         return roster is not None and fingerprint in roster.by_key
 
     def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> signer.SignerVerdict | None:
-        """What roster and pages say of who signed a datasheet; None where they have no say, or there is no plant."""
+        """Return the verdict of roster and pages on a signer; None if they do not apply, or there is no plant."""
         rules = self._plant.signer_rules()
         return None if rules is None else rules.signing(certifier, station_key, digest)
 
     def signer_rules(self) -> SignerRules | None:
-        """The same for many datasheets at one moment."""
+        """Return the rules for many datasheets at one moment."""
         return self._plant.signer_rules()
 
     def trust(self, record: TrustRecord) -> None:
-        """Trust a key under a name (the vault opens); PolicyError if the name stands for another key or role."""
+        """Trust a key under a name (the vault opens); PolicyError if another key or role has the name."""
         self._row_macs.require()
         with self._store.transaction():
             self._store.put_trust(self._row_macs.trust(record))
@@ -101,7 +101,7 @@ class Policy:
         return [*cas, kept]
 
     def counts(self, ca: bytes) -> bool:
-        """Whether trust in a CA has not been ended."""
+        """True if trust in a CA has not been ended."""
         ended, name = self._store.ended_cas(), keys.fingerprint(ca)
         return name not in ended or not self._row_macs.noted("ended ca", name, ended[name])
 
@@ -126,7 +126,7 @@ class Policy:
     # -- nodes that are refused ------------------------------------------------------------------------------------
 
     def revocations(self) -> list[RevocationRecord]:
-        """The deny list, by UUID."""
+        """Return the deny list, by UUID."""
         return self._store.revocations()
 
     def revocation(self, uuid: bytes) -> RevocationRecord | None:
@@ -159,7 +159,7 @@ class Policy:
         return self._store.remove_revocation(uuid)
 
     def was_lifted(self, statement: str) -> bool:
-        """Whether a person has lifted the ban of this very statement here."""
+        """True if an operator has lifted the ban of this very statement here."""
         lifted = self._store.lifted()
         names = (_digest(statement), event.hash_of_statement(statement)) if lifted else ()
         return any(name in lifted and self._row_macs.noted("lifted", name, lifted[name]) for name in names)
@@ -174,7 +174,7 @@ class Policy:
         return self._store.tombstones()
 
     def tombstone(self, uuid: bytes) -> Tombstone | None:
-        """Where a node was given, None if it was not."""
+        """Return the tombstone of a node that was given away, None if it was not."""
         return self._store.tombstone(uuid)
 
     def take_back(self, uuids: Iterable[bytes]) -> None:

@@ -1,11 +1,11 @@
-"""Seals (MACs) over the rows that decide whom this station believes: own key and CA, trust, pins, CAs of nodes, bans.
+"""MACs over the rows that decide whom this station trusts: own key and CA, trust, pins, CAs of nodes, bans.
 
-Whoever can write the store's file can change rows in it, but makes no seal: HMAC-SHA-256 (RFC 2104), cut to 16 octets,
-under a key of 32 octets that the vault wraps. A seal binds a row's kind and values to this store. When the vault opens,
-the station's own facts and the trusted keys are looked at; a pin, or the CA of a node, when it is used; everything by
-``doctor``. What fails is named and not believed.
+A program that can write the store's file can change rows in it, but cannot make their MAC: HMAC-SHA-256 (RFC 2104), cut
+to 16 octets, under a key of 32 octets that the vault wraps. A MAC binds a row's kind and values to this store. When the
+vault opens, the station's own facts and the trusted keys are checked; a pin, or the CA of a node, when it is used;
+everything by ``doctor``. A row with a wrong MAC is reported and ignored.
 
-Not promised: a row that this station once sealed and removed since can be put back, and a row can be removed.
+Not promised: a row that this station once made and removed since can be put back, and a row can be removed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _Values = tuple[str | bytes | None, ...]
 
 
 class RowMacs:
-    """Makes and checks the seals of one store; ``vault`` opens the vault, ``tell`` gets a sentence for the user."""
+    """Makes and checks the MACs of one store; ``vault`` opens the vault, ``tell`` gets a sentence for the user."""
 
     def __init__(self, store: Store, vault: Callable[[], Vault], tell: Callable[[str], object]) -> None:
         self._store = store
@@ -43,7 +43,7 @@ class RowMacs:
 
     @property
     def active(self) -> bool:
-        """Whether the vault was opened, so that seals can be made and checked without asking anybody."""
+        """True if the vault was opened, so that MACs can be made and checked without asking."""
         return self._keyed is not None
 
     def require(self) -> None:
@@ -53,7 +53,7 @@ class RowMacs:
     # -- making ----------------------------------------------------------------------------------------------------
 
     def facts(self, facts: StationRecord) -> StationRecord:
-        """The station's facts with their seal, and a seal key if there is none yet."""
+        """Return the station's facts with their MAC, and a MAC key if there is none yet."""
         if facts.seal_key is None:
             key = os.urandom(_KEY_OCTETS)
             facts = replace(facts, seal_key=self._vault().wrap(key, context=self._context()))
@@ -61,27 +61,27 @@ class RowMacs:
         return replace(facts, mac=self._mac("station", _facts(facts)))
 
     def entry(self, entry: WhitelistEntry) -> WhitelistEntry:
-        """A whitelist entry with its seal."""
+        """Return a whitelist entry with its MAC."""
         return replace(entry, mac=self.of_entry(entry))
 
     def of_entry(self, entry: WhitelistEntry) -> bytes:
-        """The seal of a whitelist entry."""
+        """Return the MAC of a whitelist entry."""
         return self._mac("whitelist", _entry(entry))
 
     def trust(self, record: TrustRecord) -> TrustRecord:
-        """A trusted key with its seal."""
+        """Return a trusted key with its MAC."""
         return replace(record, mac=self._mac("trust", _trust(record)))
 
     def point(self, uuid: bytes, point: bytes) -> bytes | None:
-        """The seal of a node's identity key; None, and so only a hint, as long as the vault is closed."""
+        """Return the MAC of a node's identity key; None, and so only a hint, as long as the vault is closed."""
         return self._mac("node", (uuid, point)) if self.active else None
 
     def ca(self, uuid: bytes, ca: bytes) -> bytes:
-        """The seal of the CA that a node keeps."""
+        """Return the MAC of the CA that a node keeps."""
         return self._mac("ca", (uuid, ca))
 
     def note(self, kind: str, name: str) -> bytes:
-        """The seal of a person's decision: ``lifted`` (a ban), ``ended ca`` (trust in a CA out of a bundle)."""
+        """Return the MAC of an operator's decision: ``lifted`` (a ban), ``ended ca`` (trust in a CA of a bundle)."""
         return self._mac(kind, (name,))
 
     # -- checking --------------------------------------------------------------------------------------------------
@@ -98,25 +98,25 @@ class RowMacs:
         return entry
 
     def check_point(self, node: NodeRecord | ExportEligibility) -> None:
-        """Raise StoreChangedError where a node's sealed identity key was changed."""
+        """Raise StoreChangedError if a node's identity key with a MAC was changed."""
         bad = node.point is not None and node.point_mac is not None
         if bad and self.active and not self._holds(node.point_mac, "node", (node.uuid, node.point)):
             remove = f"teds-provision whitelist remove {node.uuid.hex()}, then tap the node."
             raise changed([f"the key of node {node.uuid.hex()}"], remove)
 
     def check_ca(self, uuid: bytes, ca: bytes, mac: bytes | None) -> None:
-        """Raise StoreChangedError where the CA that a node keeps is not the one that this station noted."""
+        """Raise StoreChangedError if the CA that a node keeps is not the recorded one."""
         if self.active and not self._holds(mac, "ca", (uuid, ca)):
             raise changed(
                 [f"the CA of node {uuid.hex()}"], "Restore a backup, or reset the node and agree on a new key."
             )
 
     def trusted(self, record: TrustRecord) -> bool:
-        """Whether a trusted key counts: its seal holds, or the vault is closed and nobody can say."""
+        """True if a trusted key counts: its MAC is right, or the vault is closed and it cannot be checked."""
         return not self.active or record.name not in self.broken_trust
 
     def noted(self, kind: str, name: str, mac: bytes | None) -> bool:
-        """Whether a person's decision counts: its seal holds, or the vault is closed and nobody can say."""
+        """True if an operator's decision counts: its MAC is right, or the vault is closed and it cannot be checked."""
         return not self.active or self._holds(mac, kind, (name,))
 
     def all_broken(self) -> Iterator[str]:
@@ -144,7 +144,7 @@ class RowMacs:
         yield from self._plant()
 
     def _plant(self) -> Iterator[tuple[str, bytes | None, str, _Values]]:
-        """What this station keeps of its plant and believes without asking again who signed it."""
+        """Yield the plant's rows that this station believes without verifying their signer again."""
         record, row = self._store.plant(), self._store.held_roster()
         if record is not None:
             yield "the registry that was joined", record.mac, "plant", (record.registry,)
@@ -167,7 +167,7 @@ class RowMacs:
     # -- when the vault opens --------------------------------------------------------------------------------------
 
     def opened_by(self, masters: MasterKeys) -> bool:
-        """True if these master keys open the key of the seals, and it is the one that is in use here."""
+        """True if these master keys open the MAC key, and it is the one that is in use here."""
         facts = self._store.facts()
         if facts is None or facts.seal_key is None or self._keyed is None:
             return False
@@ -178,9 +178,9 @@ class RowMacs:
         return hmac.compare_digest(_keyed(key).digest(), self._keyed.digest())
 
     def unlocked(self, vault: Vault) -> None:
-        """The vault has opened: look at the station's own facts and at trust.
+        """Check the station's own facts and its trust when the vault has opened.
 
-        Raises StoreChangedError where the station's own key or CA is not what this station sealed, VaultError.
+        Raises StoreChangedError if the station's own key or CA differs from what this station wrote, VaultError.
         """
         facts = self._store.facts()
         if facts is None:
@@ -195,7 +195,7 @@ class RowMacs:
         self._look_at_trust()
 
     def _look_at_trust(self) -> None:
-        """Find, and tell, what another program wrote of whom this station believes: none of it counts."""
+        """Find and report trust rows that another program wrote: none of them counts."""
         self.broken_trust = tuple(
             record.name for record in self._store.trusted() if not self._holds(record.mac, "trust", _trust(record))
         )
@@ -256,6 +256,6 @@ def _trust(record: TrustRecord) -> _Values:
 
 
 def changed(what: list[str], cure: str) -> StoreChangedError:
-    """The error for rows that another program changed."""
+    """Return the error for rows that another program changed."""
     shown = ", ".join(what[:_SHOWN]) + (f" and {len(what) - _SHOWN} more" if len(what) > _SHOWN else "")
     return StoreChangedError(f"{shown} in the store was changed by another program and is not trusted.", hint=cure)

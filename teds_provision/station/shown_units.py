@@ -1,4 +1,4 @@
-"""What the profile of a node says of its channels beside the datasheet: the unit that people see, frame, deviation."""
+"""What the profile of a node adds to its channels beside the datasheet: the display unit, frame, deviation."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from teds_provision.teds.profile import ChannelProfile, default_folders, find_pr
 
 
 def shown_units(station: Station, uuid: bytes) -> Mapping[int, str]:
-    """The unit of each channel whose profile names one to show its values in; a profile that cannot be read has none.
+    """Return the display unit of each channel whose profile names one; empty for a profile that cannot be read.
 
-    Values are computed, published and kept in SI whatever it says.
+    Values are computed, published and kept in SI whatever it is.
     """
     return units_of(channel_profiles(station, uuid).values())
 
 
 def units_of(channels: Iterable[ChannelProfile]) -> dict[int, str]:
-    """The unit of each of these channels that names one to show its values in."""
+    """Return the display unit of each of these channels that names one."""
     return {channel.number: channel.display for channel in channels if channel.display}
 
 
 def channel_profiles(station: Station, uuid: bytes) -> Mapping[int, ChannelProfile]:
-    """The channels of a node's profile by number; none where it has none, or one that cannot be read."""
+    """Return the channels of a node's profile by number; empty if it has none, or one that cannot be read."""
     record = station.nodes.get(uuid)
     return _channels_of(record.profile, station.home) if record is not None and record.profile else {}
 

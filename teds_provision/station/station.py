@@ -119,15 +119,15 @@ class Station:
         self._opening = threading.RLock()
         self._runs = threading.local()
         self.notice: Callable[[str], object] = lambda text: None
-        """Told in one sentence whom this station waits for."""
+        """Receives one sentence about what this station waits for."""
         self.released: Callable[[bytes, str], AbstractContextManager[object]] = lambda uuid, command: nullcontext()
-        """``with station.released(uuid, "write"):`` nobody of this home measures the node for the length of the block.
+        """``with station.released(uuid, "write"):`` no process of this home measures the node during the block.
 
-        A command that writes enters it before it speaks to the node. Raises PolicyError where a running `ncap` does
-        not let the node go; where none runs, or in that process itself, there is nothing to do.
+        A command that writes enters it before it contacts the node. Raises PolicyError if a running `ncap` does not
+        release the node; if none runs, or in that process itself, there is nothing to do.
         """
         self.use_agent = True
-        """Whether what ``unlock`` holds open opens the vault; False where the passphrase itself is asked for."""
+        """True if an agent's secret (``unlock``) opens the vault; False if the passphrase itself is asked for."""
         store.when_waiting(lambda text: self.notice(text))  # noqa: PLW0108 - it is replaced later
         self.row_macs = RowMacs(store, self._opened, tell)
         self.identity = StationIdentity(store, self._opened, self.row_macs)
@@ -142,9 +142,9 @@ class Station:
 
     @classmethod
     def open(cls, home: Path, *, ask: Ask, tell: Callable[[str], object] = lambda text: None) -> Station:
-        """Open the station of ``home``; raises NotFoundError where init was never finished.
+        """Open the station of ``home``; raises NotFoundError if init was never finished.
 
-        ``ask`` gives a passphrase when the vault opens, ``tell`` gets what the user has to know then.
+        ``ask`` gives a passphrase when the vault opens, ``tell`` gets messages for the user.
         """
         if not has_store(home):
             raise not_initialised(home)
@@ -209,7 +209,7 @@ class Station:
         return self._vault
 
     def adopt(self, vault: Vault) -> None:
-        """Use a vault that is open; raises StoreChangedError where the store does not go with it any more."""
+        """Use a vault that is open; raises StoreChangedError if the store no longer matches it."""
         self._vault = vault  # the seals below are made and checked with it
         try:
             self._look_at_seals(vault)
@@ -278,19 +278,19 @@ class Station:
             return True
 
     def unlock(self, uuid: bytes | None = None) -> None:
-        """Open the vault now: nobody is asked for a passphrase while the store is locked or a node lies there.
+        """Open the vault now, so that no passphrase is asked for while the store is locked or a node waits.
 
-        With ``uuid`` only where a key of that node is held, as nothing is unwrapped otherwise.
+        With ``uuid`` only if a key of that node is held, as nothing is unwrapped otherwise.
         """
         if uuid is None or self.keys.held(uuid):
             self.current_vault()
 
     def credentials(self, uuid: bytes | None = None) -> wire_agreement.Credentials:
-        """What the station shows and signs with: to node ``uuid`` under the CA that this node keeps, else its own."""
+        """Return the credentials for node ``uuid`` under the CA that this node keeps, else the station's own."""
         return self.identity.credentials(None if uuid is None else self.keys.ca_of(uuid))
 
     def version(self) -> int:
-        """Changes when another process has changed the store, and only then: what was planned before is stale."""
+        """Return a number that changes exactly when another process has changed the store: earlier plans are stale."""
         return self._store.version()
 
     def changes(self) -> tuple[int, int]:
@@ -298,16 +298,16 @@ class Station:
         return self._store.changes()
 
     def rows(self) -> Iterator[bytes]:
-        """The whole store as it is at one moment, as a stream (see :mod:`teds_provision.store.dump`)."""
+        """Yield the whole store as it is at one moment (see :mod:`teds_provision.store.dump`)."""
         return dump(self._store)
 
     # -- one command at a time, all or nothing, and who did it -----------------------------------------------------
 
     @contextmanager
     def lock(self, command: str, notice: Callable[[str], object] | None = None) -> Iterator[None]:
-        """Hold the store: one command, and one thread of it, at a time; waits, then says who holds it.
+        """Hold the store: one command, and one thread of it, at a time; waits, then names the holder.
 
-        May stand inside another one of the same thread.
+        May be nested in the same thread.
         """
         self._store.drain()
         with self._turn:
@@ -323,11 +323,11 @@ class Station:
 
     @contextmanager
     def durable(self, command: str, *, more_follows: bool = False) -> Iterator[None]:
-        """One durable step: the store held, and all of the block on the disk or nothing of it.
+        """Run one durable step: the store held, and all of the block on the disk or nothing of it.
 
-        Never held while a node is talked to: a slow node would hold up every other command. ``more_follows``: in a
-        :meth:`run` it may reach the disk together with the step after it. Only for what nobody is promised before
-        that: a loss of power in between is then as one an instant earlier.
+        Never held while a node is talked to: a slow node would delay every other command. ``more_follows``: in a
+        :meth:`run` it may reach the disk together with the step after it. Only for data that was not promised to any
+        party before: a loss of power in between is then as one an instant earlier.
         """
         run: _DurableRun | None = getattr(self._runs, "now", None) if more_follows else None
         with self.lock(command), self._store.transaction(later=run is not None):
@@ -380,11 +380,11 @@ class Station:
         return NodeLock(self.home, uuid, notice=self.notice)
 
     def transaction(self) -> AbstractContextManager[None]:
-        """All of the block reaches the disk, or nothing of it; may stand inside another one."""
+        """Write all of the block to the disk, or nothing of it; may be nested."""
         return self._store.transaction()
 
     def reading(self) -> AbstractContextManager[None]:
-        """Ask many things of one moment; nobody is talked to or waited for in the block."""
+        """Read many things of one moment; the block must not contact nodes or wait."""
         return self._store.reading()
 
     def audit(self, act: str, uuid: bytes | None, outcome: str, **detail: object) -> None:
@@ -402,12 +402,12 @@ def _ask_no_one(_prompt: str, _confirm: bool) -> str:
 
 
 def not_initialised(home: Path) -> NotFoundError:
-    """The error for a home without a station."""
+    """Return the error for a home without a station."""
     return NotFoundError(f"There is no base station in {home} yet.", hint="To create one: teds-provision init")
 
 
 def not_certified() -> NotFoundError:
-    """The error for a station that asked for a certificate and has none yet."""
+    """Return the error for a station that requested a certificate and has none yet."""
     return NotFoundError(
         "This station is waiting for its CA's certificate.",
         hint="To install it: teds-provision init --certificate CERT",

@@ -25,16 +25,16 @@ class ChannelSummary:
 
 @dataclass(frozen=True)
 class NodeSummary:
-    """Name of the node and its channels, as its datasheet says."""
+    """Name of the node and its channels, from its datasheet."""
 
     name: str | None
     channels: tuple[ChannelSummary, ...]
 
 
 def summarise(image: Image, units: Mapping[int, str] | None = None) -> NodeSummary:
-    """Decode what a person wants to see; never raises on any octets.
+    """Decode what people want to see; never raises on any octets.
 
-    ``units``: in which ones the values of channels are shown, where that is not for the datasheet to say.
+    ``units``: display units of channels, if the profile names them.
     """
     shown = units or {}
     channels = [

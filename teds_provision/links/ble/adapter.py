@@ -58,7 +58,7 @@ class Adapter:
         return now
 
     async def device(self, address: str) -> BLEDevice:
-        """The device at this address, as BlueZ knows it now; raises NoNodeError."""
+        """Return the device at this address, as BlueZ knows it now; raises NoNodeError."""
         known = self._seen.get(address)
         if known is None or time.monotonic() - known[1] > _FRESH_SECONDS:
             await self.scan(CONNECT_SECONDS, lambda now: address in now)

@@ -1,6 +1,6 @@
-"""What bleak and BlueZ raise, as errors with cause and cure.
+"""Errors of bleak and BlueZ, translated to errors with cause and remedy.
 
-Names of D-Bus errors and BlueZ's words ("le-connection-…") are those of bluetoothd 5.66.
+Names of D-Bus errors and BlueZ's texts ("le-connection-…") are those of bluetoothd 5.66.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ _NO_SERVICE: Final = ("org.freedesktop.DBus.Error.ServiceUnknown", "org.freedesk
 
 
 def missing_bleak() -> NoReaderError:
-    """The error where bleak is not installed."""
+    """Return the error for a missing bleak."""
     return NoReaderError("BLE needs bleak, which is not installed.", hint=how_to_install("ble"))
 
 
 def is_full(error: BaseException, held: Collection[object]) -> bool:
-    """Whether the adapter took no further connection beside those that are ``held``; with none it is only busy."""
+    """True if the adapter accepts no connection beyond those that are ``held``; with none it is only busy."""
     text = str(error)
     return _LIMIT in text or (bool(held) and any(word in text for word in _REFUSED))
 
 
 def is_busy(error: BaseException) -> bool:
-    """Whether another program (or a killed one) has a connect or a scan under way on this adapter."""
+    """True if another program (or a killed one) has a connect or a scan under way on this adapter."""
     return getattr(error, "dbus_error", "") in _BUSY
 
 
 def is_gone(error: BaseException) -> bool:
-    """Whether BlueZ has forgotten the device since it was seen."""
+    """True if BlueZ has forgotten the device since it was seen."""
     unknown = getattr(error, "dbus_error", "") in _UNKNOWN
     return unknown or type(error).__name__ == "BleakDeviceNotFoundError" or "not found" in str(error)
 
 
 def adapter_trouble(error: Exception, adapter: str) -> LinkError | None:
-    """The error for Bluetooth that cannot be used at all; None where the trouble is the node's or the air's."""
+    """Return the error for unusable Bluetooth; None if the cause is the node or the air."""
     reason = getattr(getattr(error, "reason", None), "name", "")
     if isinstance(error, FileNotFoundError | ConnectionRefusedError | PermissionError):
         return NoReaderError("There is no D-Bus system bus, so Bluetooth is unavailable.", hint=SERVICE_HINT)
@@ -76,7 +76,7 @@ class TooManyConnectionsError(LinkError):
 
 
 def too_many(held: int, adapter: str) -> TooManyConnectionsError:
-    """The error for an adapter whose connections are used up."""
+    """Return the error for an adapter whose connections are used up."""
     return TooManyConnectionsError(
         f"The Bluetooth of {adapter} holds {held} connection{'' if held == 1 else 's'} and takes no more.",
         hint="Measure fewer nodes over it, or add an adapter: many take 5 to 9, Nordic's own controllers 20.",
@@ -84,7 +84,7 @@ def too_many(held: int, adapter: str) -> TooManyConnectionsError:
 
 
 def silent(address: str, last: Exception | None) -> NodeSilentError:
-    """The error for a node that does not answer."""
+    """Return the error for a node that does not answer."""
     why = f" ({_text(last)})" if last is not None and _text(last) else ""
     return NodeSilentError(
         f"The node at {address} does not answer over BLE{why}.",

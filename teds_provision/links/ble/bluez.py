@@ -1,4 +1,4 @@
-"""What bluetoothd says of its adapters, asked over D-Bus without opening anything; for the doctor."""
+"""Facts about bluetoothd's adapters, read over D-Bus without opening anything; for the doctor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _ADAPTER, _DEVICE = "org.bluez.Adapter1", "org.bluez.Device1"
 
 @dataclass(frozen=True)
 class AdapterFacts:
-    """One adapter: switched on, able to connect to nodes, and how many connections it holds now, whoever made them."""
+    """One adapter: switched on, able to connect to nodes, and its present number of connections of all programs."""
 
     name: str
     address: str
@@ -25,9 +25,9 @@ class AdapterFacts:
 
 
 def adapters(bus_address: str | None = None) -> list[AdapterFacts]:
-    """Every adapter that bluetoothd has; ``bus_address`` None: the system's bus.
+    """Return every adapter of bluetoothd; ``bus_address`` None: the system's bus.
 
-    Raises NoReaderError where there is no system bus, bluetoothd does not run, or what asks for it is not installed.
+    Raises NoReaderError if there is no system bus, bluetoothd does not run, or the D-Bus library is not installed.
     """
     try:
         import dbus_fast  # noqa: F401

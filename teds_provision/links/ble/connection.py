@@ -34,9 +34,9 @@ class NotConnectedError(ConnectionLostError):
 
 
 class BleConnection:
-    """The connection to the node at ``address``; ``number`` tells it apart in this process.
+    """The connection to the node at ``address``; ``number`` identifies it in this process.
 
-    ``data`` is given each notification of the data characteristic, in the loop.
+    ``data`` receives each notification of the data characteristic, in the loop.
     """
 
     _numbers = itertools.count(1)
@@ -47,30 +47,30 @@ class BleConnection:
         self._adapter, self.address, self._data, self._trace = adapter, address, data, trace
         self.number = next(self._numbers)
         self.streaming = False
-        """A measurement hangs on it: it is not given up for another node."""
+        """True if a measurement uses it: it is not given up for another node."""
         self.asking = False
         self.was_up = False
-        """Whether it ever came about: then one that ended is worth patience."""
+        """True if it was ever connected: then a lost connection is worth waiting for."""
         self._client: BleakClient | None = None
         self._news: asyncio.Queue[bytes | None] = asyncio.Queue()
         self._turn = asyncio.Lock()
 
     @property
     def is_up(self) -> bool:
-        """Whether the node is connected."""
+        """True if the node is connected."""
         return self._client is not None and self._client.is_connected
 
     @property
     def mtu(self) -> int:
-        """ATT MTU, 23 where it is not connected."""
+        """ATT MTU, 23 if it is not connected."""
         if not self.is_up:
             return ble.LEAST_MTU
         return max(self._characteristic(ble.WRITE).max_write_without_response_size + 3, ble.LEAST_MTU)
 
     async def exchange(self, transaction: int, message: bytes, seconds: float) -> bytes:
-        """Write a command and return its reply; connects first where need be.
+        """Write a command and return its reply; connects first if necessary.
 
-        Raises ConnectionLostError, TimeoutError (no reply), NoNodeError, and what makes Bluetooth unusable.
+        Raises ConnectionLostError, TimeoutError (no reply), NoNodeError, and the errors of unusable Bluetooth.
         """
         async with self._turn:
             self.asking = True
@@ -127,7 +127,7 @@ class BleConnection:
         self.was_up = True
 
     async def _client_with_service(self) -> bool:
-        """Connect, and subscribe; False where the node's service is not there."""
+        """Connect, and subscribe; return False if the node's service is missing."""
         client = await self._connected()
         # bleak tells its own retries to the disconnected callback too, before connect() has returned
         self._empty()
@@ -137,7 +137,7 @@ class BleConnection:
         return True
 
     async def _connected(self) -> BleakClient:
-        """A connected client; looks for the device once more where BlueZ has forgotten it."""
+        """Return a connected client; looks for the device once more if BlueZ has forgotten it."""
         for attempt in range(_FORGOTTEN_TRIES):
             device = await self._adapter.device(self.address)
             client = self._client = self._new_client(device)
@@ -168,7 +168,7 @@ class BleConnection:
         )
 
     async def _subscribe(self, client: BleakClient) -> None:
-        """Enable replies, and data where the node measures: before the first write."""
+        """Enable replies, and data if the node measures: before the first write."""
         try:
             async with asyncio.timeout(_SUBSCRIBE_SECONDS):
                 await client.start_notify(ble.NOTIFY, lambda _c, octets: self._news.put_nowait(bytes(octets)))

@@ -56,7 +56,7 @@ _FIRST_PAUSE, _LAST_PAUSE = 0.3, 2.0
 
 
 class BleLink:
-    """One node's line. ``make_room`` gives up a connection that nobody needs now; False where there is none."""
+    """The link to one node. ``make_room`` gives up an idle connection; it returns False if there is none."""
 
     via: Final = "ble"
 
@@ -74,7 +74,7 @@ class BleLink:
 
     @property
     def capabilities(self) -> Capabilities:
-        """What a node in the air can do."""
+        """Capabilities of a node over the air."""
         return BLE
 
     @property
@@ -85,8 +85,8 @@ class BleLink:
     def exchange(self, frame: bytes) -> bytes:
         """Send one command frame and return its reply; see ``Link.exchange``.
 
-        Where the connection ends it is made anew, and the request repeated: the session is gone then, so a sealed one
-        is refused, and a new session opened above.
+        A lost connection is made again, and the request repeated: the session is gone then, so a sealed one is refused,
+        and the caller opens a new session.
         """
         self._last = self._number()
         return self._ask(frame, self._last)

@@ -37,7 +37,7 @@ _MOST_OCTETS: Final = 4 << 20
 
 
 def cache_file() -> Path:
-    """Where it lies: ``~/.cache/teds-provision/ble-addresses.json`` unless XDG_CACHE_HOME says otherwise."""
+    """Return its path: ``~/.cache/teds-provision/ble-addresses.json`` unless XDG_CACHE_HOME is set."""
     from platformdirs import user_cache_path
 
     return user_cache_path("teds-provision") / FILE
@@ -59,7 +59,7 @@ class RememberedNodes:
         return list(reversed(self._known.items()))
 
     def remember_node(self, address: str, identity: Identity) -> None:
-        """A node was met; an address at which it was before is forgotten."""
+        """Record the address of a node; an earlier address of it is forgotten."""
         others = {
             at: known_identity
             for at, known_identity in self._known.items()
@@ -69,7 +69,7 @@ class RememberedNodes:
         self._known = {**others, address: identity}
 
     def save(self) -> None:
-        """Write it, where something is new; never raises."""
+        """Write the cache, if it changed; never raises."""
         if not self._changed:
             return
         kept = list(self._known.items())[-MOST:]
@@ -82,7 +82,7 @@ class RememberedNodes:
 
 _ROUND_SECONDS: Final = 2.0
 _SILENCE_SECONDS: Final = 1.5
-"""Nobody new for so long: everyone was seen. Nodes advertise every 0.1 to 1 s."""
+"""Seconds without a new node after which all were seen. Nodes advertise every 0.1 to 1 s."""
 _LONGEST_SECONDS: Final = 8.0
 _GONE_SECONDS: Final = 10.0
 _GUESS_SECONDS: Final = 2.0
@@ -127,11 +127,11 @@ class BlePort:
 
     @property
     def capabilities(self) -> Capabilities:
-        """What Bluetooth LE can do."""
+        """Capabilities of Bluetooth LE."""
         return BLE
 
     def next_transaction(self) -> int:
-        """A transaction number, 0 to 65535; the first of a process is random."""
+        """Return a transaction number, 0 to 65535; the first of a process is random."""
         with self._lock:
             self._transaction = (self._transaction + 1) & 0xFFFF
             return self._transaction
@@ -157,7 +157,7 @@ class BlePort:
             self._heard = False
 
     def link(self, number: int, notice: NoticeSink | None = None) -> BleLink:
-        """The line over the connection of this number; raises NoNodeError where there is none."""
+        """Return the link over the connection of this number; raises NoNodeError if there is none."""
         connection = next(
             (ble_connection for ble_connection in self._connections.values() if ble_connection.number == number), None
         )
@@ -166,11 +166,11 @@ class BlePort:
         return BleLink(self._loop, connection, self.next_transaction, self._make_room, notice or _silently)
 
     def mtu(self, number: int) -> int:
-        """ATT MTU of a connection, 23 where it is not there."""
+        """Return the ATT MTU of a connection, 23 if it is absent."""
         return self.link(number).mtu
 
     def keep(self, number: int, *, streaming: bool) -> None:
-        """Whether a measurement hangs on a connection, so that it is not given up for another node."""
+        """Mark a connection as used by a measurement or not, so that it is not given up for another node."""
         for connection in self._connections.values():
             if connection.number == number:
                 connection.streaming = streaming
@@ -180,9 +180,9 @@ class BlePort:
     def find(
         self, wanted: Callable[[Identity], bool], *, seconds: float, notice: NoticeSink, address: int | None = None
     ) -> Contact:
-        """Return the node for which ``wanted`` holds: at ``address=``, else whichever advertises and is it.
+        """Return the node for which ``wanted`` is true: at ``address=``, else the first that advertises.
 
-        Raises NoNodeError after ``seconds``, NoReaderError where Bluetooth cannot be used.
+        Raises NoNodeError after ``seconds``, NoReaderError if Bluetooth cannot be used.
         """
         where = f"at {self.spec.address} " if self.spec.address else ""
         notice(Notice("waiting", f"Looking for the node {where}over BLE ({self.spec.text}).", seconds))
@@ -198,10 +198,10 @@ class BlePort:
         )
 
     def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
-        """Every node that advertises, asked one after the other; raises NoNodeError after ``seconds``.
+        """Return every advertising node, asked one after the other; raises NoNodeError after ``seconds``.
 
-        Listens until nobody new came for 1.5 s, and for ``listen`` seconds at least. Who is heard is asked soon: a new
-        node advertises for a minute after its tap, and no longer.
+        Listens until no new one came for 1.5 s, and for at least ``listen`` seconds. Nodes are asked as soon as they
+        are heard: a new node advertises only for a minute after its tap.
         """
         notice(Notice("waiting", f"Looking for nodes over BLE ({self.spec.text}).", seconds))
         began = time.monotonic()
@@ -257,7 +257,7 @@ class BlePort:
     # -- the inside ------------------------------------------------------------------------------------------------
 
     def _candidates(self, wanted: Callable[[Identity], bool], until: float) -> Iterator[str]:
-        """Addresses to ask, until then: where it was met before, then whoever advertises, each now and then."""
+        """Yield addresses to ask until ``until``: known ones first, then those that advertise, each at intervals."""
         asked: dict[str, float] = {}
         for known in self._guesses(wanted):
             if self._is_up(known) or self._advertises(known):
@@ -269,16 +269,16 @@ class BlePort:
                 yield address
 
     def _guesses(self, wanted: Callable[[Identity], bool]) -> list[str]:
-        """Addresses at which a wanted node was met before, to be tried before anyone else is listened for.
+        """Return addresses of earlier contacts with a wanted node, to try before listening for others.
 
-        None where anybody is wanted: then the first that advertises is as good.
+        Empty if any node will do: then the first that advertises is as good.
         """
         if self.spec.address or wanted(_NOBODY):
             return []
         return [address for address, identity in self._known.items() if wanted(identity)][:_MOST_GUESSES]
 
     def _advertises(self, address: str) -> bool:
-        """Whether this address is heard within a moment."""
+        """True if this address is heard within a moment."""
         return address in self._loop.run(self._adapter.scan(_GUESS_SECONDS, lambda seen: address in seen))
 
     def _advertising(self, seconds: float, asked: dict[str, float]) -> list[str]:
@@ -298,9 +298,9 @@ class BlePort:
     def _all_new(
         self, seconds: float, asked: Mapping[str, float], found: Mapping[str, Contact], enough: float
     ) -> list[str]:
-        """Who advertises and was not found yet: until nobody new came for a while, and it was ``enough``.
+        """Return advertising addresses not found yet: until no new one came for a while, and ``enough`` has passed.
 
-        Who did not say who it is is new again after some seconds, while it goes on to advertise.
+        A node that did not identify itself counts as new again after some seconds, while it advertises.
         """
         began = time.monotonic()
         first_at: dict[str, float] = {}
@@ -321,7 +321,7 @@ class BlePort:
     def _ask(
         self, address: str, wanted: Callable[[Identity], bool], notice: NoticeSink, told: set[bytes]
     ) -> Contact | None:
-        """Connect and ask who it is; the connection stays where it is the one that is wanted, alone."""
+        """Connect and read Identify; the connection stays only if it is the wanted node."""
         link = self._link(address, notice)
         in_use = link.connection.is_up
         try:
@@ -367,7 +367,7 @@ class BlePort:
         return connection is not None and connection.is_up
 
     def _make_room(self) -> bool:
-        """End a connection on which nothing is under way; False where there is none."""
+        """End an idle connection; False if there is none."""
         with self._lock:
             idle = [
                 ble_connection
@@ -398,7 +398,7 @@ class BlePort:
 
 
 def _silently(_notice: Notice) -> None:
-    """Nobody looks."""
+    """Ignore a notice."""
 
 
 def _anyone(_identity: Identity) -> bool:

@@ -1,4 +1,4 @@
-"""What ``--ble`` says: ``ADAPTER[?address=C1:D8:57:00:01:01]``."""
+"""The value of ``--ble``: ``ADAPTER[?address=C1:D8:57:00:01:01]``."""
 
 from __future__ import annotations
 

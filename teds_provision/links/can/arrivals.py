@@ -25,20 +25,24 @@ _GONE_SECONDS: Final = 3.0
 _SILENCE_SECONDS: Final = 0.055
 """Nodes answer after up to 50 ms; one that is later is heard in the next round."""
 _UNCLEAR_SECONDS: Final = 0.1
-"""The wait for one whose answer was torn: it was pulled in the middle of it more often than not, and while it is waited
-for nobody else is found. The next round asks everyone again."""
+"""Seconds to wait for a node whose answer was torn.
+
+It was usually pulled in the middle of it, and no other node is found during the wait. The next round asks all again.
+"""
 _LONGEST_SECONDS: Final = 3.0
 _MOST_PAUSE: Final = 1.0
 _CHANGE_SECONDS: Final = 0.015
-"""For a machine to change the board that was just served: asked at once, nobody new is there yet, and the silence after
-that question takes longer."""
+"""Seconds for a machine to change the board that was just served.
+
+Asked at once, there is no new board yet, and the silence after that question takes longer.
+"""
 _PAUSE_PER_NODE: Final = 0.03
 """Seconds from one question to the next for each node that answered: its six frames take 1.6 ms, 5 % of a bus."""
 
 
 @dataclass
 class _SeenNode:
-    """What was last known of one node: the last ``round`` that it answered in, and since when it is ``silent``."""
+    """Last knowledge about one node: the last ``round`` that it answered in, and since when it is ``silent``."""
 
     address: int
     state: NodeState
@@ -47,21 +51,21 @@ class _SeenNode:
 
 
 class WatchedPort(Protocol):
-    """What is asked of the port whose bus is watched."""
+    """The port of a watched bus."""
 
     spec: CanSpec
 
     def bus(self) -> BusMultiplexer:
-        """The open bus with its receiving loop."""
+        """Return the open bus with its receiving loop."""
 
     def next_transaction(self) -> int:
-        """A transaction number, 0 to 255."""
+        """Return a transaction number, 0 to 255."""
 
     def identify(self, address: int, *, seconds: float = ...) -> Identity | None:
-        """Ask one address who is there; None for nobody within ``seconds``."""
+        """Ask one address for Identify; None if there is no answer within ``seconds``."""
 
     def tell_of_rivals(self, notice: NoticeSink) -> None:
-        """Say which other stations use our source address."""
+        """Report other stations that use our source address."""
 
 
 class Arrivals:
@@ -78,7 +82,7 @@ class Arrivals:
         self._bus: BusMultiplexer | None = None
 
     def lost(self) -> None:
-        """The bus failed: its listener is of no use any more."""
+        """Handle a failed bus: its listener is useless from now on."""
         self._listener = self._bus = None
 
     def round(self, stop: threading.Event) -> Iterator[tuple[int, Identity]]:
@@ -120,7 +124,7 @@ class Arrivals:
                 return
 
     def _was_served(self, frame: Frame) -> bool:
-        """Whether an Announce is of a node that this round brought."""
+        """True if an Announce is of a node that this round brought."""
         announce = Announce.decode(frame.identifier, frame.data)
         return announce is not None and announce.crc in self._served
 
@@ -152,14 +156,14 @@ class Arrivals:
                 yield address, identity
 
     def _is_news(self, address: int, identity: Identity) -> bool:
-        """New, back after silence, or reset to factory state. A new address alone is no news."""
+        """True if the node is new, back after silence, or reset to factory state. A new address alone is no news."""
         before = self._seen.get(identity.uuid)
         self._seen[identity.uuid] = _SeenNode(address, identity.state, self._round)
         factory = NodeState.FACTORY
         return before is None or (identity.state is factory and before.state is not factory)
 
     def _say_who_left(self, clashing: set[int]) -> None:
-        """Tell of nodes that have been silent for so long that they count as gone, and forget them."""
+        """Report nodes that have been silent for so long that they count as gone, and forget them."""
         now = time.monotonic()
         for uuid, last in list(self._seen.items()):
             if last.round == self._round or last.address in clashing:

@@ -41,7 +41,7 @@ _KEPT: Final = 4096
 
 
 class SentFrames:
-    """What was sent and has not come back yet. Thread-safe."""
+    """Sent frames whose echo has not come back yet. Thread-safe."""
 
     def __init__(self) -> None:
         self._sent: OrderedDict[tuple[int, bytes], list[float]] = OrderedDict()
@@ -57,7 +57,7 @@ class SentFrames:
                 self._sent.popitem(last=False)
 
     def discard_echo(self, frame: Frame) -> bool:
-        """Whether this is one of them; it will not be another time."""
+        """Return True if this is the echo of a sent frame, and forget that frame."""
         key = (frame.identifier, frame.data)
         with self._lock:
             times = self._sent.get(key)
@@ -248,7 +248,7 @@ class Bus:
 
     @property
     def can_be_waited_for(self) -> bool:
-        """Whether :meth:`wait` sleeps."""
+        """True if :meth:`wait` sleeps."""
         return self._descriptor >= 0
 
     def drain(self, most: int = 10_000) -> None:
@@ -328,7 +328,7 @@ def _open(spec: CanSpec) -> can.BusABC:
 
 
 def require_known(spec: CanSpec) -> None:
-    """Raise UsageError for a key that the interface does not have: python-can takes any, and says nothing."""
+    """Raise UsageError for a key that the interface does not have: python-can silently ignores it."""
     if not spec.options:
         return
     known = known_keys(spec.interface)
@@ -340,9 +340,9 @@ def require_known(spec: CanSpec) -> None:
 
 @functools.cache
 def known_keys(interface: str) -> frozenset[str]:
-    """The keys of a python-can interface: arguments of its class and of those above it, and what it picks by name.
+    """Return the keys of a python-can interface: arguments of its class and its bases, and those that it reads by name.
 
-    Empty where nobody can say: an interface whose driver is not installed, or of another package.
+    Empty if they cannot be determined: an interface whose driver is not installed, or of another package.
     """
     from can.interfaces import BACKENDS
 
@@ -361,7 +361,7 @@ def known_keys(interface: str) -> frozenset[str]:
 
 
 def _multicast(bus: can.BusABC, spec: CanSpec) -> Multicast | None:
-    """The quick way to the bus of ``udp_multicast``, None for every other one."""
+    """Return the fast path to a bus of ``udp_multicast``, None for every other one."""
     if spec.interface != "udp_multicast":
         return None
     try:
@@ -372,7 +372,7 @@ def _multicast(bus: can.BusABC, spec: CanSpec) -> Multicast | None:
 
 
 def _options(spec: CanSpec) -> dict[str, Any]:
-    """What python-can is given to open the bus; a socketcand server is asked whether it is there."""
+    """Return python-can's arguments for opening the bus; checks that a socketcand server is reachable."""
     options: dict[str, Any] = dict(spec.options)
     if spec.interface == "udp_multicast" or spec.fd:
         options["fd"] = spec.fd
@@ -400,7 +400,7 @@ def _not_opened(spec: CanSpec, error: Exception) -> NoReaderError:
 
 
 def _opened(spec: CanSpec, options: dict[str, Any]) -> can.BusABC:
-    """Open; once more where a frame of a busy bus came between python-can's question and socketcand's answer."""
+    """Open; try once more if a frame of a busy bus came between python-can's question and socketcand's answer."""
     import can
 
     for _ in range(_OPENINGS - 1):
@@ -420,9 +420,9 @@ def _descriptor(bus: can.BusABC) -> int:
 
 
 def _clock_is_ours(spec: CanSpec) -> bool:
-    """Whether frames are stamped by this machine's clock: by its kernel, not by an adapter or another machine.
+    """True if this machine's kernel stamps the frames, not an adapter or another machine.
 
-    By a clock that is a little behind a frame would seem older than it is, and the bound of a node's time be false.
+    With a clock that is a little slow a frame would seem older than it is, and the bound of a node's time be false.
     """
     host = str(dict(spec.options).get("host", "127.0.0.1"))
     here = spec.interface == "socketcand" and host in ("127.0.0.1", "::1", "localhost")
@@ -462,13 +462,13 @@ def _cure(spec: CanSpec) -> str:
 
 
 def _driver(interface: str) -> str:
-    """How the driver of an interface is installed, "" where it needs none or nothing is known."""
+    """Return how to install the driver of an interface, "" if it needs none or is unknown."""
     package, library = _PACKAGES.get(interface), _LIBRARIES.get(interface)
     return f"Install it: {install_command(package)}" if package else f"It needs {library}." if library else ""
 
 
 def _unknown_key(spec: CanSpec, error: TypeError) -> UsageError:
-    """Why an interface does not take what stands behind the ``?``."""
+    """Return the error for an unknown option after the ``?``."""
     found = re.search(r"unexpected keyword argument '(\w+)'", str(error))
     missing = re.search(r"missing \d+ required [^:]*: (.+)", str(error))
     if found is not None:
@@ -483,14 +483,14 @@ def _unknown_key(spec: CanSpec, error: TypeError) -> UsageError:
 
 
 def _number(error: BaseException) -> int | None:
-    """The system's number of the innermost cause, None where it is none of the system's."""
+    """Return the errno of the innermost cause, None if it has none."""
     while error.__cause__ is not None:
         error = error.__cause__
     return error.errno if isinstance(error, OSError) else None
 
 
 def _reason(error: BaseException) -> str:
-    """The innermost cause in one line: python-can hides it behind its own."""
+    """Return the innermost cause in one line: python-can hides it behind its own."""
     while error.__cause__ is not None:
         error = error.__cause__
     if isinstance(error, NameError):  # what python-can would have loaded from the driver's library
@@ -500,7 +500,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _hung_up(bus: can.BusABC) -> bool:
-    """Whether the server has closed the connection; python-can reads that as silence."""
+    """True if the server has closed the connection; python-can reads that as silence."""
     connection = getattr(bus, "_SocketCanDaemonBus__socket", None)
     if not isinstance(connection, socket.socket):
         return False

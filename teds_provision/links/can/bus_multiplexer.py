@@ -1,7 +1,7 @@
-"""One CAN bus for many threads: whoever reads it (:class:`BusReader`) hands each frame to those who wait for it.
+"""One CAN bus for many threads: the reading one (:class:`BusReader`) hands each frame to those that wait for it.
 
-What nodes send to this station is put together here, whoever asked; the flow control leaves at once from the thread
-that reads, so that a busy one holds nobody up. Data frames, announcements and triggers go to those who listen
+Messages from nodes to this station are reassembled here, for all callers; flow control leaves at once from the thread
+that reads, so that a busy caller delays no other. Data frames, announcements and triggers go to listeners
 (:meth:`listen`).
 """
 
@@ -67,7 +67,7 @@ class BusReader:
         self._over = False
 
     def run(self) -> None:
-        """The loop; returns after :meth:`stop`, or when the bus has failed."""
+        """Run the loop; returns after :meth:`stop`, or when the bus has failed."""
         while not self._over:
             if not self._bus.can_be_waited_for:
                 self._read(_SHORT_SLICE)
@@ -78,13 +78,13 @@ class BusReader:
                 self._read_all()
 
     def stop(self) -> None:
-        """Let nobody read any more; returns when nobody does."""
+        """Stop all reading; returns when no thread reads."""
         self._over = True
         if self._turn.acquire(timeout=2):
             self._turn.release()
 
     def wait_for(self, queue: SimpleQueue[Thing], seconds: float) -> Thing:
-        """The next of a queue that ``take`` or ``failed`` fills; raises Empty after ``seconds``."""
+        """Return the next item of a queue that ``take`` or ``failed`` fills; raises Empty after ``seconds``."""
         until = time.monotonic() + seconds
         while True:
             with suppress(Empty):
@@ -126,7 +126,7 @@ class BusReader:
             self._read(0.0)
 
     def _read_all(self) -> None:
-        """The loop's turn: every frame that is there, unless another thread has come to read them."""
+        """Read every frame that is there, unless another thread has come to read them."""
         while not self._is_helped() and self._turn.acquire(blocking=False):
             try:
                 if not self._read(0.0):
@@ -135,7 +135,7 @@ class BusReader:
                 self._turn.release()
 
     def _read(self, seconds: float) -> bool:
-        """Whether there was a frame."""
+        """Read one frame; return False if there was none."""
         try:
             frame = self._bus.receive(seconds)
         except LinkError as failure:
@@ -159,7 +159,7 @@ _REPLIES_NEEDED: Final = 4
 
 
 class AddressConflicts:
-    """What speaks for another station at our address ``own``. Thread-safe."""
+    """Detects other stations that use our address ``own``. Thread-safe."""
 
     def __init__(self, own: int) -> None:
         self._own = own
@@ -175,14 +175,14 @@ class AddressConflicts:
                 del self._frames[:-_KEPT]
 
     def unasked(self, node: int) -> None:
-        """Note the beginning of a reply of ``node`` to us that nobody here asked for."""
+        """Record an unsolicited reply."""
         del node
         with self._lock:
             self._replies.append(time.monotonic())
             del self._replies[:-_KEPT]
 
     def seen(self, *, within: float = 10.0) -> bool:
-        """Whether another station used our address within these seconds."""
+        """True if another station used our address within these seconds."""
         since = time.monotonic() - within
         with self._lock:
             frames = sum(at >= since for at in self._frames)
@@ -216,8 +216,8 @@ class BroadcastReplies:
     """One functional Identify of station ``own``: ``answers`` by node address, without the transaction octet.
 
     ``conflicts`` are addresses under which two nodes answered: two first frames within this Identify, two different
-    whole answers, or consecutive frames out of sequence (profile.md, "CAN"). A frame that was lost looks the same,
-    so whoever asks looks again before it says so. ``clashes`` are those where it is sure: two different beginnings.
+    whole answers, or consecutive frames out of sequence (profile.md, "CAN"). A lost frame looks the same, so the caller
+    asks again before reporting it. ``clashes`` are those that are certain: two different beginnings.
     """
 
     own: int
@@ -230,7 +230,7 @@ class BroadcastReplies:
 
     @property
     def busy(self) -> bool:
-        """Whether an answer has begun and not ended."""
+        """True if an answer has begun and not ended."""
         return bool(self._partial)
 
     @property
@@ -311,7 +311,7 @@ class Listener:
         self.lost = 0
 
     def get(self, seconds: float | None = None) -> Frame | None:
-        """The next frame, None after ``seconds``; raises LinkError once the bus has failed and all is read."""
+        """Return the next frame, None after ``seconds``; raises LinkError once the bus has failed and all is read."""
         try:
             frame = self._frames.get(timeout=None if seconds is None else max(0.0, seconds))
         except Empty:
@@ -321,7 +321,10 @@ class Listener:
         return frame
 
     def get_all(self, seconds: float) -> list[Frame]:
-        """All frames that wait, in order; where none does, the next one, or none after ``seconds``. Raises as get."""
+        """Return all waiting frames, in order; if there are none, the next one, or none after ``seconds``.
+
+        Raises as get.
+        """
         first = self.get(seconds)
         if first is None:
             return []
@@ -359,7 +362,7 @@ class Listener:
 
 @dataclass(frozen=True)
 class ReplyEvent:
-    """What became of a reply: ``body`` (transaction first) whole, or it has begun, is torn, or another one began.
+    """Progress of a reply: ``body`` (transaction first) whole, or it has begun, is torn, or another one began.
 
     ``at``: when the last frame of a whole one came in (time.monotonic).
     """
@@ -371,9 +374,9 @@ class ReplyEvent:
 
 @dataclass
 class AddressPair:
-    """What the loop knows of one pair of addresses: the message that comes in, and the thread that has an exchange.
+    """State of one pair of addresses: the incoming message, and the thread that has an exchange.
 
-    ``own`` is the station's address; ``transaction`` that of the exchange that runs, -1 for none.
+    ``own`` is the station's address; ``transaction`` that of the running exchange, -1 for none.
     """
 
     node: int
@@ -428,7 +431,7 @@ class PendingBroadcast:
 
 
 class BusMultiplexer:
-    """An open bus with its receiving loop, a thread of its own, until :meth:`close`. All methods are thread-safe."""
+    """An open bus with its receiving loop in a thread, until :meth:`close`. All methods are thread-safe."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -467,7 +470,7 @@ class BusMultiplexer:
 
     @property
     def failed(self) -> bool:
-        """Whether the bus failed, or was closed: it has to be opened anew."""
+        """True if the bus failed, or was closed: it has to be opened again."""
         return self._failure is not None
 
     @property
@@ -477,11 +480,11 @@ class BusMultiplexer:
 
     @property
     def lossy(self) -> bool:
-        """Whether frames were lost here a short while ago."""
+        """True if frames were lost here a short while ago."""
         return time.monotonic() - self._lost_at < _LOSSY_SECONDS
 
     def note_loss(self) -> None:
-        """A frame of an exchange was lost."""
+        """Record a lost frame of an exchange."""
         self._lost_at = time.monotonic()
 
     def check(self) -> None:
@@ -490,7 +493,7 @@ class BusMultiplexer:
             raise self._failure
 
     def next_of(self, queue: SimpleQueue[Thing], seconds: float) -> Thing:
-        """The next that the bus puts into a line's queue; raises Empty after ``seconds``."""
+        """Return the next item that the bus puts into a queue; raises Empty after ``seconds``."""
         return self._reading.wait_for(queue, seconds)
 
     def send(self, frame: Frame) -> None:
@@ -515,7 +518,7 @@ class BusMultiplexer:
             self._listeners = tuple(other for other in self._listeners if other is not listener)
 
     def address_pair(self, node: int, own: int | None = None) -> AddressPair:
-        """The line to the node at this address; ``own`` is another address than this station's, to try a node out."""
+        """Return the state for the node at this address; ``own`` is another station address, for testing a node."""
         pair = node, self.own if own is None else own
         line = self._lines.get(pair)  # there already for all frames but the first: a new one costs more than a frame
         if line is None:
@@ -527,7 +530,7 @@ class BusMultiplexer:
     def gather(self, transaction: int) -> Iterator[PendingBroadcast]:
         """Collect the answers of all nodes to the functional Identify of this transaction.
 
-        The loop goes on with it for a moment afterwards: whoever leaves with the first answer may be told later that a
+        The loop continues for a moment afterwards: a caller that leaves with the first answer may later learn that a
         second node answered under the same address (:meth:`clash`).
         """
         now = time.monotonic()
@@ -540,7 +543,7 @@ class BusMultiplexer:
             asked.until = time.monotonic() + _STRAGGLERS_SECONDS
 
     def clash(self, node: int) -> bool:
-        """Whether two nodes were heard under this address a short while ago, and not one alone since then."""
+        """True if two nodes were heard under this address a short while ago, and no single one since then."""
         return time.monotonic() - self._clashes.get(node, -math.inf) < _CLASH_SECONDS
 
     # -- the loop, and what runs in it -----------------------------------------------------------------------------
@@ -574,7 +577,7 @@ class BusMultiplexer:
             listener.offer(frame)
 
     def announced_since(self, node: int, moment: float) -> bool:
-        """Whether something announced itself at this address after ``moment`` (time.monotonic)."""
+        """True if a node announced itself at this address after ``moment`` (time.monotonic)."""
         return self._announced.get(node, -math.inf) > moment
 
     def _from_node(self, line: AddressPair, frame: Frame) -> None:

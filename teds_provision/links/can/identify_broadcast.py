@@ -19,25 +19,25 @@ LONGEST_SECONDS: Final = 3.0
 """A station listens until 300 ms of silence, 3 s at most (profile.md, "CAN")."""
 
 AskOne = Callable[[int], Identity | None]
-"""Ask one address who is there: None where nobody answers in a way that can be read; raises AddressConflictError."""
+"""Ask one address for Identify: None if there is no readable answer; raises AddressConflictError."""
 
 
 @dataclass
 class FunctionalAnswers:
-    """What one functional Identify came to: who answers where, and what remained unclear."""
+    """Result of one functional Identify: the node at each address, and the unclear ones."""
 
     identities: dict[int, Identity] = field(default_factory=dict)
     conflicts: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
 
     def together(self, other: FunctionalAnswers) -> FunctionalAnswers:
-        """What two questions came to; what one of them made clear is clear."""
+        """Return the combined result of two questions; an address that one of them settled is settled."""
         identities = self.identities | other.identities
         unfinished = (self.unfinished | other.unfinished) - identities.keys()
         return FunctionalAnswers(identities, self.conflicts | other.conflicts, unfinished)
 
     def cleared_by(self, later: FunctionalAnswers) -> FunctionalAnswers:
-        """What a later question made of it: where two seemed to answer, they do if they did again."""
+        """Return the result after a later question: a conflict remains only if it appeared again."""
         identities = {node: who for node, who in self.identities.items() if node not in later.conflicts}
         identities |= later.identities
         unclear = self.unfinished | self.conflicts | later.unfinished
@@ -45,7 +45,7 @@ class FunctionalAnswers:
 
     @property
     def twice(self) -> dict[bytes, list[int]]:
-        """UUIDs that answer under more than one address, with these: one of them is not who it says."""
+        """UUIDs that answer under more than one address, with these addresses: one of them is an impostor."""
         places: dict[bytes, list[int]] = {}
         for address, identity in sorted(self.identities.items()):
             places.setdefault(identity.uuid, []).append(address)
@@ -55,10 +55,10 @@ class FunctionalAnswers:
 def ask_all(
     bus: BusMultiplexer, transaction: int, *, silence: float, longest: float
 ) -> Iterator[tuple[int, Identity] | FunctionalAnswers]:
-    """Send a functional Identify; yields each node as it answers, and at last all that was found.
+    """Send a functional Identify; yield each node as it answers, and finally the whole result.
 
-    Ends after ``silence`` seconds without a frame of an answer, ``longest`` at most. What came torn stands under
-    ``conflicts`` or ``unfinished``: it may be two nodes, or a lost frame. Raises LinkError.
+    Ends after ``silence`` seconds without a frame of an answer, ``longest`` at most. Torn answers are in ``conflicts``
+    or ``unfinished``: two nodes, or a lost frame. Raises LinkError.
     """
     fd = bus.spec.fd
     with bus.gather(transaction) as asked:
@@ -90,9 +90,9 @@ def _news(bus: BusMultiplexer, asked: PendingBroadcast, silence: float, longest:
 
 
 def ask_unclear_again(found: FunctionalAnswers, ask: AskOne, *, until: float) -> FunctionalAnswers:
-    """Ask each address that remained unclear by itself: a lost frame does not come twice, two nodes do.
+    """Ask each unclear address separately: two nodes collide again, a lost frame does not recur.
 
-    ``until`` is a monotonic time. Keeps as ``conflicts`` where two really answer, as ``unfinished`` where nobody does.
+    ``until`` is a monotonic time. Real double answers stay in ``conflicts``, silent addresses in ``unfinished``.
     """
     identities, conflicts, unfinished = dict(found.identities), set[int](), set[int]()
     for address in sorted(found.conflicts | found.unfinished):
@@ -123,7 +123,7 @@ def read_identity(reply: bytes) -> Identity:
 
 
 def ask_one(ask: Callable[[bytes], bytes]) -> Identity | None:
-    """Who is there, by ``ask`` (a command frame to its reply); None for nobody, or nobody that can be understood."""
+    """Return the Identify by ``ask`` (a command frame to its reply); None for no answer, or none that is valid."""
     torn = 0
     while torn < 2:
         try:
@@ -141,7 +141,7 @@ def conflict_text(node: int) -> str:
 
 
 def twice_text(uuid: bytes, addresses: list[int]) -> str:
-    """One sentence that names the UUID and where it answers."""
+    """Return one sentence with the UUID and the addresses under which it answers."""
     where = " and ".join(f"0x{address:02X}" for address in addresses)
     return f"Node {uuid.hex()} answers at {where}: one of them is an impostor."
 

@@ -20,8 +20,8 @@ from typing import Any, Final, Literal
 class Frame:
     """One CAN data frame with a 29-bit identifier; ``data`` 0 to 8 octets, in FD up to 64.
 
-    ``at`` is when it came in, in seconds of ``time.monotonic()``, taken back by what it lay in the kernel's queue;
-    0 for a frame that is sent.
+    ``at`` is the time of arrival, in seconds of ``time.monotonic()``, less the time in the kernel's queue; 0 for a
+    frame that is sent.
     """
 
     identifier: int
@@ -55,7 +55,7 @@ _SINGLE, _FIRST, _CONSECUTIVE, _FLOW = range(4)
 
 
 def physical_id(target: int, source: int) -> int:
-    """Identifier of a frame from ``source`` to ``target``."""
+    """Return the identifier of a frame from ``source`` to ``target``."""
     return _PHYSICAL | target << 8 | source
 
 
@@ -88,7 +88,7 @@ def read_single(data: bytes) -> bytes | None:
 
 
 def single(body: bytes, *, fd: bool = False) -> bytes:
-    """A padded single frame; ``body`` at most 7 octets, in FD 62."""
+    """Return a padded single frame; ``body`` at most 7 octets, in FD 62."""
     return padded((bytes([len(body)]) if len(body) <= 7 else bytes([0, len(body)])) + body, fd=fd)
 
 
@@ -162,7 +162,7 @@ class Pair:
         return True
 
     def _has_its_length(self, consecutive: bytes) -> bool:
-        """Whether it is as long as its first frame, or the last and shorter; ISO 15765-2 ignores all others.
+        """True if it is as long as its first frame, or the last and shorter; ISO 15765-2 ignores all others.
 
         can-isotp takes any classic one.
         """
@@ -171,7 +171,7 @@ class Pair:
         return octets == first or (octets < first and octets - 1 >= left)
 
     def _take_single(self, data: bytes) -> bool:
-        """Take a message of one frame without the state machine; False where that has to see it."""
+        """Receive a message of one frame without the state machine; False if that has to see it."""
         body = read_single(data) if not self._is_busy else None
         if body is None:
             return False
@@ -194,7 +194,7 @@ class Pair:
             self._logic.process()
 
     def received(self) -> bytes | None:
-        """The next whole message, None while there is none."""
+        """Return the next whole message, None while there is none."""
         if self._singles:
             return self._singles.popleft()
         body = self._logic.recv()
@@ -202,22 +202,22 @@ class Pair:
 
     @property
     def sending(self) -> bool:
-        """Whether a message of ours is still under way."""
+        """True if a message of ours is still under way."""
         return bool(self._logic.transmitting())
 
     @property
     def receiving(self) -> bool:
-        """Whether a message of theirs has begun and not ended."""
+        """True if a message of theirs has begun and not ended."""
         return bool(self._logic.is_rx_active())
 
     @property
     def _is_busy(self) -> bool:
-        """Whether can-isotp has anything to do, or a message that nobody has fetched yet."""
+        """True if can-isotp has anything to do, or a message that has not been fetched yet."""
         return bool(self._waiting) or self.sending or self.receiving or self._logic.available()
 
     @property
     def waits_for_flow(self) -> bool:
-        """Whether our first frame, or block, has not been answered yet."""
+        """True if our first frame, or block, has not been answered yet."""
         return bool(self._logic.tx_state == self._wait_fc)
 
     def due_in(self, most: float) -> float:
@@ -272,7 +272,7 @@ def _not_waited_for(_seconds: float) -> None:
 
 
 def _tolerable(data: bytes) -> bytes | None:
-    """Drop what ISO 15765-2 says to ignore and can-isotp would take for the end of a transfer.
+    """Drop frames that ISO 15765-2 ignores and can-isotp would treat as the end of a transfer.
 
     Unknown frame types, single frames with an impossible length, first frames of a message that fits one frame, or of
     4095 octets or fewer by 32 bits, and unknown flow states are ignored; a reserved STmin counts as 127 ms.
@@ -290,7 +290,7 @@ def _tolerable(data: bytes) -> bytes | None:
 
 
 def _announced(first: bytes) -> tuple[int, int]:
-    """Octets that a first frame announces, and where they begin; 0 where 32 bits say what 12 bits hold."""
+    """Return the octets that a first frame announces, and where they begin; 0 if 32 bits hold what fits 12 bits."""
     if length := (first[0] & 0xF) << 8 | first[1]:
         return length, 2
     length = int.from_bytes(first[2:6], "big")
@@ -339,7 +339,7 @@ class Reassembly:
 
     @classmethod
     def begin(cls, peer: int, frame: Frame) -> Reassembly | None:
-        """Start with a first frame; None where it is none, or announces a length that needs none."""
+        """Start with a first frame; None if it is none, or announces a length that needs none."""
         data = frame.data
         if len(data) < 8 or data[0] >> 4 != 1:
             return None
@@ -350,7 +350,7 @@ class Reassembly:
 
     @property
     def too_long(self) -> bool:
-        """Whether no message of the profile has that length."""
+        """True if no message of the profile has that length."""
         return self.length > LONGEST
 
     def add_frame(self, data: bytes) -> Taken:
@@ -373,21 +373,22 @@ class Reassembly:
 
 
 def flow(peer: int, own: int, status: int, *, fd: bool, gap: int = 0) -> Frame:
-    """A flow control frame to ``peer``: 16 frames a block, and ``gap`` ms (0 to 127) between them (profile.md, "CAN").
+    """Return a flow control frame to ``peer``: 16 frames a block, ``gap`` ms (0 to 127) between them.
 
-    Without a gap a reply takes the bus, as it goes before all data; with one the data find room between its frames.
+    profile.md, "CAN". Without a gap a reply takes the whole bus, as it has priority over all data; a gap leaves room
+    for data frames.
     """
     return Frame(physical_id(peer, own), padded(bytes([status, BLOCK_SIZE, gap]), fd=fd), fd)
 
 
 def first_frame(body: bytes, *, fd: bool) -> tuple[bytes, bytes]:
-    """The first frame of a message that no single frame holds, and the octets that are left."""
+    """Return the first frame of a message that no single frame holds, and the octets that are left."""
     room = 62 if fd else 6
     return (0x1000 | len(body)).to_bytes(2, "big") + body[:room], body[room:]
 
 
 def consecutive_frames(rest: bytes, *, fd: bool) -> Iterator[bytes]:
-    """The frames after the first one, padded."""
+    """Yield the frames after the first one, padded."""
     room = 63 if fd else 7
     for number, at in enumerate(range(0, len(rest), room), 1):
         yield padded(bytes([0x20 | number & 0xF]) + rest[at : at + room], fd=fd)

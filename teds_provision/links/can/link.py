@@ -49,13 +49,13 @@ BUSY_SECONDS: Final = 10.0
 BUSY_PAUSE: Final = 0.1
 """A node that cannot take a long request now is sent it again after each pause, for so long (profile.md, "CAN")."""
 _HOPE_SECONDS: Final = 0.1
-"""Between two looks whether whoever asks still hopes for a reply."""
+"""Seconds between two checks whether the caller still expects a reply."""
 _LONGEST_TRY: Final = 120.0
 """Seconds: 4095 octets at the longest gap (127 ms) that a node may ask for take 75 s."""
 
 
 def conflict(node: int) -> AddressConflictError:
-    """The error for two nodes under one address."""
+    """Return the error for two nodes under one address."""
     return AddressConflictError(
         f"Two nodes answer at CAN address 0x{node:02X}.",
         hint="Tap one of them, or connect it alone, then run: teds-provision address UUID NEW.",
@@ -71,7 +71,7 @@ class _EarlyReplyError(Exception):
 
 
 class _NoFlowControlError(Exception):
-    """The node did not take up our first frame, or a block; ``begun`` says whether it took up anything."""
+    """The node did not accept our first frame, or a block; ``begun`` is true if it accepted any."""
 
     def __init__(self, *, begun: bool) -> None:
         super().__init__()
@@ -102,7 +102,7 @@ class CanLink:
 
     @property
     def capabilities(self) -> Capabilities:
-        """What a node on a bus can do."""
+        """Capabilities of a node on a bus."""
         return CAN
 
     def exchange(self, frame: bytes) -> bytes:
@@ -125,11 +125,11 @@ class CanLink:
     # ------------------------------------------------------------------
 
     def beside(self, source: int) -> CanLink:
-        """A line to the same node from another station's address."""
+        """Return a link to the same node from another station's address."""
         return CanLink(self._bus, self._number, self.address, reply_seconds=self._reply_seconds, source=source)
 
     def everyone(self) -> bytes:
-        """Ask everyone who is there; the reply frame of this node, empty where none came."""
+        """Send a functional Identify; return the reply frame of this node, empty if none came."""
         bus, transaction = self._bus(), self._number()
         with bus.gather(transaction) as asked:
             until, fd = time.monotonic() + _HELLO_SECONDS, bus.spec.fd
@@ -149,7 +149,7 @@ class CanLink:
             return None
 
     def begin(self, octets: int) -> bytes:
-        """The frame by which the node answers the first frame of a request of so many octets."""
+        """Return the frame by which the node answers the first frame of a request of so many octets."""
         bus, transaction = self._bus(), self._number()
         with bus.address_pair(self.address, self._source).exchange(transaction) as line:
             head, _ = first_frame(bytes([transaction]).ljust(octets, b"\0"), fd=bus.spec.fd)
@@ -243,14 +243,17 @@ class _Exchange:
         raise self._failed()
 
     def _share(self, whole: int) -> float:
-        """The part of the time that the reply to the next sending is waited for."""
+        """Return the part of the time for which the reply to the next sending is waited for."""
         if self._prompt:
             return _PROMPT_SHARES[whole]
         shares = _LOSSY_SHARES if self._bus.lossy else _SHARES
         return shares[max(0, len(shares) - self._tries + whole)] if self._tries > 1 else 1.0
 
     def _worth_another(self, began: float, refused: int, *, begun: bool) -> bool:
-        """Whether a request that never went out whole is begun anew: at once, while the node may only be busy."""
+        """True if a request that never went out whole is worth another try.
+
+        At once, while the node may only be busy.
+        """
         passed = time.monotonic() - began
         if begun or self._prompt:
             return passed < self._longest
@@ -281,9 +284,9 @@ class _Exchange:
             left -= 1
 
     def _flow(self, patience: float, end: float, *, begun: bool) -> tuple[int, float]:
-        """Wait for a flow control; returns its block size (0: no limit) and gap in seconds.
+        """Wait for a flow control; return its block size (0: no limit) and gap in seconds.
 
-        A node may say Wait for as long as a request is repeated, and not beyond ``end`` (monotonic).
+        A node may send Wait for as long as a request is repeated, and not beyond ``end`` (monotonic).
         """
         until = time.monotonic() + patience
         end = min(end, time.monotonic() + REPEAT_SECONDS)
@@ -314,7 +317,7 @@ class _Exchange:
         self._bus.send(Frame(physical_id(self._line.node, self._line.own), data, self._fd))
 
     def _reply(self, seconds: float) -> tuple[bytes, float] | None:
-        """Wait for the reply; None after ``seconds`` without a beginning, or where it is torn."""
+        """Wait for the reply; None after ``seconds`` without a beginning, or if it is torn."""
         until = time.monotonic() + seconds
         end = time.monotonic() + _LONGEST_TRY
         while (left := min(until, end) - time.monotonic()) > 0:

@@ -1,9 +1,9 @@
-"""python-can's ``udp_multicast`` bus, without what python-can does for each frame.
+"""python-can's ``udp_multicast`` bus, without python-can's work for each frame.
 
 The datagrams are python-can's own (a msgpack map of the fields of ``can.Message``), so that any program with python-can
-talks with us. What differs is how they are read and written: a message object, a select and two clock readings a frame
-are left out, and our own frames do not come back. They leave from a socket of their own, whose address nobody else
-has; the kernel drops what comes from it before it wakes us (socket filter, Linux: ``man 7 socket``, SO_ATTACH_FILTER).
+interoperates. Only reading and writing differ: a message object, a select and two clock readings a frame are left out,
+and our own frames do not come back. They leave from a separate socket, whose address no other program has; the kernel
+drops what comes from it before it wakes us (socket filter, Linux: ``man 7 socket``, SO_ATTACH_FILTER).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _CLASSIC, _FD = 8, 64
 
 
 class ReceivedFrame(NamedTuple):
-    """A frame, or what the controller says of itself (``error``: the identifier of an error frame)."""
+    """A frame, or a controller's own report (``error``: the identifier of an error frame)."""
 
     frame: Frame | None
     error: int = 0
@@ -72,7 +72,7 @@ class Multicast:
             self._out.send(datagram)
 
     def receive(self, seconds: float) -> ReceivedFrame | None:
-        """The next datagram of another, None where none came within ``seconds``; raises OSError."""
+        """Return the next datagram of another sender, None if none came within ``seconds``; raises OSError."""
         try:
             return self._read()
         except BlockingIOError:
@@ -92,7 +92,7 @@ class Multicast:
 
 
 def of_bus(bus: object, options: dict[str, Any], *, fd: bool) -> Multicast | None:
-    """The quick way to an open bus of python-can; None where it is none of ``udp_multicast``, or has another inside."""
+    """Return the fast path to an open bus of python-can; None if it is no ``udp_multicast``, or differs inside."""
     inside = getattr(bus, "_multicast", None)
     receiving, group, port = (getattr(inside, name, None) for name in ("_socket", "group", "port"))
     if not isinstance(receiving, socket.socket) or not isinstance(group, str) or not isinstance(port, int):
@@ -101,7 +101,7 @@ def of_bus(bus: object, options: dict[str, Any], *, fd: bool) -> Multicast | Non
 
 
 def written(frame: Frame) -> bytes:
-    """The datagram of a frame, as python-can writes it."""
+    """Return the datagram of a frame, as python-can writes it."""
     datagram: bytes = msgpack.packb(
         {
             "timestamp": 0.0,
@@ -121,7 +121,7 @@ def written(frame: Frame) -> bytes:
 
 
 def read(datagram: bytes, at: float, *, fd: bool) -> ReceivedFrame:
-    """What a datagram says; anybody may send anything, and what is no data frame of ours says nothing."""
+    """Parse a datagram; it may come from any sender, and anything but a data frame of ours gives an empty result."""
     try:
         fields = msgpack.unpackb(datagram)
     except Exception:  # noqa: BLE001 - msgpack raises ValueError, its own, and what a key of a strange type raises
@@ -139,17 +139,17 @@ def read(datagram: bytes, at: float, *, fd: bool) -> ReceivedFrame:
 
 
 def _is_data(fields: dict[object, object], octets: int, most: int) -> bool:
-    """Whether it is a data frame of a 29-bit identifier that says of its octets how many they are."""
+    """True if it is a data frame of a 29-bit identifier whose length field matches its octets."""
     if not fields.get("is_extended_id", True) or fields.get("is_remote_frame"):
         return False
     return octets <= most and fields.get("dlc", octets) == octets
 
 
 def _arrival(ancillary: list[tuple[int, int, bytes]]) -> float:
-    """Time of arrival on the monotonic clock, taken back by what the datagram lay in the kernel's queue.
+    """Return the time of arrival on the monotonic clock, less the datagram's time in the kernel's queue.
 
-    Never earlier than it was: the wall clock is read first. A thread that is put aside between the two readings makes
-    the arrival late, which a bound of the node's time bears; the other way round it would come before it was sent.
+    Never too early: the wall clock is read first. A thread that is preempted between the two readings makes the arrival
+    late, which a bound of the node's time tolerates; the other way round it would precede the sending.
     """
     late_by = 0.0
     for level, kind, data in ancillary:
@@ -160,7 +160,7 @@ def _arrival(ancillary: list[tuple[int, int, bytes]]) -> float:
 
 
 def _sender(family: int, group: str, port: int, hop_limit: int) -> socket.socket:
-    """A socket to the group alone, with an address of its own; raises OSError."""
+    """Return a socket to the group alone, with a separate address; raises OSError."""
     sender = socket.socket(family, socket.SOCK_DGRAM)
     try:
         if family == socket.AF_INET6:
@@ -176,9 +176,9 @@ def _sender(family: int, group: str, port: int, hop_limit: int) -> socket.socket
 
 
 def _drop_own(receiving: socket.socket, own: tuple[str, int]) -> None:
-    """Have the kernel drop what comes from our own sender; without it each frame wakes us, and is told by its sender.
+    """Have the kernel drop frames of our own sender; without the filter each one wakes us, to be dropped by its sender.
 
-    In front of the filter lies the UDP header, source port first; the source address is that of the IP header.
+    In front of the filter is the UDP header, source port first; the source address is that of the IP header.
     """
     if receiving.family != socket.AF_INET or not sys.platform.startswith("linux"):
         return

@@ -34,14 +34,16 @@ from teds_provision.protocol.messages.identity import Identity
 
 _HELLO_SECONDS: Final = 1.0
 _GUESS_SECONDS: Final = 0.1
-"""The wait for who may be at the address where a node is thought to be; everyone is asked after it."""
+"""Seconds to wait for a node at its last address before all are asked."""
 _MANY: Final = 8
 _ROUNDS_OF_MANY: Final = 3
-"""Where so many answer, everyone is asked again until nobody new answers: the first frame of an answer that is lost
-leaves no trace of its node, and with each node more it is likelier that one was."""
+"""Number of answers from which all are asked again until no new one answers.
+
+A lost first frame of an answer leaves no trace of its node, and is likelier with each node more.
+"""
 _ROUND_SECONDS: Final = 1.0
 _BUSY_SECONDS: Final = 1.5
-"""So long a node may take for its answer where somebody collects: a key agreement keeps a small one from everything."""
+"""Seconds that a node may take for its answer when nodes are collected: a key agreement blocks a small one."""
 _REOPEN_SECONDS: Final = 1.0
 
 
@@ -66,11 +68,11 @@ class CanPort:
 
     @property
     def capabilities(self) -> Capabilities:
-        """What a bus can do."""
+        """Capabilities of a bus."""
         return CAN
 
     def bus(self) -> BusMultiplexer:
-        """The open bus with its receiving loop; opens it again after it was lost."""
+        """Return the open bus with its receiving loop; opens it again after it was lost."""
         with self._lock:
             if self._bus is None or self._bus.failed:
                 if self._bus is not None:
@@ -80,7 +82,7 @@ class CanPort:
             return self._bus
 
     def use_source(self, source: int) -> None:
-        """Speak from another source address from now on: the bus is opened anew by whoever needs it next."""
+        """Use another source address from now on; the bus is opened again at its next use."""
         self.close()
         self.spec = replace(self.spec, source=source)
 
@@ -96,11 +98,11 @@ class CanPort:
         self.bus().send(frame)
 
     def link(self, address: int) -> CanLink:
-        """The line to the node at this address, whoever it is."""
+        """Return the link to the node at this address, whichever it is."""
         return CanLink(self.bus, self.next_transaction, address)
 
     def next_transaction(self) -> int:
-        """A transaction number, 0 to 255; the first of a process is random."""
+        """Return a transaction number, 0 to 255; the first of a process is random."""
         with self._lock:
             self._transaction = (self._transaction + 1) & 0xFF
             return self._transaction
@@ -115,10 +117,10 @@ class CanPort:
     def identify(
         self, address: int, *, seconds: float = _HELLO_SECONDS, until_announced: bool = False
     ) -> Identity | None:
-        """Ask one address who is there; None for nobody. Raises AddressConflictError, LinkError.
+        """Ask one address for Identify; None if there is no answer. Raises AddressConflictError, LinkError.
 
-        ``until_announced``: given up when something announces itself there, as it has not heard the question; whoever
-        asks it because of its Announce need not wait for this one.
+        ``until_announced``: stop as soon as a node announces itself there, as it has not heard the question; a caller
+        that asks because of the Announce need not wait for this one.
         """
         link = self.link(address)
         if until_announced:
@@ -165,12 +167,12 @@ class CanPort:
         )
 
     def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
-        """Every node that answers: what identify shows, and provision chooses from.
+        """Return every node that answers: what identify shows, and provision chooses from.
 
-        Listens until 300 ms of silence, 3 s at most, and asks by itself each address whose answer was torn; what
-        remains unclear is told through ``notice``. With ``listen`` everyone is asked again and again so long, and has
-        1.5 s for each answer: a node may be busy with another station, or about to start. Raises NoNodeError after
-        ``seconds``, AddressConflictError, LinkError.
+        Listens until 300 ms of silence, 3 s at most, and asks each address separately whose answer was torn; unclear
+        ones are reported through ``notice``. With ``listen`` all are asked repeatedly for that time, with 1.5 s for
+        each answer: a node may be busy with another station, or about to start. Raises NoNodeError after ``seconds``,
+        AddressConflictError, LinkError.
         """
         began = time.monotonic()
         until, enough = began + seconds, began + min(listen, seconds)
@@ -226,9 +228,9 @@ class CanPort:
         return found
 
     def _settled(self, found: FunctionalAnswers, until: float) -> FunctionalAnswers:
-        """Look again at what remained unclear: where two seem to be, by asking everyone once more.
+        """Check unclear answers again: apparent conflicts by asking all once more.
 
-        A reply to a station that died a moment ago, by chance under our transaction number, looks like a second node;
+        A reply to a station that ended a moment ago, by chance under our transaction number, looks like a second node;
         it comes once, a second node each time.
         """
         left = until - time.monotonic()

@@ -21,7 +21,7 @@ OptionValue = int | float | str | bool
 _HINT: Final = "Examples: socketcan:can0?bitrate=500000 or udp_multicast:239.74.163.2?node=0x21."
 _RESERVED: Final = frozenset({"interface", "channel", "can_filters", "ignore_config", "config_context"})
 _HOW: Final = frozenset({"bitrate", "data_bitrate", "hop_limit", "fd", "receive_own_messages", "timing"})
-"""Options that say how a bus is used, not which one it is."""
+"""Options about how a bus is used, not which one it is."""
 _TRUE: Final = frozenset({"1", "true", "yes", "on"})
 _FALSE: Final = frozenset({"0", "false", "no", "off"})
 
@@ -53,13 +53,13 @@ class CanSpec:
 
     @property
     def sources(self) -> tuple[int, ...]:
-        """The source addresses that it may be used under, the first choice first: where one was named, that alone."""
+        """The source addresses to use, the first choice first: a named one alone."""
         others = [address for address in range(FIRST_STATION, LAST_STATION + 1) if address != self.source]
         return (self.source,) if self.source_named else (self.source, *others)
 
     @property
     def wire(self) -> str:
-        """What tells this bus from every other one: interface, channel, and the options that say where it is."""
+        """Identity of this bus: interface, channel, and the options that locate it."""
         where = sorted(f"{key}={value}" for key, value in self.options if key not in _HOW)
         return "?".join([self.text, *(["&".join(where)] if where else [])])
 

@@ -34,7 +34,7 @@ Fields = dict[str, int | str]
 
 
 def charging(records: Sequence[NdefRecord]) -> Charging | None:
-    """What the WLC records of a message say, None where it has none."""
+    """Return the charging report of a message's WLC records, None if it has none."""
     raw: dict[str, Fields] = {}
     for record in records:
         for name, read in ((b"WLCCAP", capability), (b"WLCSTAI", status), (b"WLCCTL", control)):
@@ -135,7 +135,7 @@ def _milliseconds(exponent: int) -> int:
 
 
 def ble_address(records: Sequence[NdefRecord]) -> BleAddress | None:
-    """The device address of a Bluetooth LE out-of-band record, None where there is none that can be read."""
+    """Return the device address of a Bluetooth LE out-of-band record, None if there is no valid one."""
     for record in records:
         if record.tnf == MIME and record.type.lower() == OUT_OF_BAND:
             for kind, data in _structures(record.payload):
@@ -145,7 +145,7 @@ def ble_address(records: Sequence[NdefRecord]) -> BleAddress | None:
 
 
 def _structures(octets: bytes) -> Iterator[tuple[int, bytes]]:
-    """Advertising structures: length, type, data; ends where one is cut off."""
+    """Yield advertising structures: length, type, data; ends at one that is cut off."""
     at = 0
     while at + 1 < len(octets):
         size = octets[at]

@@ -1,7 +1,7 @@
 """NDEF messages, their framing alone (NFC Forum NDEF 1.0, section 3.2): octets to records and back.
 
-What stands in a record of somebody else is not looked at, so that one bad text record on a tag cannot hide the
-records that matter. Pure; imports no NFC library.
+The content of foreign records is ignored, so that one bad text record on a tag cannot hide the records that matter.
+Pure; imports no NFC library.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ class NdefRecord:
         return _NAMES[self.tnf] + "".join(chr(octet) if 32 <= octet < 127 else f"\\x{octet:02x}" for octet in self.type)
 
     def is_external(self, name: bytes) -> bool:
-        """Tell whether this is the external type ``name`` (compared without case, as the NFC Forum asks)."""
+        """True if this is the external type ``name`` (compared without case, as the NFC Forum requires)."""
         return self.tnf == EXTERNAL and self.type.lower() == name.lower()
 
     def is_well_known(self, name: bytes) -> bool:
-        """Tell whether this is the well-known type ``name``."""
+        """True if this is the well-known type ``name``."""
         return self.tnf == WELL_KNOWN and self.type == name
 
 
 def encode(records: Sequence[NdefRecord]) -> bytes:
-    """Return the NDEF message of ``records``: short records where the payload has at most 255 octets, no chunks."""
+    """Return the NDEF message of ``records``: short records for payloads of at most 255 octets, no chunks."""
     octets = bytearray()
     for number, record in enumerate(records):
         short = len(record.payload) < 256

@@ -1,16 +1,16 @@
-"""nfcpy, imported once, with what its import does to the whole program undone, and mended where it hangs or waits.
+"""nfcpy, imported once, with the side effects of its import undone, and fixed where it hangs or waits.
 
 Importing nfcpy 1.0.4 turns ``logging.captureWarnings`` on, sets its own logger to INFO and runs ``ldconfig`` and
-``gcc`` from PATH to look for a libcrypto that only LLCP encryption would use. Import this module only where a reader
-or an emulated tag is really wanted: it costs some 100 ms.
+``gcc`` from PATH to look for a libcrypto that only LLCP encryption would use. Import this module only if a reader or an
+emulated tag is needed: it costs some 100 ms.
 
-Three things of it are mended here; nothing above them changes:
+Three behaviors are fixed here; nothing above them changes:
 
 * An exchange without a target raises: nfcpy answers None there, which its tags take for "still present", so that a node
   that was lifted off in the middle of an exchange was never missed.
 * The PN53x driver sets its registers and its time-out before each exchange, three host commands for one that counts.
   Here they are set only when they change.
-* Each frame is written out for the log four times, whether anybody logs or not.
+* Each frame is formatted for the log four times, even without a logger. Here only with one.
 """
 
 from __future__ import annotations
@@ -56,12 +56,12 @@ Type4TagCommandError: Any = nfc.tag.tt4.Type4TagCommandError
 
 
 def _logged() -> bool:
-    """Whether anybody reads nfcpy's log of frames (``--debug``)."""
+    """True if nfcpy's log of frames is enabled (``--debug``)."""
     return bool(nfc.clf.log.isEnabledFor(logging.DEBUG))
 
 
 class QuietExchange:
-    """What a Type 4 tag of nfcpy does with an APDU, without writing it out for the log."""
+    """The APDU exchange of nfcpy's Type 4 tag, without formatting it for the log."""
 
     _dep: Any
 
@@ -77,7 +77,7 @@ class Frontend(nfc.ContactlessFrontend):  # type: ignore[misc]
     trace: Trace | None = None
 
     def exchange(self, send_data: bytes, timeout: float) -> Any:
-        """Exchange one frame; raises nfc.clf.TimeoutError where no target is activated."""
+        """Exchange one frame; raises nfc.clf.TimeoutError if no target is activated."""
         if self.target is None and self.device is not None:
             raise nfc.clf.TimeoutError("no target is activated")
         if self.trace is None:

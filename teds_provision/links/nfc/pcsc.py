@@ -46,7 +46,7 @@ def _context(scard: Any) -> Any:
 
 
 def names() -> list[str]:
-    """Names of all PC/SC readers; raises NoReaderError where the service or the library is missing."""
+    """Return the names of all PC/SC readers; raises NoReaderError if the service or the library is missing."""
     scard = _scard()
     context = _context(scard)
     try:
@@ -57,7 +57,7 @@ def names() -> list[str]:
 
 
 def names_if_any() -> list[str]:
-    """As :func:`names`, empty where there is no PC/SC here."""
+    """Return the same as :func:`names`, empty if there is no PC/SC here."""
     try:
         return contactless(names())
     except NoReaderError:
@@ -81,7 +81,7 @@ class PcscReader:
         self._card: _Card | None = None
 
     def sense(self) -> ReaderTag | None:
-        """Connect to what lies on the reader, field off and on before; None for nothing. Raises ReaderLostError."""
+        """Connect to the tag on the reader, field off and on before; None if there is none. Raises ReaderLostError."""
         self._disconnect()
         scard = self._scard
         result, handle, protocol = scard.SCardConnect(
@@ -149,7 +149,7 @@ def _error_text(scard: Any, result: int) -> str:
 
 @dataclass
 class _Target:
-    """What nfcpy's tags want to know of an activation."""
+    """The activation facts that nfcpy's tags need."""
 
     uid: bytes
 
@@ -160,7 +160,7 @@ class _Target:
 
 
 class _Card:
-    """A connected card; stands where nfcpy's tags have their front end."""
+    """A connected card; replaces the front end of nfcpy's tags."""
 
     def __init__(self, scard: Any, handle: Any, protocol: int, trace: Trace | None) -> None:
         self._scard, self._trace = scard, trace
@@ -199,7 +199,7 @@ def _tag(card: _Card) -> ReaderTag:
 
 
 class _ApduExchange:
-    """Stands where nfcpy has its ISO-DEP."""
+    """Replaces nfcpy's ISO-DEP."""
 
     def __init__(self, card: _Card) -> None:
         self._card = card

@@ -25,7 +25,7 @@ LONGEST_FRAME = 4094  # octets: the largest maxMessage (profile.md, "Command fra
 class Piece:
     """One payload record: ``body`` is the part at ``offset`` of a whole of ``total`` octets.
 
-    ``answer`` says that the node sent it, ``more`` that parts follow.
+    ``answer``: the node sent it; ``more``: parts follow.
     """
 
     transaction: int
@@ -58,10 +58,10 @@ class Piece:
 
 
 def room(max_ndef: int, others: int = 0) -> int:
-    """Return how many octets of body one message of at most ``max_ndef`` octets takes beside ``others`` octets.
+    """Return how many octets of body one message of at most ``max_ndef`` octets holds beside ``others`` octets.
 
-    ``others`` counts the whole records that stand in the same message. At least 1 when the profile can work at all;
-    0 or less when it cannot.
+    ``others`` counts the whole records in the same message. At least 1 when the profile can work at all; 0 or less when
+    it cannot.
     """
     left = max_ndef - others - 3 - len(TIM_TYPE)  # a short record: flags, type length, payload length
     if left > 255:

@@ -84,7 +84,7 @@ class Poller:
             self._mailbox.write(message.encode([tnep.select(b"")]))
 
     def restart(self) -> None:
-        """Select the service anew before the next transaction."""
+        """Select the service again before the next transaction."""
         self._selected = False
 
     def _exchange(self, octets: bytes, take: Callable[[Sequence[NdefRecord]], bool]) -> None:

@@ -1,4 +1,4 @@
-"""NFC as a port: waits for taps on a reader and carries command frames to the node that lies there (profile.md, "NFC").
+"""NFC as a port: waits for taps on a reader and carries command frames to the tapped node (profile.md, "NFC").
 
 nfcpy's ``connect`` is not used: it swallows OSError and Ctrl-C. One thread senses, activates and exchanges.
 """
@@ -28,7 +28,7 @@ from teds_provision.protocol.messages.identity import Identity
 
 @dataclass(frozen=True)
 class NodeInField:
-    """A node in the field: its tag as activated, its service, and what it says of itself."""
+    """A node in the field: its tag as activated, its service, and its unauthenticated identity."""
 
     tag: ReaderTag
     service: tnep.ServiceParameters
@@ -39,14 +39,14 @@ class NodeInField:
 
 @dataclass(frozen=True)
 class ForeignTag:
-    """A tag that is no node of ours; ``text`` says what it is."""
+    """A tag that is no node of ours; ``text`` describes it."""
 
     tag: ReaderTag
     text: str
 
 
 def look(tag: ReaderTag) -> NodeInField | ForeignTag:
-    """Read the initial message and say what the tag is; raises FieldLostError and ReaderLostError."""
+    """Read the initial message and classify the tag; raises FieldLostError and ReaderLostError."""
     try:
         records = message.decode(tag.read())
     except GarbledError as error:
@@ -84,7 +84,7 @@ _LOOK_AGAIN = 1.0  # seconds until a tag that was not wanted is read anew
 
 
 def open_port(where: str, trace: Trace | None = None) -> NfcPort:
-    """Open the reader that ``where`` names, as ``--nfc`` does; empty or ``auto``: the one that is there.
+    """Open the reader that ``where`` names, as ``--nfc`` does; empty or ``auto``: the only one.
 
     Raises NoReaderError, UsageError.
     """
@@ -95,7 +95,7 @@ class NfcPort:
     """A reader, on which nodes are found by tapping them. One tap at a time: calls from several threads take turns.
 
     ``path`` is ``udp:localhost:PORT``, a path of nfcpy, or ``auto``. Raises NoReaderError when the reader cannot be
-    opened, UsageError where ``auto`` finds several.
+    opened, UsageError if ``auto`` finds several.
     """
 
     def __init__(self, path: str, trace: Trace | None = None) -> None:
@@ -111,7 +111,7 @@ class NfcPort:
 
     @property
     def capabilities(self) -> Capabilities:
-        """What a reader can do."""
+        """Capabilities of a reader."""
         return NFC
 
     @property
@@ -156,7 +156,7 @@ class NfcPort:
         )
 
     def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
-        """The node that is tapped: a reader sees one at a time; see ``Port.everyone``."""
+        """Return the tapped node: a reader sees one at a time; see ``Port.everyone``."""
         return [self.find(lambda _: True, seconds=seconds, notice=notice)]
 
     def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
@@ -212,7 +212,7 @@ class NfcPort:
         return self._transaction
 
     def back(self, uuid: bytes, seconds: float) -> NodeInField:
-        """Activate the node ``uuid`` anew.
+        """Activate the node ``uuid`` again.
 
         Raises NodeSilentError when it, or any node, is not there within ``seconds``.
         """
@@ -247,7 +247,7 @@ class NfcPort:
         return _contact(visit, NfcLink(self, visit, notice), self.trace)
 
     def _look(self, notice: NoticeSink, stop: threading.Event) -> NodeInField | ForeignTag | None:
-        """Poll once; None when nothing lies there or the reader is away (which is told once)."""
+        """Poll once; None if there is no tag or the reader is away (which is reported once)."""
         try:
             with self.turn:
                 if self._reader is None:
@@ -291,7 +291,7 @@ class NfcPort:
 
 
 class NfcLink:
-    """The line to one node that lies on the reader; selects the service when it is first used."""
+    """The link to the node on the reader; selects the service when it is first used."""
 
     def __init__(self, port: NfcPort, visit: NodeInField, notice: NoticeSink) -> None:
         self._port = port
@@ -300,7 +300,7 @@ class NfcLink:
         self.visit = visit
         self._last = 0
         self.lost = False
-        """Whether the node left in the middle of an exchange and did not come back in time."""
+        """True if the node left in the middle of an exchange and did not come back in time."""
 
     @property
     def via(self) -> str:
@@ -309,21 +309,21 @@ class NfcLink:
 
     @property
     def capabilities(self) -> Capabilities:
-        """What a tap can do."""
+        """Capabilities of a tap."""
         return NFC
 
     @property
     def announced(self) -> dict[str, int]:
-        """What the node's service record says; see ``Announces``."""
+        """Content of the node's service record; see ``Announces``."""
         service = self.visit.service
         return {"WT_INT": service.wt_int, "N_wait": service.n_wait, "maxNdef": service.max_ndef}
 
     def exchange(self, frame: bytes) -> bytes:
         """Send one whole command frame and return its whole reply frame.
 
-        A transaction that failed is repeated as it is, at most twice within 15 s; a node that left the field for a
-        moment is activated anew (its session is gone then, which the layer above notices by the reply), and a reader
-        that failed is opened again once. Raises NodeSilentError, GarbledError or NoReaderError.
+        A failed transaction is repeated unchanged, at most twice within 15 s; a node that left the field for a moment
+        is activated again (its session is gone then, which the layer above notices by the reply), and a reader that
+        failed is opened again once. Raises NodeSilentError, GarbledError or NoReaderError.
         """
         with self._port.turn:
             self._last = self._port.next_transaction()
@@ -388,7 +388,7 @@ def _contact(visit: NodeInField, link: NfcLink, trace: Trace | None) -> Contact:
 
 
 def _report_tag(seen: NodeInField | ForeignTag, told: str, notice: NoticeSink) -> str:
-    """Name a tag that is waited past, unless it was the last one named; return what was said."""
+    """Report a foreign tag, unless it was the last one reported; return the reported text."""
     if isinstance(seen, ForeignTag):
         text = seen.text
         if text != told:
@@ -401,7 +401,7 @@ def _report_tag(seen: NodeInField | ForeignTag, told: str, notice: NoticeSink) -
 
 
 def _has_left(here: bytes | None, seen: NodeInField | ForeignTag | None, gone_at: float) -> TypeGuard[bytes]:
-    """Whether the node ``here``, which is not ``seen``, is gone: something else lies there, or nothing for a while."""
+    """True if the node ``here``, which is not ``seen``, is gone: another tag is there, or none for a while."""
     return here is not None and (seen is not None or time.monotonic() - gone_at > _DEBOUNCE)
 
 

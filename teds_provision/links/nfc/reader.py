@@ -1,4 +1,4 @@
-"""Opening a reader, and what to tell a person when that fails."""
+"""Opening a reader, and the error message if that fails."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Reader:
         self._targets = [nfc.clf.RemoteTarget(technology) for technology in technologies]
 
     def sense(self) -> ReaderTag | None:
-        """Poll the field once and activate what lies there; takes up to about 0.2 s. Raises ReaderLostError."""
+        """Poll the field once and activate a tag that is there; takes up to about 0.2 s. Raises ReaderLostError."""
         try:
             with translated():
                 target = self._clf.sense(*self._targets, iterations=1)
@@ -57,9 +57,9 @@ class Reader:
 def open_reader(path: str, trace: Trace | None = None) -> Reader | PcscReader:
     """Open the reader that ``path`` names: ``udp[:host][:port]``, ``pcsc[:READER]`` or any path of nfcpy.
 
-    Those are ``usb``, ``usb:072f:2200``, ``tty:USB0:pn532``. ``auto`` is the one USB reader that is there, else the one
-    PC/SC reader. Raises NoReaderError with the cause and its cure, UsageError for a path
-    that is none, and where ``auto`` finds several. Every frame goes to ``trace``.
+    Those are ``usb``, ``usb:072f:2200``, ``tty:USB0:pn532``. ``auto`` is the only USB reader, else the only PC/SC
+    reader. Raises NoReaderError with the cause and its remedy, UsageError for a malformed path, and if ``auto`` finds
+    several. Every frame goes to ``trace``.
     """
     if path == AUTO:
         path = _the_only_one()
@@ -106,7 +106,7 @@ def _usb_readers(path: str) -> list[tuple[int, int, int, int]]:
 
 
 def plugged_in() -> list[str]:
-    """The paths of the readers that ``auto`` chooses from: USB readers, else those of PC/SC. None is opened."""
+    """Return the paths of the readers that ``auto`` chooses from: USB readers, else those of PC/SC. None is opened."""
     try:
         found = [f"usb:{int(bus):03}:{int(number):03}" for _, _, bus, number in _usb_readers("usb")]
     except NoReaderError:  # no libusb: a PC/SC reader needs none
@@ -115,7 +115,7 @@ def plugged_in() -> list[str]:
 
 
 def _the_only_one() -> str:
-    """The path of the only reader that is there; ``usb`` where there is none, so that it says what is missing."""
+    """Return the path of the only reader; ``usb`` if there is none, so that the error names what is missing."""
     found = plugged_in()
     if len(found) > 1:
         raise UsageError(
@@ -170,7 +170,7 @@ def _absent(path: str) -> NoReaderError:
 
 
 def _kernel_driver(vendor: int, product: int) -> str:
-    """Return the kernel driver that holds the reader, "" for a program; where sysfs does not say, the usual one."""
+    """Return the kernel driver that holds the reader, "" for a program; the usual one if sysfs does not report it."""
     for device in Path("/sys/bus/usb/devices").glob("*"):
         try:
             ids = [int((device / name).read_text(), 16) for name in ("idVendor", "idProduct")]
@@ -183,7 +183,7 @@ def _kernel_driver(vendor: int, product: int) -> str:
 
 
 def _candidates() -> str:
-    """Say what was looked for, and which serial ports could have a reader behind them."""
+    """Describe what was looked for, and which serial ports could have a reader."""
     known = ", ".join(f"{vendor:04x}:{product:04x}" for vendor, product in nfc.clf.device.usb_device_map)
     ports = sorted(path.name.removeprefix("tty") for path in Path("/dev").glob("tty[AU][CMS][AB]*"))
     serial = f" Serial ports here: {', '.join(f'--nfc tty:{port}:pn532' for port in ports)}." if ports else ""

@@ -60,10 +60,10 @@ def translated() -> Iterator[None]:
 
 
 class Type4Ndef(NfcpyType4Ndef):  # type: ignore[misc]
-    """NDEF on Type 4: lengths that a short APDU can say, and the file selected once, not before every read.
+    """NDEF on Type 4: lengths that fit a short APDU, and the file selected once, not before every read.
 
-    The first read after a write asks for the length of the message and for as much of it as the shortest sealed answer
-    has: most answers are no longer, and come with one command instead of two.
+    The first read after a write fetches the length of the message and as much of it as the shortest sealed answer has:
+    most answers are no longer, and come with one command instead of two.
     """
 
     _chosen: bytes | None = None
@@ -134,14 +134,14 @@ class _BufferedFrontend:
 
 
 class IsoDep(nfc.tag.tt4.IsoDepInitiator):  # type: ignore[misc]
-    """ISO-DEP, the reader's side, with an end: nfcpy follows a tag that says S(WTX), or R(ACK), or chains, for ever."""
+    """ISO-DEP, the reader's side, with an end: nfcpy follows endless S(WTX), R(ACK) or chaining."""
 
     def __init__(self, clf: Any, fsc: int, fwt: float) -> None:
         self._air = _BufferedFrontend(clf)
         super().__init__(self._air, fsc, fwt)
 
     def exchange(self, command: bytes | None, timeout: float | None = None) -> Any:
-        """One command; raises Type4TagCommandError after 5 s, and where a block of the answer is cut short."""
+        """Exchange one command; raises Type4TagCommandError after 5 s, and if a block of the answer is cut short."""
         self._air.until = time.monotonic() + _APDU_SECONDS
         try:
             return super().exchange(command, timeout)
@@ -172,10 +172,10 @@ class _Type4Tag(QuietExchange, Type4ATag):  # type: ignore[misc]
 
 
 class _Type2Ndef(NfcpyType2Ndef):  # type: ignore[misc]
-    """NDEF on Type 2: once nfcpy has found where the message lies, one READ says whether there is one.
+    """NDEF on Type 2: once nfcpy has located the message, one READ shows whether there is one.
 
-    nfcpy reads the capability container and every TLV anew each time, and before each write. Where lock or reserved
-    octets lie within the message, or beyond the first sector, its own way is kept.
+    nfcpy reads the capability container and every TLV again each time, and before each write. If lock or reserved
+    octets are within the message, or beyond the first sector, its own way is kept.
     """
 
     _simple = False
@@ -238,7 +238,7 @@ class Type2(Type2Tag):  # type: ignore[misc]
 
 
 def _frame_limits(ats: bytes) -> tuple[int, int]:
-    """Return FSCI and FWI of an answer to select; 2 and 4 where it does not say."""
+    """Return FSCI and FWI of an answer to select; 2 and 4 if they are absent."""
     fsci, fwi = 2, 4
     if len(ats) > 1 and ats[0] > 1:
         fsci, at = ats[1] & 0x0F, 2
@@ -260,7 +260,7 @@ class ReaderTag:
 
     @property
     def is_present(self) -> bool:
-        """Whether the tag still answers, in this activation; raises ReaderLostError."""
+        """True if the tag still answers, in this activation; raises ReaderLostError."""
         try:
             with self._talking():
                 return bool(self._tag.is_present)
@@ -297,7 +297,7 @@ class ReaderTag:
 
     @contextmanager
     def _talking(self) -> Iterator[None]:
-        """Talk to the tag: FieldLostError where the reader has looked for another since."""
+        """Use the tag: FieldLostError if the reader has looked for another since."""
         with translated():
             if self._tag.target is None or self._tag.clf.target is not self._tag.target:
                 raise FieldLostError

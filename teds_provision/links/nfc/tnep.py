@@ -23,7 +23,7 @@ _SINGLE_RESPONSE = 0
 
 @dataclass(frozen=True)
 class ServiceParameters:
-    """The ``Tp`` record: what a tag says of one of its services.
+    """The ``Tp`` record: a tag's parameters of one of its services.
 
     ``wt_int`` 0 to 63, ``n_wait`` 0 to 15, ``max_ndef`` octets of the longest NDEF message that the tag takes or gives.
     """

@@ -64,7 +64,10 @@ def frontend(device: Any, path: str) -> Any:
 
 
 def _at(device: Any, host: str, port: int) -> None:
-    """What nfcpy's constructor does; it turns a port that has a name in /etc/services (10000 is webmin) into that."""
+    """Set host and port as nfcpy's constructor does.
+
+    That turns a port with a name in /etc/services (10000: webmin) into it.
+    """
     device.addr, device._path, device.socket = (host, port), f"{host}:{port}", None
     device._create_socket()
 
@@ -81,7 +84,7 @@ def _received(receive: Callable[..., _Frame], timeout: float | None, brty_list: 
 
 
 class NodeDevice(UdpDevice):  # type: ignore[misc]
-    """The tag's side of a simulated reader. ``air`` is told each frame, to imitate the time that it takes on air."""
+    """The tag's side of a simulated reader. ``air`` receives each frame, to imitate its time on air."""
 
     socket: Any
 
@@ -109,7 +112,7 @@ class NodeDevice(UdpDevice):  # type: ignore[misc]
                 knock.sendto(b"RFOFF", self.addr)
 
     def bind(self) -> bool:
-        """Lie down on the reader; False while another node lies there."""
+        """Place the node on the reader; False while another node is on it."""
         self._create_socket()
         if not self.bound:
             try:

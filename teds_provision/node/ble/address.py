@@ -20,8 +20,8 @@ _STATIC: Final = 0xC0
 class StaticAddress:
     """The address of the node in ``folder``. :meth:`look` must see each change of the node's state.
 
-    A node that was keyed when it was last seen and is in factory state now was reset: it gets another address, also
-    where the power went in between.
+    A node that was keyed when it was last seen and is in factory state now was reset: it gets another address, also if
+    the power went in between.
     """
 
     def __init__(self, folder: Path, *, factory: bool) -> None:
@@ -37,7 +37,7 @@ class StaticAddress:
         return BleAddress(self._octets, random=True)
 
     def look(self, *, factory: bool) -> bool:
-        """Take note of the node's state; True where the address has changed. Raises StoreError."""
+        """Record the node's state; return True if the address has changed. Raises StoreError."""
         if self._keyed and factory:
             self._renew(keyed=False)
             return True
@@ -58,7 +58,7 @@ class StaticAddress:
         self._octets, self._keyed = octets, keyed
 
     def _read(self) -> tuple[bytes, bool]:
-        """What the file says; no address where there is none, or none that can be read."""
+        """Return the content of the file; no address if there is none, or no valid one."""
         try:
             said = json.loads(read_limited(self._path, 4096, "address"))
             octets = bytes.fromhex(said["address"])

@@ -1,6 +1,6 @@
 """A node as a Bluetooth LE peripheral: its GATT service, its connections, when it advertises (profile.md, "BLE").
 
-Runs in the loop of whoever made it, over any controller that bumble can talk to; commands run in a crew of threads.
+Runs in the caller's loop, over any controller that bumble can talk to; commands run in a pool of threads.
 """
 
 from __future__ import annotations
@@ -113,12 +113,12 @@ class Peripheral:
         await asyncio.to_thread(self._workers.end)
 
     def tapped(self) -> None:
-        """The node was tapped: it advertises for a minute at least."""
+        """Advertise for at least a minute: the node was tapped."""
         self._tapped_until = time.monotonic() + TAPPED_SECONDS
         self._news.set()
 
     async def notify_data(self, number: int, octets: bytes) -> None:
-        """Send a data message over the connection of this number; drops it where that is gone."""
+        """Send a data message over the connection of this number; drop it if that is gone."""
         line = self._lines.get(number)
         if line is not None and line.hears:
             await self._device.notify_subscriber(line.connection, self._data, octets)
@@ -221,7 +221,7 @@ class Peripheral:
     # -- commands --------------------------------------------------------------------------------------------------
 
     def _written(self, connection: Any, value: bytes) -> None:
-        """A station wrote a piece of a command."""
+        """Handle a piece of a command that a station wrote."""
         line = self._line_of(connection)
         received = line.assembly.add_frame(bytes(value)) if line is not None else None
         if line is None or received is None or line.waiting >= _MOST_WAITING:
@@ -262,7 +262,7 @@ class Peripheral:
         self._news.set()
 
     def _driven(self, connection: Any, value: bytes) -> None:
-        """A Drive message: 00 ‖ message."""
+        """Handle a Drive message: 00 ‖ message."""
         line = self._line_of(connection)
         if line is not None and value[:1] == b"\0":
             line.turns.put(lambda: self._node.drive(line.name, bytes(value[1:])))

@@ -1,6 +1,6 @@
-"""A virtual transducer's BLE: a peripheral on a controller that bumble drives, in a loop and thread of its own.
+"""A virtual transducer's BLE: a peripheral on a controller that bumble drives, in a separate loop and thread.
 
-The controller is named as bumble does: ``usb:0`` (a dongle, taken from the kernel), ``serial:/dev/ttyACM0``,
+The controller is named as in bumble: ``usb:0`` (a dongle, taken from the kernel), ``serial:/dev/ttyACM0``,
 ``tcp-client:127.0.0.1:46100`` (a virtual one).
 """
 
@@ -48,7 +48,7 @@ class BleServer:
         return self._address.address
 
     def start(self) -> None:
-        """Open the controller; raises NoReaderError where it does not answer."""
+        """Open the controller; raises NoReaderError if it does not answer."""
         self._thread.start()
         try:
             self._run(self._open(), _OPEN_SECONDS)
@@ -69,7 +69,7 @@ class BleServer:
             self._thread.join(timeout=3)
 
     def tapped(self) -> None:
-        """The node was tapped."""
+        """Handle a tap of the node."""
         if self._peripheral is not None:
             self._loop.call_soon_threadsafe(self._peripheral.tapped)
 

@@ -22,7 +22,7 @@ _MOST_WAITING: Final = 4
 
 
 BUS: Final = "can"
-"""What stands before the colon in the names of lines: streams of one bus share a node's budget."""
+"""The part before the colon in the names of links: streams of one bus share a node's budget."""
 
 
 def link_name(station: int) -> str:
@@ -39,9 +39,9 @@ class EndpointRequest(NamedTuple):
 
 
 class StationState:
-    """One base station's line to one node: its own session (by name) and stored reply.
+    """One base station's link to one node: its session (by name) and stored reply.
 
-    A link is one pair of addresses: with a new own address it begins anew. ``pairs`` keeps the old Pair as long as it
+    A link is one pair of addresses: with a new own address it starts over. ``pairs`` keeps the old Pair as long as it
     still sends.
     """
 
@@ -61,12 +61,12 @@ class StationState:
             self.turns.put(job)
 
     def begin_anew(self) -> None:
-        """The pair of addresses is another one, or the bus was lost: session and stored reply are gone."""
+        """Start over: the pair of addresses is another one, or the bus was lost; session and stored reply are gone."""
         self._repetition.forget()
         self.endpoint.handler.lost(self.name)
 
     def reply_left(self) -> None:
-        """The reply is through, or was given up: from now on it is kept for who asks again."""
+        """Handle that the reply is sent, or was abandoned: from now on it is kept for a repeated request."""
         self.replying = None
         self._repetition.reply_sent(time.monotonic())
 
@@ -86,7 +86,7 @@ class StationState:
 
 
 class CanEndpoint:
-    """One node on the bus. ``send`` puts one of its frames on the bus; ``claim`` is made anew with each start."""
+    """One node on the bus. ``send`` puts one of its frames on the bus; ``claim`` is created at each start."""
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class CanEndpoint:
         self.claim.announced(time.monotonic())
 
     def pair(self, station: int, own: int) -> tuple[StationState, Pair]:
-        """The pair of ``own`` and ``station``, made where there is none yet."""
+        """Return the pair of ``own`` and ``station``, made if there is none yet."""
         line = self.lines.get(station)
         if line is None:
             line = self.lines[station] = StationState(self, station, self._workers.turns())
@@ -127,7 +127,7 @@ class CanEndpoint:
         return line, pair
 
     def reply_left(self, line: StationState) -> None:
-        """The reply that left this line is through, or was given up: data may follow."""
+        """Handle that the reply on this link is sent, or was abandoned: data may follow."""
         line.reply_left()
         if self.measuring is not None:
             self.measuring.reply_left(line.name)
@@ -142,7 +142,7 @@ class CanEndpoint:
                 line.turns.put(line.begin_anew)
 
     def lose_lines(self) -> None:
-        """The bus is gone: so are sessions and stored replies."""
+        """Drop sessions and stored replies: the bus is gone."""
         lines, self.lines = self.lines, {}
         for line in lines.values():
             line.gone = True

@@ -29,10 +29,10 @@ from teds_provision.protocol.operation.can_frames import drive_address, trigger_
 
 
 class EndpointTable:
-    """The seats of one process by their addresses.
+    """The endpoints of one process by their addresses.
 
-    ``at_time`` runs a job at a moment (monotonic); ``moved`` is told of a seat that takes another address, before it
-    does; ``tell`` is given what a person should know. ``echoes``: the controller gives back what we send.
+    ``at_time`` runs a job at a moment (monotonic); ``moved`` is called for an endpoint that takes another address,
+    before it does; ``tell`` receives messages for people. ``echoes``: the controller gives back what we send.
     """
 
     def __init__(
@@ -51,24 +51,24 @@ class EndpointTable:
         self.find()
 
     def at(self, address: int) -> Sequence[CanEndpoint]:
-        """The seats that have this address; nodes that have just met may be two."""
+        """Return the endpoints that have this address; nodes that have just met may be two."""
         return self._at.get(address, ())
 
     def find(self) -> None:
-        """Look anew who has which."""
+        """Rebuild the table of addresses."""
         self._at = {}
         for seat in self._endpoints:
             self._at.setdefault(seat.address, []).append(seat)
 
     def heard(self, source: int) -> None:
-        """A frame came from this address: it is taken."""
+        """Record that an address is in use: a frame came from it."""
         if 1 <= source <= LAST_NODE and source not in self._known:
             self._known.add(source)
             for seat in self._endpoints:
                 seat.claim.hear(source)
 
     def speaks(self, seat: CanEndpoint, identifier: int) -> None:
-        """A frame of one of them leaves: the others of this process hear it as they hear those of the bus."""
+        """Pass a leaving frame of an endpoint to the others of this process, which hear it as one of the bus."""
         source = identifier & 0xFF
         if source not in seat.spoken_from:
             seat.spoken_from.add(source)
@@ -77,13 +77,13 @@ class EndpointTable:
                     other.claim.hear(source)
 
     def announce_all(self) -> None:
-        """The bus is there: each announces itself after its random wait."""
+        """Schedule every endpoint's Announce after its random wait: the bus is there."""
         for seat in self._endpoints:
             seat.claim.start(time.monotonic())
             self._announce_when_due(seat)
 
     def announced(self, frame: Frame, speaker: CanEndpoint | None) -> None:
-        """An Announce was heard, from the bus or from a node of this process (``speaker``)."""
+        """Handle an Announce from the bus or from a node of this process (``speaker``)."""
         announce = Announce.decode(frame.identifier, frame.data)
         if announce is None:
             return
@@ -149,8 +149,8 @@ class CanServer:
     """Serves nodes on one CAN bus.
 
     ``spec_text`` is the value of ``--can``; ``node=`` and ``source=`` mean nothing here, since a node's address is
-    ``handler.can_address()`` and every base station is served. ``counts_as_tapped`` says whether a request from the bus
-    counts as one by tap (a node built without NFC, in factory state). ``tell`` is given what a person should know.
+    ``handler.can_address()`` and every base station is served. ``counts_as_tapped`` returns True if a request from the
+    bus counts as one by tap (a node built without NFC, in factory state). ``tell`` receives messages for people.
     """
 
     def __init__(
@@ -190,11 +190,11 @@ class CanServer:
         counts_as_tapped: Callable[[], bool] = _never,
         measuring: MeasuringHandler | None = None,
     ) -> None:
-        """Hang one more node on this bus, before :meth:`start`; ``measuring`` where it offers operation.md."""
+        """Add one more node to this bus, before :meth:`start`; ``measuring`` if it offers operation.md."""
         self._nodes.append((handler, counts_as_tapped, measuring))
 
     def start(self) -> None:
-        """Open the bus and listen; raises NoReaderError or UsageError where it cannot."""
+        """Open the bus and listen; raises NoReaderError or UsageError if it cannot."""
         self._bus = Bus(self._spec)
         self._stop.clear()
         self._workers = WorkerPool()
@@ -233,14 +233,14 @@ class CanServer:
         return EndpointTable(self._endpoints, self._at_time, self._moves, self._tell, echoes=echoes)
 
     def _moves(self, seat: CanEndpoint) -> None:
-        """What is under way from its old address ends."""
+        """End what is under way from an endpoint's old address."""
         for pairs in (self._active, self._pushing):
             pairs.difference_update([entry for entry in pairs if entry[0] is seat])
 
     def send_data(self, handler: NodeHandler, identifier: int, data: bytes, *, fd: bool) -> None:
-        """Put a data frame of a node on the bus; raises LinkError where that is lost.
+        """Put a data frame of a node on the bus; raises LinkError if that is lost.
 
-        The bus may take its time over it: what others send is heard meanwhile.
+        The bus may take its time over it: frames of others are received meanwhile.
         """
         with self._lock:
             seat, bus = self._seat_of.get(id(handler)), self._bus
@@ -373,7 +373,7 @@ class CanServer:
         self._note(seat, pair)
 
     def _measuring_frame(self, station: int, frame: Frame) -> None:
-        """A trigger, whose tick is that of its arrival for every node, or a Drive frame."""
+        """Handle a trigger, whose tick is that of its arrival for every node, or a Drive frame."""
         if trigger_station(frame.identifier) == station:
             nodes = [seat.measuring for seat in self._endpoints if seat.measuring is not None]
             for node, tick in [(node, node.tick(frame.at)) for node in nodes]:
@@ -441,7 +441,7 @@ class CanServer:
         self._note(seat, pair)
 
     def _end_answer_to_everyone(self, line: StationState, pair: Pair) -> None:
-        """Let an answer to everyone that nobody takes up give way; a reply is none."""
+        """Abandon a broadcast answer without flow control; a reply to this station alone is kept."""
         if pair.waits_for_flow and line.replying is not pair:
             pair.stop_sending()
 

@@ -1,4 +1,4 @@
-"""What a virtual transducer measures and acts with: channels, clock, battery."""
+"""The hardware of a virtual transducer: channels, clock, battery."""
 
 from typing import TYPE_CHECKING
 

@@ -43,13 +43,13 @@ class Battery:
         self._lock = threading.Lock()
 
     def field(self, *, present: bool) -> None:
-        """A charging field came or went."""
+        """Handle a charging field that came or went."""
         with self._lock:
             self._run()
             self._in_field = present
 
     def power(self) -> PowerReply:
-        """What Power (128.18) says now."""
+        """Return the present reply to Power (128.18)."""
         with self._lock:
             self._run()
             level, in_field = self._level, self._in_field
@@ -79,9 +79,9 @@ _PPM: Final = 1e-6
 
 @dataclass(frozen=True)
 class ActuatorReading:
-    """What an actuator does: its raw number, the value in ``unit`` (None: nothing says), and whether it is safe.
+    """State of an actuator: its raw number, the value in ``unit`` (None if unknown), and whether it is safe.
 
-    ``time`` is when it began to, unix seconds.
+    ``time`` is when it began, unix seconds.
     """
 
     channel: int
@@ -96,8 +96,8 @@ class ActuatorReading:
 class Board:
     """Channels of ``sheet``; ``source`` is the text of ``--source``.
 
-    ``shown`` is called with what actuators do, from any thread, and must return at once; ``tell`` is given what a
-    person should know. Raises BadDataError where a channel cannot be imitated, and what the source raises.
+    ``shown`` is called with the state of actuators, from any thread, and must return at once; ``tell`` receives
+    messages for people. Raises BadDataError if a channel cannot be imitated, and errors of the source.
     """
 
     def __init__(
@@ -154,11 +154,11 @@ class Board:
 
     @property
     def drift(self) -> int:
-        """ppm: of a simulation nobody knows how fast its time runs."""
+        """Drift in ppm; the rate of a simulation's time is unknown."""
         return _DRIFT if self.clock.runs_by_itself else _DRIFT_OF_SIMULATION
 
     def now(self) -> int:
-        """The present tick, or the one up to which samples are being taken."""
+        """Return the present tick, or the one up to which samples are being taken."""
         return self.clock.tick() if self.sampling is None else self.sampling
 
     def keeps(self, period: int) -> bool:
@@ -168,7 +168,7 @@ class Board:
     # -- sensors ---------------------------------------------------------------------------------------------------
 
     def read(self, channel: int, tick: int) -> RawReading:
-        """What the source gives for ``tick``; zeros that are not valid where it gives nothing."""
+        """Return the source's value for ``tick``; zeros that are not valid if it has none."""
         given = self.source.at(channel, tick / NANOSECONDS)
         converter = self.converters[channel]
         if given is None or channel in self.faults:
@@ -180,7 +180,7 @@ class Board:
 
     @property
     def has_events(self) -> bool:
-        """Whether it has event sensors."""
+        """True if it has event sensors."""
         return bool(self._seen)
 
     def events(self) -> Iterator[tuple[int, int, RawReading]]:
@@ -196,23 +196,23 @@ class Board:
     # -- actuators -------------------------------------------------------------------------------------------------
 
     def bears(self, channel: int, data_set: bytes) -> bool:
-        """Whether a raw value lies between those of LowLimit and HiLimit."""
+        """True if a raw value is between those of LowLimit and HiLimit."""
         low, high = self._bounds[channel]
         return low <= self.converters[channel].raw_of(data_set) <= high
 
     def apply(self, values: Mapping[int, bytes]) -> None:
-        """Show what actuators were told, and tell the source."""
+        """Show the new values of actuators, and pass them to the source."""
         with self._lock:
             self._set_points.update(values)
         for channel in values:
             self._show(channel, safe=False)
 
     def set_point(self, channel: int) -> bytes:
-        """The present value of an actuator."""
+        """Return the present value of an actuator."""
         return self._set_points[channel]
 
     def safe(self, channel: int) -> None:
-        """The safe state: LowLimit."""
+        """Bring an actuator to its safe state: LowLimit."""
         with self._lock:
             self._set_points[channel] = self._safe_state[channel]
         self._show(channel, safe=True)
@@ -232,7 +232,10 @@ class Board:
             return bytes(converter.form.octets)
 
     def _raw_limits(self, channel: int) -> tuple[float, float]:
-        """Raw numbers that the hardware bears, rounded outwards by half a step; all where the sheet states none."""
+        """Return the raw numbers that the hardware accepts, rounded outwards by half a step.
+
+        All if the sheet has none.
+        """
         converter = self.converters[channel]
         try:
             ends = sorted(converter.raw(limit) for limit in (converter.low, converter.high))
@@ -246,16 +249,16 @@ class Board:
     # -- self-test, faults, power ----------------------------------------------------------------------------------
 
     def self_test(self, channels: Sequence[int]) -> None:
-        """It takes TestTime of the Meta-TEDS, 0.1 s at least and 10 s at most; it always passes."""
+        """Run the self-test: it takes TestTime of the Meta-TEDS, 0.1 s to 10 s, and always passes."""
         end = self.now() + round(self._test_seconds * NANOSECONDS)
         self._testing.update(dict.fromkeys(channels, end))
 
     def testing(self, channel: int) -> bool:
-        """Whether its self-test runs."""
+        """True if its self-test runs."""
         return self.now() < self._testing.get(channel, 0)
 
     def fault(self, channel: int) -> bool:
-        """Whether a test put a fault in (``faults``)."""
+        """True if a test put a fault in (``faults``)."""
         return channel in self.faults
 
     def power(self) -> PowerReply:

@@ -31,7 +31,7 @@ class NodeClock:
         self.guard: Callable[[], AbstractContextManager[None]] = nullcontext
 
     def tick(self) -> int:
-        """The present tick in ns."""
+        """Return the present tick in ns."""
         with self._lock:
             return self._base if self._own else self._base + self._host() - self._since
 
@@ -42,7 +42,7 @@ class NodeClock:
 
     @property
     def runs_by_itself(self) -> bool:
-        """Whether time passes without :meth:`advance`."""
+        """True if time passes without :meth:`advance`."""
         return not self._own
 
     def now(self) -> float:
@@ -50,13 +50,13 @@ class NodeClock:
         return self.tick() / NANOSECONDS
 
     def own_clock(self) -> None:
-        """A simulation has the clock from now on."""
+        """Let a simulation drive the clock from now on."""
         with self._lock:
             if not self._own:
                 self._base, self._own = self.tick(), True
 
     def host_clock(self) -> None:
-        """The simulation is gone: the clock goes on with the host's, from where it stands."""
+        """Let the clock go on with the host's, from its present value: the simulation is gone."""
         with self._lock:
             if self._own:
                 self._since, self._own, self._step = self._host(), False, _HOST_STEP

@@ -1,4 +1,4 @@
-"""From what a source says to the octets of a sample, one value at a time and quickly; and back for an actuator."""
+"""Conversion of a source's values to the octets of a sample, one at a time and quickly; and back for an actuator."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _PACKING: Final = {DataModel.FLOAT32: struct.Struct(">f"), DataModel.FLOAT64: st
 class Converter:
     """Converts for one channel of the datasheet that the node was made with.
 
-    Where that has no calibration, an integer channel is an ideal converter: its range is spread evenly over the raw
-    numbers. Raises BadDataError where samples of that form cannot be made.
+    Without a calibration, an integer channel is an ideal converter: its range is spread evenly over the raw numbers.
+    Raises BadDataError if samples of that form cannot be made.
     """
 
     def __init__(self, sheet: Sheet, channel: Channel) -> None:
@@ -56,14 +56,14 @@ class Converter:
         return SourceChannel(self._channel.number, self._channel.name, self.low, self.high)
 
     def octets(self, reading: Reading) -> bytes:
-        """The sample that the channel gives; values are kept within the limits, and rounded to what a sample holds.
+        """Return the sample of a reading; values are kept within the limits, and rounded to what a sample holds.
 
-        Raises BadDataError where there is no way from the value to a sample.
+        Raises BadDataError if the value cannot be converted to a sample.
         """
         return self.write(reading.raw if reading.raw is not None else self.raw(reading.value or 0.0))
 
     def raw(self, value: float) -> float:
-        """The raw number, not rounded, of a value in the unit in which people see it."""
+        """Return the raw number, not rounded, of a value in its display unit."""
         if self._turn < math.inf:
             value = self._wrapped(value)
         else:
@@ -76,7 +76,7 @@ class Converter:
         return raws[at - 1] + share * (raws[at] - raws[at - 1])
 
     def _wrapped(self, value: float) -> float:
-        """An angle moved by whole turns to where the curve gives it, or to the nearer of its ends."""
+        """Return an angle moved by whole turns into the range of the curve, or to the nearer of its ends."""
         value = self._from + (value - self._from) % self._turn
         if value <= self._to:
             return value
@@ -91,7 +91,7 @@ class Converter:
         return self._writer.write(np.array([raw]))
 
     def value(self, octets: bytes) -> float | None:
-        """The value that a set point stands for, None where nothing says so."""
+        """Return the value that a set point means, None if it is undefined."""
         if self._interpreter.problem:
             ends, raw = self.form.raw_range, self.raw_of(octets)
             if ends is None or not math.isfinite(raw) or not self._ranged:
@@ -101,7 +101,7 @@ class Converter:
         return float(values[0]) if math.isfinite(values[0]) else None
 
     def raw_of(self, octets: bytes) -> float:
-        """The raw number that octets hold; NaN where they hold none."""
+        """Return the raw number that octets hold; NaN if they hold none."""
         numbers, possible = self._writer.numbers(self._writer.raw(octets))
         return float(numbers[0]) if possible[0] else math.nan
 
@@ -110,7 +110,7 @@ class Converter:
         return math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high
 
     def _tabulated(self) -> tuple[list[float], list[float]] | None:
-        """Knots of the way from values to raw numbers where straight lines between them are as good as the curve."""
+        """Return knots from values to raw numbers if straight lines between them are as good as the curve."""
         if not self._ranged:
             return None
         ends = self.form.raw_range

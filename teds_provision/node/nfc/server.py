@@ -1,4 +1,4 @@
-"""A virtual transducer's NFC: an emulated tag that lies on a simulated reader (nfcpy's udp frames, loopback only)."""
+"""A virtual transducer's NFC: an emulated tag on a simulated reader (nfcpy's udp frames, loopback only)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SHORT, _ACK_BITS = 9, 6  # etu of a short frame (7 bits) and of a 4-bit acknowl
 
 
 def command_seconds(octets: bytes) -> float:
-    """Return how long a command takes from the reader to the tag, CRC_A added where the frame has one."""
+    """Return the seconds that a command takes from the reader to the tag, with CRC_A if the frame has one."""
     if len(octets) == 1 and octets in (b"\x26", b"\x52"):
         return _SHORT * ETU
     anticollision = len(octets) == 2 and octets[0] in (0x93, 0x95, 0x97) and octets[1] == 0x20
@@ -74,12 +74,12 @@ _Respond = Callable[[bytes], bytes | None]
 
 
 class NfcServer:
-    """Serves ``handler`` on ``path`` (``udp:localhost:PORT``) as a Type 4 or a Type 2 tag, in its own thread.
+    """Serves ``handler`` on ``path`` (``udp:localhost:PORT``) as a Type 4 or a Type 2 tag, in a thread.
 
     ``uid`` has 4, 7 or 10 octets (Type 2: 7), random when None. ``wt_int`` (0 to 63) and ``n_wait`` (0 to 15) are
     announced; ``max_ndef`` octets is the longest NDEF message, by default 4160 (Type 4) or 499 (Type 2, its most).
-    ``pace`` makes every frame last as long as on air at 106 kbit/s; with ``queue`` it waits while another node lies
-    there. ``extras`` are further records of the initial message. Raises UsageError for what does not fit.
+    ``pace`` makes every frame last as long as on air at 106 kbit/s; with ``queue`` it waits while another node is on
+    the reader. ``extras`` are further records of the initial message. Raises UsageError for what does not fit.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class NfcServer:
         self._thread = threading.Thread(target=self._serve, name="nfc-tag", daemon=True)
 
     def start(self) -> None:
-        """Lie down on the reader. Raises NoReaderError, also where another node lies there and does not leave."""
+        """Place the node on the reader. Raises NoReaderError, also if another node is on it and does not leave."""
         self._device = NodeDevice(*self._address)
         if self._pace:
             self._device.air = AirTime()

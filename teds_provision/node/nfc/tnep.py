@@ -55,7 +55,7 @@ def out_of_band_record(address: bytes, *, random: bool) -> NdefRecord:
 
 
 def is_poller_information(record: NdefRecord) -> bool:
-    """Whether a reader says how it charges; it may write that at any time, into the mailbox that TNEP uses."""
+    """True if a reader reports how it charges; it may write that at any time, into the mailbox that TNEP uses."""
     return record.is_well_known(POLLER)
 
 
@@ -68,9 +68,9 @@ def _none() -> tuple[NdefRecord, ...]:
 
 @dataclass(frozen=True)
 class ExtraRecords:
-    """Records of the initial message ``before`` ``Tp`` and ``after`` the id, asked for anew each time.
+    """Records of the initial message ``before`` ``Tp`` and ``after`` the id, evaluated each time.
 
-    ``field`` is told when a reader's field comes (True) and goes.
+    ``field`` is called when a reader's field comes (True) and goes.
     """
 
     before: Records = _none
@@ -85,7 +85,7 @@ LINE = "nfc"
 
 
 class Memory(Protocol):
-    """Where the NDEF message lies: a Type 4 file or a Type 2 SRAM."""
+    """Storage of the NDEF message: a Type 4 file or a Type 2 SRAM."""
 
     max_ndef: int
     written: Callable[[bytes], None]
@@ -137,7 +137,7 @@ class TnepTag:
         self._worker.join()
 
     def activated(self) -> None:
-        """A reader selected the tag: the initial message stands there again, and is renewed as soon as possible."""
+        """Show the initial message again, renewed as soon as possible: a reader selected the tag."""
         with self._lock:
             self._serial += 1
             self._selected = False
@@ -146,7 +146,7 @@ class TnepTag:
             self._jobs.put(self._renew)
 
     def lost(self) -> None:
-        """The field is gone: so are sessions, half requests and stored replies."""
+        """Drop sessions, half requests and stored replies: the field is gone."""
         with self._lock:
             self._serial += 1
             self._selected = False
@@ -162,7 +162,10 @@ class TnepTag:
         return self._fresh.wait(seconds)
 
     def _written(self, octets: bytes) -> None:
-        """A reader completed a message: empty the mailbox at once ("need more time") and let the worker answer."""
+        """Handle a completed message of a reader.
+
+        Empties the mailbox at once ("need more time") and lets the worker answer.
+        """
         with self._lock:
             self._serial += 1
             serial = self._serial

@@ -1,4 +1,4 @@
-"""Where a virtual transducer has its values from: one file each, one line each in the table below."""
+"""Sources of a virtual transducer's values: one file each, one line each in the table below."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ONE_NODE_ONLY: Final = frozenset({"-", "unix"})
 
 
 def kind_of(text: str) -> str:
-    """The word before the colon of ``--source``; raises UsageError for one that is not known."""
+    """Return the word before the colon of ``--source``; raises UsageError for an unknown one."""
     kind = text.partition(":")[0]
     if kind not in SOURCES:
         raise UsageError(
@@ -36,6 +36,9 @@ def kind_of(text: str) -> str:
 
 
 def make_source(text: str, places: Sequence[SourceChannel], tell: Tell) -> Source:
-    """The source that ``--source`` names, for these sensors; raises UsageError, NotFoundError or BadDataError."""
+    """Return the source that ``--source`` names, for these sensors.
+
+    Raises UsageError, NotFoundError or BadDataError.
+    """
     kind = kind_of(text)
     return SOURCES[kind](text.partition(":")[2], places, tell)

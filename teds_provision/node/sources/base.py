@@ -1,4 +1,4 @@
-"""What a source of values is: where a virtual transducer has its measurements from."""
+"""The interface of a source, from which a virtual transducer takes its measurements."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from teds_provision.errors import UsageError
 
 
 class Reading(NamedTuple):
-    """What a channel shows at one instant: a ``value`` in the unit in which people see it, or a ``raw`` number."""
+    """One channel at one instant: a ``value`` in its display unit, or a ``raw`` number."""
 
     value: float | None = None
     raw: float | None = None
@@ -29,12 +29,12 @@ class SourceChannel:
 
     @cached_property
     def span(self) -> tuple[float, float]:
-        """Low and high of its range; 0 to 1 where the datasheet states none."""
+        """Return low and high of its range; 0 to 1 if the datasheet has none."""
         stated = math.isfinite(self.low) and math.isfinite(self.high)
         return (self.low, self.high) if stated else (0.0, 1.0)
 
     def between(self, share: float) -> Reading:
-        """The value at a share (0 to 1) of the range."""
+        """Return the value at a share (0 to 1) of the range."""
         low, high = self.span
         return Reading(value=low + share * (high - low))
 
@@ -43,16 +43,16 @@ Tell = Callable[[str], None]
 
 
 class Source(Protocol):
-    """Where values come from. ``at`` is called from the node's measuring thread."""
+    """A source of values. ``at`` is called from the node's measuring thread."""
 
     def at(self, channel: int, seconds: float) -> Reading | None:
-        """What a channel shows at a time of the node's clock (seconds since its start), None for nothing valid."""
+        """Return a channel's reading at a time of the node's clock (seconds since its start), None if it is invalid."""
 
     def start(self, drive: SimulationClock) -> None:
-        """Begin; a source with a clock of its own drives the node's. Raises what names why it cannot."""
+        """Begin; a source with a clock drives the node's. Raises an error with the reason if it cannot."""
 
     def acted(self, values: Mapping[str, float]) -> None:
-        """Actuators were told new values, by channel name, in the units in which people see them."""
+        """Receive new values of actuators, by channel name, in display units."""
 
     def stop(self) -> None:
         """End; never raises."""
@@ -65,16 +65,16 @@ class SimulationClock(Protocol):
         """Seconds since the node's start by its clock."""
 
     def own_clock(self) -> None:
-        """From now on the clock stands still but for :meth:`advance`."""
+        """Stop the clock, except for :meth:`advance`, from now on."""
 
     def advance(self, seconds: float, change: Callable[[], None]) -> None:
-        """The clock goes to ``seconds`` since the node's start, never back; then ``change`` puts the new values.
+        """Move the clock to ``seconds`` since the node's start, never back; then call ``change`` for the new values.
 
-        Whatever falls due before is sampled with the values before.
+        Samples that fall due before use the values before.
         """
 
     def host_clock(self) -> None:
-        """The source has ended: the clock goes on with that of the host."""
+        """Let the clock go on with that of the host: the source has ended."""
 
 
 class GeneratedSource:
@@ -87,7 +87,7 @@ class GeneratedSource:
         """Nothing to begin."""
 
     def acted(self, values: Mapping[str, float]) -> None:
-        """Nobody listens."""
+        """Ignore the values of actuators."""
 
     def stop(self) -> None:
         """Nothing to end."""

@@ -1,4 +1,4 @@
-"""``exec:COMMAND``: a program that prints lines as a simulation does, and is given what actuators are told."""
+"""``exec:COMMAND``: a program that prints lines as a simulation does, and receives the values of actuators."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class CommandSource(LineSource):
         self._stopped = False
 
     def start(self, drive: SimulationClock) -> None:
-        """Start the program; raises NotFoundError where there is none. Its errors go to our standard error."""
+        """Start the program; raises NotFoundError if there is none. Its errors go to our standard error."""
         try:
             self._process = subprocess.Popen(
                 self._words,
@@ -43,7 +43,7 @@ class CommandSource(LineSource):
         threading.Thread(target=self._run, name="source", daemon=True).start()
 
     def acted(self, values: Mapping[str, float]) -> None:
-        """Write what actuators were told; a program that does not read loses it."""
+        """Write the values of actuators; a program that does not read loses them."""
         if self._process is not None and self._process.stdin is not None:
             with contextlib.suppress(OSError, ValueError):
                 os.write(self._process.stdin.fileno(), json.dumps({"set": dict(values)}).encode() + b"\n")

@@ -1,9 +1,9 @@
-"""``-`` and ``unix:PATH``: lines of a simulation, whose own clock becomes the node's.
+"""``-`` and ``unix:PATH``: lines of a simulation, whose clock becomes the node's.
 
 A line is a JSON object: ``{"t": seconds, "value": {"NAME": x}}``, or ``"raw"`` in place of ``"value"`` or beside it.
 ``t`` counts from the simulation's start and never goes back; a value holds until a line gives another, and null makes
-it invalid. To whoever feeds through a socket or is run by ``exec:``, what actuators are told goes back as lines
-``{"set": {"NAME": x}}``.
+it invalid. A simulation on a socket or run by ``exec:`` receives the values of actuators as lines ``{"set": {"NAME":
+x}}``.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _TELL_EVERY: Final = 1000
 
 
 class LineSource:
-    """Readings as the last lines gave them; ``needs_time`` says whether a line must have ``t``.
+    """Readings as the last lines gave them; ``needs_time``: a line must have ``t``.
 
-    Lines that are none are counted, told (the first, then each thousandth), and change nothing.
+    Malformed lines are counted and reported (the first, then each thousandth), and change nothing.
     """
 
     def __init__(self, places: Sequence[SourceChannel], tell: Tell, *, needs_time: bool = True) -> None:
@@ -44,11 +44,11 @@ class LineSource:
         self.dropped = 0
 
     def at(self, channel: int, seconds: float) -> Reading | None:
-        """What the last line gave."""
+        """Return the value of the last line."""
         return self._readings.get(channel)
 
     def begin(self, drive: SimulationClock) -> None:
-        """A simulation begins; for one that must have times the clock stands still until its first line."""
+        """Begin a simulation; if it must have times, the clock stops until its first line."""
         self._drive, self._last = drive, None
         if self._needs_time:
             drive.own_clock()
@@ -62,7 +62,7 @@ class LineSource:
                 self._tell(f"A line of the source was skipped ({self.dropped} so far): {problem}.")
 
     def end(self) -> None:
-        """The source has ended: no value is valid any more, the node stays."""
+        """End the source: no value is valid any more, the node stays."""
         self._readings = {}
         if self._drive is not None:
             self._drive.host_clock()
@@ -157,7 +157,7 @@ class StandardInput(LineSource):
         threading.Thread(target=self._run, name="source", daemon=True).start()
 
     def acted(self, values: Mapping[str, float]) -> None:
-        """A pipe has no way back."""
+        """Ignore the values of actuators: a pipe has no way back."""
 
     def stop(self) -> None:
         """Take no more lines."""
@@ -172,7 +172,7 @@ class StandardInput(LineSource):
 
 
 class UnixSocket(LineSource):
-    """Lines from whoever connects to a Unix socket (mode 0600), one simulation after the other."""
+    """Lines from a client of a Unix socket (mode 0600), one simulation after the other."""
 
     def __init__(self, places: Sequence[SourceChannel], tell: Tell, path: Path) -> None:
         super().__init__(places, tell)
@@ -194,7 +194,7 @@ class UnixSocket(LineSource):
         self._thread.start()
 
     def acted(self, values: Mapping[str, float]) -> None:
-        """Send what actuators were told; a simulation that does not read loses it."""
+        """Send the values of actuators; a simulation that does not read loses them."""
         peer = self._peer
         if peer is not None:
             try:

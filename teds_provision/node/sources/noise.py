@@ -13,7 +13,7 @@ class Noise(GeneratedSource):
     """Evenly spread noise over each channel's range."""
 
     def at(self, channel: int, seconds: float) -> Reading | None:
-        """A new random value at each call."""
+        """Return a new random value at each call."""
         place = self.places.get(channel)
         return None if place is None else place.between(random.random())
 

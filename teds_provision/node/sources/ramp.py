@@ -1,4 +1,4 @@
-"""``ramp:PERIOD``: from the lowest value to the highest in each period, then anew."""
+"""``ramp:PERIOD``: from the lowest value to the highest in each period."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Ramp(GeneratedSource):
         self.period = period
 
     def at(self, channel: int, seconds: float) -> Reading | None:
-        """The ramp at that time."""
+        """Return the ramp at that time."""
         place = self.places.get(channel)
         return None if place is None else place.between((seconds / self.period) % 1.0)
 
 
 def make(argument: str, places: Sequence[SourceChannel], tell: Tell) -> Ramp:
-    """``ramp:2`` or ``ramp:20ms``; 10 s where nothing is said."""
+    """Return the source of ``ramp:2`` or ``ramp:20ms``; 10 s by default."""
     return Ramp(places, seconds_of(argument or "10", "ramp"))

@@ -1,7 +1,7 @@
-"""``file:CSV``: what a file says, played back by the node's clock; behind its last row nothing is valid.
+"""``file:CSV``: a file played back by the node's clock; after its last row all values are invalid.
 
 The first line names the columns: ``t`` (or ``time``, seconds; the first row is the node's start), then a channel's name
-for values in its unit, or ``raw:NAME`` for raw numbers. An empty field keeps nothing valid. Lines that begin with ``#``
+for values in its unit, or ``raw:NAME`` for raw numbers. An empty field is an invalid value. Lines that begin with ``#``
 are comments. A value holds until the next row.
 """
 
@@ -36,7 +36,7 @@ class RecordedSource(GeneratedSource):
         self._told = False
 
     def at(self, channel: int, seconds: float) -> Reading | None:
-        """The last row that is not newer; None behind the end."""
+        """Return the last row that is not newer; None behind the end."""
         column = self._columns.get(channel)
         if seconds > self._end:
             if not self._told:

@@ -9,14 +9,14 @@ from teds_provision.node.sources.base import GeneratedSource, Reading, SourceCha
 
 
 class Sine(GeneratedSource):
-    """A sine of ``period`` seconds; at time 0 channel 1 stands in the middle of its range and rises."""
+    """A sine of ``period`` seconds; at time 0 channel 1 is in the middle of its range and rises."""
 
     def __init__(self, places: Sequence[SourceChannel], period: float) -> None:
         super().__init__(places)
         self.period = period
 
     def at(self, channel: int, seconds: float) -> Reading | None:
-        """The sine at that time."""
+        """Return the sine at that time."""
         place = self.places.get(channel)
         if place is None:
             return None
@@ -25,5 +25,5 @@ class Sine(GeneratedSource):
 
 
 def make(argument: str, places: Sequence[SourceChannel], tell: Tell) -> Sine:
-    """``sine:2`` or ``sine:20ms``; 10 s where nothing is said."""
+    """Return the source of ``sine:2`` or ``sine:20ms``; 10 s by default."""
     return Sine(places, seconds_of(argument or "10", "sine"))
