@@ -1,8 +1,8 @@
-"""The rest of a datasheet, read behind the measurement: what was kept stands in for it until then, and no longer.
+"""Re-reads the remaining TEDS in the background; until then the cached copy is used.
 
-Every session reads the Security TEDS. Where the node has started since its other TEDS were read, it is measured at once
-by the signed copy, and they are read again in what data leave free: one node at a time on a bus, the frames of a reply
-apart from each other, and after each exchange a pause that is longer than it took.
+Every session reads the Security TEDS. If the node has started since its other TEDS were read, it is measured at once by
+the signed copy, and they are read again in the air time that data leave free: one node at a time on a bus, the frames
+of a reply apart from each other, and after each exchange a pause that is longer than it took.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class BackgroundReread:
         self._left = TRIES
 
     def step(self) -> bool:
-        """One exchange, if the bus is free for it now; False where nothing is left to do.
+        """Do one exchange, if the bus is free for it now; False if nothing is left to do.
 
-        Raises BadDatasheetError where what was read is not what the values rest on; SessionLostError.
+        Raises BadDatasheetError if the TEDS differ from those on which the values rest; SessionLostError.
         """
         began = time.monotonic()
         if began < self._due:

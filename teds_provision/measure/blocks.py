@@ -1,7 +1,7 @@
-"""What passes from the runner to the sinks: facts of channels, blocks of samples, rows of a group, reports.
+"""The data that pass from the runner to the sinks: facts of channels, blocks of samples, rows of a group, reports.
 
 One vocabulary for every sink, so that a sink never asks a node, the store or a datasheet. All of it is frozen, and a
-block's arrays are never written to after they were handed on: several sinks read them in threads of their own.
+block's arrays are never written to after they were handed on: several sinks read them in their threads.
 
 Values are in the SI unit of the datasheet (``ChannelFacts.unit``); times are unix seconds.
 """
@@ -28,11 +28,11 @@ State = Literal["waiting", "running", "lost", "refused", "ended"]
 
 @dataclass(frozen=True)
 class ChannelFacts:
-    """What the signed datasheet and the plan say of one TransducerChannel; does not change while it is measured.
+    """Facts of one TransducerChannel from signed datasheet and plan; constant while it is measured.
 
     ``unit`` is the SI unit of ``Block.value`` as text (``rad``, ``K``, ``m/s²``; empty for counts), ``units`` its
-    exponents, ``shown_unit`` the one for people (``°``, ``°C``). ``uncertainty`` (OError, worst case), ``low`` and
-    ``high`` are in ``unit``; None means that the datasheet does not say. ``calibrated`` and ``due`` are ISO dates.
+    exponents, ``shown_unit`` the display unit (``°``, ``°C``). ``uncertainty`` (OError, worst case), ``low`` and
+    ``high`` are in ``unit``; None if the datasheet has none. ``calibrated`` and ``due`` are ISO dates.
     """
 
     uuid: str  # 20 hex digits, lower case
@@ -66,12 +66,12 @@ class ChannelFacts:
 
     @property
     def key(self) -> tuple[str, int]:
-        """Node and channel: what tells channels apart in a whole station."""
+        """Node and channel, which identify a channel in a whole station."""
         return self.uuid, self.number
 
     @property
     def full_turn(self) -> bool:
-        """Whether its values wrap: an angle sensor over one turn."""
+        """True if its values wrap: an angle sensor over one turn."""
         if self.kind == "actuator" or self.units is None or self.low is None or self.high is None:
             return False
         return spans_a_turn(self.units, self.low, self.high)
@@ -86,9 +86,9 @@ class ChannelFacts:
 class Block:
     """Samples of one stream, checked and calibrated: n instants of c channels.
 
-    ``raw`` is n × c of a dtype that holds every raw value exactly (integer, float64, else object). ``value`` is
-    n × c float64, NaN exactly where ``valid`` is False. With ``test_pattern`` there are no measurements in it: every
-    value is NaN, and each sink marks what it writes.
+    ``raw`` is n × c of a dtype that holds every raw value exactly (integer, float64, else object). ``value`` is n × c
+    float64, NaN exactly where ``valid`` is False. With ``test_pattern`` there are no measurements in it: every value is
+    NaN, and each sink marks what it writes.
     """
 
     uuid: str
@@ -116,10 +116,10 @@ class Block:
 class GroupRows:
     """Rows of a group, or of one node, on one grid of times: the "synchronized data" of all its channels.
 
-    ``group`` is the name of the group, or the node's UUID where :attr:`StationFacts.each_node` says so.
+    ``group`` is the name of the group, or the node's UUID if :attr:`StationFacts.each_node` is true.
 
-    ``value`` (n × c) holds each channel's last value that is not newer than the row, ``age`` how much older it is;
-    both NaN after two periods without a value.
+    ``value`` (n × c) holds each channel's last value that is not newer than the row, ``age`` how much older it is; both
+    NaN after two periods without a value.
     """
 
     group: str
@@ -145,7 +145,7 @@ class InvalidValues:
 
 
 def why_invalid(found: Sequence[InvalidValues]) -> str:
-    """``66 of channel 1 above its high limit, 360 °``, the largest counts first; empty where all are valid."""
+    """Return ``66 of channel 1 above its high limit, 360 °``, the largest counts first; empty if all are valid."""
     most = sorted(found, key=lambda invalid: -invalid.count)
     told = [f"{invalid.count} of channel {invalid.channel}: {invalid.why}" for invalid in most[:MOST_TOLD]]
     more = sum(invalid.count for invalid in most[MOST_TOLD:])
@@ -171,13 +171,13 @@ class NodeReport:
 
 @dataclass(frozen=True)
 class StationFacts:
-    """Who measures: what a file's header, a topic's prefix and a metadata message say of the station.
+    """Facts of the station for a file's header, a topic's prefix and a metadata message.
 
-    ``names`` maps (uuid, channel) to the topic that the user chose, channel 0 to the node's part of it;
-    ``scalar_rate`` limits topics of one value (Hz), 0 leaves them out.
-    ``nodes`` maps a uuid to the node's name, of every node that this station knows: topics are unique among them all.
-    ``each_node``: nodes come and go, and each has an array topic of its own in place of the group's.
-    ``instance`` tells the measurements of one station apart, which may run side by side; "" where there is one alone.
+    ``names`` maps (uuid, channel) to the topic that the user chose, channel 0 to the node's part of it; ``scalar_rate``
+    limits topics of one value (Hz), 0 leaves them out. ``nodes`` maps a uuid to the node's name, of every node that
+    this station knows: topics are unique among them all. ``each_node``: nodes come and go, and each has an array topic
+    in place of the group's. ``instance`` distinguishes the measurements of one station, which may run side by side; ""
+    if there is only one.
     """
 
     name: str
@@ -229,9 +229,9 @@ class SetPointCommand:
 
 @dataclass
 class SinkStats:
-    """What became of what a sink was given. ``error`` is for people: the sink has ended and takes nothing more.
+    """Counters of a sink. ``error`` is for people: the sink has ended and takes nothing more.
 
-    Not frozen: a sink counts in one of its own, and a new one for each item took longer than to write the item.
+    Not frozen: each sink counts in its own, and a new one for each item took longer than to write the item.
     """
 
     written: int = 0  # samples (values) that went out
@@ -245,6 +245,6 @@ class SinkStats:
     hint: str = ""
 
     def fail(self, error: str, hint: str) -> None:
-        """The first failure stays."""
+        """Record a failure; the first one stays."""
         if self.state != "failed":
             self.state, self.error, self.hint = "failed", error, hint

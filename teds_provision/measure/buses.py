@@ -1,4 +1,4 @@
-"""The buses of this process, each heard and looked out on by one thread, whoever measures on it.
+"""The buses of this process, each read and searched by one thread for all who measure on it.
 
 Measurements, detection and commands share them: they are opened once, and closed when the process ends.
 """
@@ -42,11 +42,11 @@ class MeasuredBus:
         self.receiver.close()
 
     def assembly(self, length: int) -> StreamAssembly:
-        """What puts frames of messages of so many octets together."""
+        """Return the assembler of messages of so many octets."""
         return StreamAssembly(length, fd=isinstance(self.port, CanPort) and self.port.spec.fd)
 
     def time_for(self, time: BusTime, address: int) -> BusTime:
-        """The time of this link as the node at ``address`` has it: over the air its connection has an MTU."""
+        """Return the time of this link as the node at ``address`` has it: over the air its connection has an MTU."""
         return air_time(time, self.port.mtu(address)) if isinstance(self.port, BlePort) else time
 
     def drive(self, address: int, message: bytes) -> None:
@@ -60,7 +60,7 @@ class MeasuredBus:
 
 
 def bus_at(port: CanPort | BlePort, sightings: Presence, *, poll: float | None) -> MeasuredBus:
-    """The bus, or the adapter, behind a port."""
+    """Return the bus, or the adapter, behind a port."""
     if isinstance(port, BlePort):
         return MeasuredBus(
             port, BleStreamReceiver(port), BusShare(BusTime(mtu=LEAST_MTU)), BleDiscovery(port, sightings, poll=poll)
@@ -70,9 +70,9 @@ def bus_at(port: CanPort | BlePort, sightings: Presence, *, poll: float | None) 
 
 
 class Buses:
-    """All of them; ``with Buses(ports) as buses:`` ends their threads. The ports are the caller's to close.
+    """All of them; ``with Buses(ports) as buses:`` ends their threads. The caller closes the ports.
 
-    ``news`` is told each node that answers, from the look-out's thread.
+    ``news`` is called with each node that answers, from the discovery's thread.
     """
 
     def __init__(
@@ -107,16 +107,16 @@ class Buses:
         return tuple(self._buses.values())
 
     def bus_of(self, sighting: Sighting) -> MeasuredBus:
-        """The bus on which a node was seen."""
+        """Return the bus on which a node was seen."""
         return self._buses[sighting.port.place]
 
     def expect(self, uuids: Iterable[bytes]) -> None:
-        """These nodes will be measured: room is kept for them on every bus until it is known where they are."""
+        """Expect these nodes to be measured: every bus keeps room for them until their place is known."""
         for bus in self.all():
             bus.share.expect(uuids)
 
     def poll(self, seconds: float | None) -> None:
-        """Ask everybody so often from now on; None (as at the beginning): only while somebody is missing."""
+        """Send a broadcast every ``seconds`` from now on; None (the default): only while a node is missing."""
         self._poll = seconds
         for bus in self.all():
             bus.discovery.poll(seconds)

@@ -1,4 +1,4 @@
-"""``calibrate capture``: one point of a calibration from the running sensor, beside the reference that it stands at."""
+"""``calibrate capture``: one point of a calibration from the running sensor, with its reference value."""
 
 from __future__ import annotations
 
@@ -54,11 +54,10 @@ def capture_at(
     unit: str | None = None,
     shown_unit_asked: bool = False,
 ) -> CaptureResult:
-    """Put a point into a file: channel ``number`` of the node that ``node`` names reads so, and is at ``reference``.
+    """Add a point to a file: channel ``number`` of ``node`` gives its raw value at ``reference``.
 
-    A claim of somebody else's on the sensor is no hindrance: several may measure it. Raises PolicyError (too
-    restless, at the wrap of its raw values, a file of another node), BadDataError (unit, channel, file), NotFoundError
-    (folder).
+    Another station's claim on the sensor does not matter: several may measure it. Raises PolicyError (too restless, at
+    the wrap of its raw values, a file of another node), BadDataError (unit, channel, file), NotFoundError (folder).
     """
     uuid = station.nodes.resolve(node)
     if not file.parent.is_dir():
@@ -85,7 +84,7 @@ def capture_at(
 
 
 def _point(settled: SampleSeries, reference: float) -> Point:
-    """Mean and spread of the raw values; raises PolicyError where they say nothing of one place."""
+    """Return mean and spread of the raw values; raises PolicyError if they do not belong to one place."""
     channel = settled.interpreter.channel
     raw, _ = settled.interpreter.reader.numbers(settled.raw)
     if not np.isfinite(raw).all():

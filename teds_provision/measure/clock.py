@@ -1,9 +1,9 @@
-"""Node ticks to host time: an estimate, a bound that holds, and a lying clock is found out (operation.md section 5).
+"""Node ticks to host time: an estimate, a bound, and detection of a dishonest clock (operation.md section 5).
 
-Two kinds of evidence. A Clock *exchange* says where the offset lies: within an interval that delay can only widen. An
-*arrival* says that a sample was taken before it came: an upper limit, whose lower hull over time follows the skew.
-The estimate is a line through the exchanges (of the hull before there are enough of them), kept inside what the
-evidence allows. A refit never steps: the difference is let out over SLEW seconds, so time never goes back.
+Two kinds of evidence. A Clock *exchange* limits the offset to an interval that delay can only widen. An *arrival*
+proves that a sample was taken before it came: an upper limit, whose lower hull over time follows the skew. The estimate
+is a line through the exchanges (of the hull before there are enough of them), kept inside what the evidence allows. A
+refit never steps: the difference is spread over SLEW seconds, so time never goes back.
 
 Host time is CLOCK_MONOTONIC in nanoseconds. :class:`HostClock` converts it by one offset until the system's clock is
 set: then all stamps change at once, and every recorder begins a new part.
@@ -71,9 +71,9 @@ class Exchange:
 
 
 class ClockMap:
-    """Ticks of one node in one session to host time. Not for several threads at once.
+    """Ticks of one node in one session to host time. Not thread-safe.
 
-    ``lie`` is empty, or says why this clock cannot be believed; then stamps go on, and the data are to be marked.
+    ``lie`` is empty, or why this clock cannot be believed; then stamps go on, and the data are to be marked.
     """
 
     def __init__(self, own_drift: float = OWN_DRIFT) -> None:
@@ -93,7 +93,7 @@ class ClockMap:
 
     @property
     def known(self) -> bool:
-        """Whether there is any evidence yet."""
+        """True if there is any evidence yet."""
         return self._known
 
     @property
@@ -102,7 +102,10 @@ class ClockMap:
         return tuple(self._exchanges)
 
     def exchange(self, exchange: Exchange) -> bool:
-        """Take an exchange; False where the clock lies (``lie`` says how). It moves no stamp where there is better."""
+        """Take an exchange; False if the clock is dishonest (``lie`` has the reason).
+
+        It moves no stamp if there is better.
+        """
         if exchange.sent >= END_OF_TICKS:
             self.lie = "the node claims to have run for centuries"
             return False
@@ -164,7 +167,7 @@ class ClockMap:
         return host - round(self._line(guess))
 
     def ticks_at(self, host: int) -> TickBounds:
-        """What the node's tick may be at a host time (monotonic ns), by all evidence."""
+        """Return the bounds of the node's tick at a host time (monotonic ns), by all evidence."""
         ahead = self.ahead(host)
         return TickBounds(max(0, host + ahead.low), host + ahead.high)
 
@@ -178,10 +181,10 @@ class ClockMap:
         return TickBounds(-math.ceil(high), 1 - math.floor(low))
 
     def line(self, first: int, last: int) -> tuple[int, float, float]:
-        """Host time of a tick (monotonic ns), ns of host time for each of the node's from there on, and the bound.
+        """Return a line: host time of a tick (monotonic ns), host ns per node ns, and the bound.
 
-        The bound is of the error of what this says of any tick from ``first`` to ``last``, in seconds; infinite without
-        an exchange.
+        The bound is of the error of this line for any tick from ``first`` to ``last``, in seconds; infinite without an
+        exchange.
         """
         self._handed_out = True
         rate = 1.0 + self._skew
@@ -201,7 +204,7 @@ class ClockMap:
         return line + self._residue * min(1.0 - (tick - self._refitted) / SLEW, 1.0)
 
     def _limits(self, tick: int) -> tuple[float, float]:
-        """The offsets that all evidence allows at a tick."""
+        """Return the offsets that all evidence allows at a tick."""
         doubt = self._rate * abs(tick - self._when)
         return self._low - doubt, self._high + doubt
 
@@ -222,11 +225,11 @@ class ClockMap:
         self._known = True
 
     def _by_exchanges(self, tick: int) -> tuple[float, float]:
-        """The middle of what all exchanges allow, at most what the arrivals do; (offset at tick, skew).
+        """Return the middle of what all exchanges allow, at most what the arrivals do; (offset at tick, skew).
 
-        Delay only ever widens an exchange, on one side or the other. So the quickest request of all says more than the
-        mean of many, and so does the quickest reply. What they say is carried to ``tick`` along the skew, whose own
-        doubt makes old ones say less.
+        Delay only ever widens an exchange, on one side or the other. So the quickest request of all is better evidence
+        than the mean of many, and so is the quickest reply. Their limits are carried to ``tick`` along the skew, whose
+        uncertainty weakens old ones.
         """
         at = np.array([exchange.tick - tick for exchange in self._exchanges], dtype=np.float64)
         offsets = np.array([exchange.offset for exchange in self._exchanges])
@@ -251,7 +254,7 @@ class ClockMap:
         return min(max(skew, -self._rate), self._rate)
 
     def _by_arrivals(self, tick: int) -> tuple[float, float]:
-        """The edge of the lower hull over the middle of the window; (offset at tick, skew)."""
+        """Return the edge of the lower hull over the middle of the window; (offset at tick, skew)."""
         hull = self._hull.points()
         if not hull:
             return 0.0, 0.0
@@ -268,8 +271,8 @@ class ClockMap:
 class LowerHull:
     """The lower hull of arrivals (tick, host - tick) over the last WINDOW and a little more, a point at a time.
 
-    The best arrival of each BUCKET stands for it. What is too old goes a tenth of the window at a time: then the hull
-    is made anew, and not for every point. ``count`` is how many buckets there were.
+    The best arrival of each BUCKET represents it. Old ones are removed a tenth of the window at a time: then the hull
+    is computed again, and not for every point. ``count`` is how many buckets there were.
     """
 
     def __init__(self) -> None:
@@ -305,7 +308,7 @@ class LowerHull:
         return self._best[0] - self._closed[0][0] if self._closed else 0
 
     def points(self) -> list[tuple[int, int]]:
-        """The hull's corners, oldest first."""
+        """Return the hull's corners, oldest first."""
         hull = list(self._hull)
         if self.count:
             _extend(hull, self._best)
@@ -331,7 +334,7 @@ class WallClock:
 
     @classmethod
     def now(cls, readings: int = 9) -> WallClock:
-        """The narrowest of a few readings, so that an interruption between the two clocks does not count."""
+        """Return the narrowest of a few readings, so that an interruption between the two clocks does not count."""
         found = []
         for _ in range(readings):
             before = time.monotonic_ns()
@@ -349,9 +352,9 @@ class WallClock:
 class HostClock:
     """The wall clock of one measurement: steady, until the system's clock is set.
 
-    ``number`` counts how often that was; a block says by which one it is dated. ``apart`` are seconds by which the
-    system's clock differs from this one without being a step: they belong to the bound of a stamp's error. One thread
-    looks and sets; any thread reads :attr:`present`.
+    ``number`` counts how often that happened; each block records by which one it is dated. ``apart`` are seconds by
+    which the system's clock differs from this one without being a step: they belong to the bound of a stamp's error.
+    One thread looks and sets; any thread reads :attr:`present`.
     """
 
     def __init__(self, wall: WallClock | None = None) -> None:
@@ -360,7 +363,7 @@ class HostClock:
         self.apart = 0.0
 
     def was_set(self) -> bool:
-        """Whether the system's clock was set by more than STEP since; costs a microsecond where it was not."""
+        """Return True if the system's clock was set by more than STEP since; costs a microsecond if it was not."""
         return self._differs(WallClock.now(1)) and self._differs(WallClock.now())
 
     def _differs(self, wall: WallClock) -> bool:
@@ -387,20 +390,20 @@ class HostClock:
 
 
 class MonotonicStamps:
-    """Stamps of one stream never go back, whatever a refit says."""
+    """Stamps of one stream never go back, whatever a refit changes."""
 
     def __init__(self) -> None:
         self._last = -np.inf
 
     def __call__(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The times, each at least as late as the one before it."""
+        """Return the times, each at least as late as the one before it."""
         held: NDArray[np.float64] = np.maximum(np.maximum.accumulate(times), self._last)
         if len(held):
             self._last = float(held[-1])
         return held
 
     def straight(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The same for at least one time, all on a straight line: mostly there is nothing to do."""
+        """Return the same for at least one time, all on a straight line: mostly there is nothing to do."""
         if times[-1] >= times[0] >= self._last:
             self._last = float(times[-1])
             return times

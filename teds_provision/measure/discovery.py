@@ -1,10 +1,9 @@
-"""Who is on a bus, asked once for everybody who waits: announcements, and a functional Identify now and then.
+"""Finding nodes on a bus for all waiting threads: announcements, and a functional Identify now and then.
 
-Fifty nodes that are looked for by fifty threads would each ask the whole bus; so one look-out asks for all. It asks at
-its start, when somebody is missing (at once, once more, then after 1 s, doubling to 30 s; sooner where that one
-announces itself), and every ``poll`` seconds where it was asked to. Then it also asks each address that announces
-itself, once in 10 s at most and five a second over all (operation.md section 7). What it hears is a hint: a session
-says who it is.
+Fifty threads that look for fifty nodes would each ask the whole bus; so one discovery asks for all. It asks at its
+start, when a node is missing (at once, once more, then after 1 s, doubling to 30 s; sooner if that one announces
+itself), and every ``poll`` seconds if requested. Then it also asks each address that announces itself, once in 10 s at
+most and five a second over all (operation.md section 7). Its results are hints: a session proves identity.
 """
 
 from __future__ import annotations
@@ -42,10 +41,10 @@ LEAST, MOST = 1.0, 30.0  # seconds between questions while somebody is missing
 
 
 class BroadcastPace:
-    """When everybody is asked again: ``asked`` is when they were last.
+    """Decides when to broadcast again: ``asked`` is when that was last done.
 
-    While somebody is missing that is after ``first`` seconds, then after LEAST, doubling to MOST. ``first`` is short on
-    a bus, where a question, or its answer, may have been lost.
+    While a node is missing that is after ``first`` seconds, then after LEAST, doubling to MOST. ``first`` is short on a
+    bus, where a question, or its answer, may have been lost.
     """
 
     def __init__(self, asked: float, *, first: float = LEAST) -> None:
@@ -53,7 +52,7 @@ class BroadcastPace:
         self._first = self._pause = first
 
     def is_due(self, *, wanted: bool, missing: bool, poll: float | None) -> bool:
-        """Whether to ask now: somebody wants it, is missing, or polls."""
+        """Return True if a broadcast is due: requested, for a missing node, or by polling."""
         since = time.monotonic() - self.asked
         if wanted or not missing:
             self._pause = self._first
@@ -66,7 +65,7 @@ class BroadcastPace:
 
 
 class Discovery:
-    """A thread until :meth:`close`. ``failure`` is why the link could not be asked last, None where it could."""
+    """A thread until :meth:`close`. ``failure`` is why the last question failed, None if it did not."""
 
     LONGEST: ClassVar[float]  # seconds that one round of questions may take
 
@@ -86,11 +85,11 @@ class Discovery:
         self._thread.join(self.LONGEST)
 
     def poll(self, seconds: float | None) -> None:
-        """Ask everybody every so many seconds from now on; None: only while somebody is missing."""
+        """Send a broadcast every so many seconds from now on; None: only while a node is missing."""
         self._poll = seconds
 
     def discover(self, seconds: float | None = None) -> None:
-        """Ask everybody now, and wait until that is done; raises LinkError where the link has failed."""
+        """Send a broadcast now, and wait until that is done; raises LinkError if the link has failed."""
         with self._turn:
             wanted = self._begun + 1  # a round that is under way may be past the node that has just come
             self._asked.set()
@@ -100,7 +99,7 @@ class Discovery:
             raise self.failure
 
     def _run(self) -> None:
-        """The thread; it calls :meth:`_round_begins` and :meth:`_round_ends` around each round."""
+        """Run the thread, with :meth:`_round_begins` and :meth:`_round_ends` around each round."""
         raise NotImplementedError
 
     def _round_begins(self) -> None:
@@ -163,7 +162,7 @@ class CanDiscovery(Discovery):
                 self._ask_announcer()
 
     def _heard(self, frame: Frame | None) -> float:
-        """Seconds after the last question to everybody at which they are asked again because of this frame."""
+        """Return the seconds after the last broadcast at which the next one is due because of this frame."""
         announce = Announce.decode(frame.identifier, frame.data) if frame is not None else None
         if announce is None:
             return math.inf
@@ -185,7 +184,7 @@ class CanDiscovery(Discovery):
         return True
 
     def _ask_announcer(self) -> None:
-        """Ask one address that announced itself, where its turn has come; who is asked too soon is left out."""
+        """Ask one address that announced itself, if its turn has come; one that was asked too recently is left out."""
         now = time.monotonic()
         if now - max(self._asked_at.values(), default=-math.inf) < ALL:
             return
@@ -197,7 +196,7 @@ class CanDiscovery(Discovery):
                 return
 
     def _ask(self) -> None:
-        """One question to everybody (or to ``node=`` alone); each is told of as soon as it answers."""
+        """Send one broadcast (or ask ``node=`` alone); report each node as soon as it answers."""
         self._round_begins()
         port, began = self.port, time.monotonic()
         if port.spec.node is not None:
@@ -227,9 +226,9 @@ class CanDiscovery(Discovery):
             self._presence.note(twice_text(uuid, addresses))
 
     def identify_at(self, address: int, seconds: float) -> None:
-        """Ask one address now, on the caller's thread; who answers is told of as everybody is. Raises LinkError.
+        """Ask one address now, on the caller's thread; an answer is reported as any other. Raises LinkError.
 
-        An Announce from there ends it: the look-out asks because of that itself.
+        An Announce from there ends it: discovery asks because of that itself.
         """
         self._ask_one(address, seconds, until_announced=True)
 
@@ -252,7 +251,7 @@ ROUND = 20.0  # seconds in which somebody must advertise, else the look-out begi
 
 
 class BleStreamReceiver(StreamReceiver):
-    """The listening thread of one Bluetooth adapter; nodes are told apart by the number of their connection."""
+    """The listening thread of one Bluetooth adapter; the number of their connection identifies nodes."""
 
     def __init__(self, port: BlePort) -> None:
         self._air = port
@@ -283,9 +282,10 @@ class BleStreamReceiver(StreamReceiver):
 
 
 class BleDiscovery(Discovery):
-    """The look-out of one adapter, a thread until :meth:`close`: it looks only while somebody is missing, or on asking.
+    """The discovery of one adapter, a thread until :meth:`close`.
 
-    Every node that advertises is connected to and asked, one after the other; those that are in use are left alone.
+    It searches only while a node is missing, or on request. Every advertising node is connected to and asked, one after
+    the other; those that are in use are left alone.
     """
 
     LONGEST = ROUND
@@ -319,9 +319,9 @@ class BleDiscovery(Discovery):
 
 
 def air_time(time_: BusTime, mtu: int) -> BusTime:
-    """The adapter's time as a node behind a connection of this MTU has it."""
+    """Return the adapter's time as a node behind a connection of this MTU has it."""
     return replace(time_, mtu=mtu)
 
 
 def _nothing(_notice: Notice) -> None:
-    """What the look-out sees is told as sightings."""
+    """Ignore notices: discovery reports sightings."""

@@ -1,8 +1,8 @@
 """One line of times for all channels of a group: the "synchronized data" of the second paper.
 
-A row stands at every multiple of the grid's period. Each channel gives its last value that is not newer than the row
+There is a row at every multiple of the grid's period. Each channel gives its last value that is not newer than the row
 (never one from the future), with its age; after two of its own periods without a value both are NaN. A row waits until
-every live stream has come past it, but no longer than ``patience``: nobody waits for the slowest.
+every live stream has come past it, but no longer than ``patience``, so that no row waits for the slowest.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Grid:
         self._test = False
 
     def add_block(self, block: Block) -> None:
-        """Samples of a stream; channels that are not of this group are left out."""
+        """Add samples of a stream; channels that are not of this group are left out."""
         stream = self._stream(block)
         if stream is None or not len(block.time):
             return
@@ -89,7 +89,7 @@ class Grid:
         return known
 
     def rows(self, now: float) -> GroupRows | None:
-        """The rows that are due at unix time ``now``; None where there is none."""
+        """Return the rows that are due at unix time ``now``; None if there is none."""
         if self._next is None:
             return None
         live = [
@@ -122,7 +122,7 @@ def _side_by_side(columns: list[int]) -> slice | list[int]:
 
 
 def _fill(stream: _Stream, rows: NDArray[Any], upto: NDArray[Any], value: NDArray[Any], age: NDArray[Any]) -> None:
-    """The columns of a stream; ``upto``: times of the rows, and a little for rounding."""
+    """Fill in the columns of a stream; ``upto``: times of the rows, and a little for rounding."""
     if not stream.times:
         return
     times, values = stream.times[0], stream.values[0]

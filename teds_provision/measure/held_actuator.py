@@ -1,8 +1,8 @@
 """Operating one actuator: a set point, kept alive by the loop that computes it, and the safe state at the end.
 
 The dead-man (operation.md section 2) is fed only by :meth:`HeldActuator.apply`, which sends a value. No thread keeps it
-alive: whatever dies, the node brings its actuator to its safe state within the dead-man. A value that nobody answers
-is sent again after a quarter and a half of the dead-man, and given up at its end.
+alive: whatever dies, the node brings its actuator to its safe state within the dead-man. An unanswered value is sent
+again after a quarter and a half of the dead-man, and abandoned at its end.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LONGEST_PAUSE = 0.5  # seconds; a node that may not be moved any more is let go 
 
 @dataclass(frozen=True)
 class AppliedSetPoint:
-    """What an actuator was told: ``value`` in ``unit``, as the raw value stands for it after rounding."""
+    """A set point that was sent: ``value`` in ``unit``, after rounding to the raw value."""
 
     channel: int
     value: float
@@ -41,7 +41,7 @@ class AppliedSetPoint:
 
 
 def unit_for(channel: Channel, text: str | None) -> WrittenUnit:
-    """The unit of a set point: the one that was named, else the datasheet's SI unit.
+    """Return the unit of a set point: the one that was named, else the datasheet's SI unit.
 
     Raises BadDataError, UsageError.
     """
@@ -74,7 +74,10 @@ class HeldActuator:
         self.safe: bool | None = None
 
     def octets_of(self, value: float) -> bytes:
-        """The data set for a value in :attr:`unit`; raises PolicyError (6) beyond the limits of the datasheet."""
+        """Return the data set for a value in :attr:`unit`.
+
+        Raises PolicyError (6) beyond the limits of the datasheet.
+        """
         one = self._interpreter
         own = one.unit.from_si(self.unit.to_si(value))
         beyond = one.beyond(own, self.unit)
@@ -102,7 +105,7 @@ class HeldActuator:
         return min(self._dead_man / 4000, LONGEST_PAUSE)
 
     def apply(self, value: float) -> AppliedSetPoint:
-        """Send one value; raises PolicyError (limits, the node), LinkError where it was not taken in time."""
+        """Send one value; raises PolicyError (limits, the node), LinkError if it was not taken in time."""
         octets = self.octets_of(value)
         began = time.monotonic()
         try:

@@ -24,9 +24,9 @@ NODE_SAYS_SO = "the node marks them as invalid"
 
 
 class StreamInterpreter:
-    """Messages of one run in, blocks out. ``problems`` says of which channels there are raw values only, and why.
+    """Messages of one run in, blocks out. ``problems`` lists channels with raw values only, and why.
 
-    ``raw_only`` is a reason for which no channel has values. Used by one thread.
+    ``raw_only`` is a reason why no channel has values. Used by one thread.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class StreamInterpreter:
         )
 
     def _count_invalid(self, raws: np.ndarray, valid: np.ndarray, flagged: np.ndarray | None) -> None:
-        """Count why values of a block are not valid; ``flagged`` says of which instants the node says so itself."""
+        """Count why values of a block are not valid; ``flagged`` marks instants that the node itself reports so."""
         places = {number: k for k, number in enumerate(self._numbers)}
         for k, interpreter in enumerate(self._channels):
             bad = ~valid[:, k]
@@ -150,9 +150,9 @@ class StreamInterpreter:
                 self._invalid[key] = self._invalid.get(key, 0) + count
 
     def _spaced(self, first: StreamMessage, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """When so many instants are after that of the first one, in ns and in seconds.
+        """Return how long after the first one so many instants are, in ns and in seconds.
 
-        The period of a stream that runs free is what its own ticks say; the asked one is nominal (operation.md 3).
+        The period of a free-running stream follows from its ticks; the requested one is nominal (operation.md 3).
         """
         if self._free:
             before, self._before = self._before, first
@@ -167,7 +167,7 @@ class StreamInterpreter:
         return self._steps[:count], self._seconds[:count]
 
     def _values(self, octets: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Raw values, values (NaN where not valid), and which are valid, of instants as they stand in messages."""
+        """Return raw values, values (NaN where not valid), and validity of the instants in messages."""
         if self._many is not None:
             raws = self._many.raw(octets)
             return raws, *self._many.values(raws)

@@ -17,10 +17,10 @@ _LISTEN_SECONDS = 1.0
 
 @dataclass(frozen=True)
 class LinkSurvey:
-    """What one link says now. ``nodes`` are plain Identifies: hints, which nobody has proven.
+    """State of one link. ``nodes`` are plain Identifies: unproven hints.
 
-    ``state``: ``up``; ``listed`` for what carries no question without a tap or a connection; ``down`` with ``why`` and
-    its ``cure``. ``troubles``: what was heard that is not right, as two nodes at one address.
+    ``state``: ``up``; ``listed`` for a link that carries no question without a tap or a connection; ``down`` with
+    ``why`` and its remedy ``cure``. ``troubles``: faults that were heard, such as two nodes at one address.
     """
 
     place: str
@@ -32,7 +32,7 @@ class LinkSurvey:
 
 
 def readers() -> Iterator[LinkSurvey]:
-    """The NFC readers that are plugged in; none of them is opened."""
+    """Yield the NFC readers that are plugged in; none of them is opened."""
     return (LinkSurvey(f"nfc:{path}", "listed") for path in nfc.reader.plugged_in())
 
 

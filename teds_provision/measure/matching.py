@@ -1,8 +1,8 @@
-"""Which nodes a measurement takes in as they come (``ncap run --measure EXPR``): by type, name, group, datasheet.
+"""Selection of the nodes that a measurement takes in as they come (``ncap run --measure EXPR``).
 
 EXPR is ``all``, or terms joined by ``,`` that must all hold: ``type:PROFILE``, ``name:GLOB``, ``group:NAME``, a bound
-of ``nodes --fits`` (``angle >= 360 deg``; all bounds together are one requirement); a bare word is a group. Who may be
-measured at all is no matter of the expression: a node must have a key here, and neither be banned nor given away.
+of ``nodes --fits`` (``angle >= 360 deg``; all bounds together are one requirement); a bare word is a group. The
+expression does not decide who may be measured: a node must have a key here, and neither be banned nor given away.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ _LONGEST = 64  # characters of a name that is looked for
 
 @dataclass(frozen=True)
 class NodeMatch:
-    """An expression, read: ``types`` by name, ``names`` as patterns, ``groups``, and what the datasheet must fit.
+    """A parsed expression: ``types`` by name, ``names`` as patterns, ``groups``, and requirements on the datasheet.
 
-    ``text`` is the expression as it was said.
+    ``text`` is the expression as it was given.
     """
 
     text: str
@@ -83,14 +83,16 @@ class NodeMatch:
         return cls(text, tuple(found["type"]), tuple(found["name"]), tuple(found["group"]), fits)
 
     def require_groups(self, station: Station) -> None:
-        """Raise NotFoundError where the expression names a group that is not there."""
+        """Raise NotFoundError if the expression names a group that does not exist."""
         for group in self.groups:
             station.groups.get(group)
 
     def unknown_type(self, station: Station) -> str:
-        """Half a sentence on a type that is neither a profile here nor that of a known node; "" where there is none.
+        """Return half a sentence on a type that is neither a profile here nor that of a known node.
 
-        No mistake for certain: a node of that type may be handed over later.
+        "" if there is none.
+
+        Not certainly a mistake: a node of that type may be handed over later.
         """
         for kind in self.types:
             if not _is_profile(kind, station) and not station.nodes.find(Search(profile=kind)):
@@ -98,7 +100,7 @@ class NodeMatch:
         return ""
 
     def why_not(self, station: Station, uuid: bytes) -> str:
-        """Why a node is not meant by this expression, in half a sentence; "" where it is."""
+        """Return why this expression does not select a node, in half a sentence; "" if it does."""
         record = station.nodes.get(uuid)
         profile, name = (record.profile or "", record.name or "") if record is not None else ("", "")
         for kind in self.types:
@@ -151,7 +153,7 @@ def nearest_types(kind: str, station: Station) -> list[str]:
 
 @dataclass(frozen=True)
 class UnsignedNodes:
-    """Every node that describes itself, which nobody has signed: ``ncap run --adopt --unverified``."""
+    """Every node that describes itself without a signature: ``ncap run --adopt --unverified``."""
 
     text: str = "unverified"
 
@@ -183,7 +185,7 @@ class ListedNodes:
 
 @dataclass(frozen=True)
 class NodeLoad:
-    """What a node would take by the datasheet that is kept of it.
+    """Load of a node by its stored datasheet.
 
     ``bus`` is the share of an empty one (None: not known), ``rate`` that of the fastest channel in Hz.
     """
@@ -193,12 +195,12 @@ class NodeLoad:
     rate: float = 0.0
 
     def messages(self, scalar_rate: float, rows: bool) -> float:
-        """Messages a second on topics: each channel's, and two for each row of the node's array where ``rows`` go."""
+        """Return the messages a second on topics: each channel's, and two for each row of the array with ``rows``."""
         return self.channels * min(scalar_rate, self.rate) + (2 * min(self.rate, ROWS) if rows else 0)
 
 
 def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: BusTime) -> NodeLoad:
-    """What a node would take; ``NodeLoad()`` where no datasheet of it is kept, or none that can be measured so."""
+    """Return the load of a node; ``NodeLoad()`` if no datasheet of it is stored, or none that can be measured so."""
     image = station.nodes.datasheet(uuid)
     if image is None:
         return NodeLoad()

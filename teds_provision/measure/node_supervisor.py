@@ -1,8 +1,7 @@
-"""One node of a measurement: found, trusted, claimed, streaming; found again when it was lost; let go at the end.
+"""One node of a measurement: found, verified, claimed, streaming; found again when it was lost; released at the end.
 
-A thread of its own for each node, so the steps stay plain sequential code (operation.md section 7): Open, verify,
-Clock, Operate, Subscribe, then Clock every lease / 3. After an error again after 1 s, doubling to 30 s; after an
-Announce at once.
+A thread for each node, so the steps stay plain sequential code (operation.md section 7): Open, verify, Clock, Operate,
+Subscribe, then Clock every lease / 3. After an error again after 1 s, doubling to 30 s; after an Announce at once.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ _log = logging.getLogger(__name__)
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 LOOKING = 2.0  # seconds that a node which ran before is looked for, between its reports
 WORKED_ON, TELL, LONGEST_WORK = 0.05, 0.5, 60.0
-"""Seconds between looks whether a command works on the node, until that is told, and until it is taken to hang."""
+"""Seconds between checks whether a command works on the node, until that is reported, and until it counts as hung."""
 LOOK = 0.2  # seconds between looks at how it does
 LOOK_FOR_DATA = 0.4  # seconds after an announcement in which data shows that it was not the node's
 ANNOUNCED = 1.0  # seconds until a node without such data is asked after it
@@ -71,7 +70,7 @@ BUSY = 2.0  # seconds in which a busy node is asked again at once; then it is tr
 
 
 class NodeSupervisor:
-    """Keeps one node measuring until :meth:`stop`; ``error`` is what it ended with, None where all is well."""
+    """Keeps one node measuring until :meth:`stop`; ``error`` is what it ended with, None if all is well."""
 
     def __init__(
         self,
@@ -126,7 +125,7 @@ class NodeSupervisor:
         self._thread.start()
 
     def give_room_up(self) -> None:
-        """It does not come back."""
+        """Give up its room on the bus: it does not come back."""
         if self._comes_back:
             self._comes_back = False
             for bus in self._buses.all():
@@ -134,20 +133,20 @@ class NodeSupervisor:
 
     @property
     def begun(self) -> bool:
-        """Whether it was ever started."""
+        """True if it was ever started."""
         return self._thread.ident is not None
 
     def stop(self, why: str = "", *, comes_back: bool = False) -> None:
-        """Ask it to end in order: Stop, Idle, Close; its last report says ``why``.
+        """End it in order: Stop, Idle, Close; its last report contains ``why``.
 
-        ``comes_back``: its room on the bus stays its own until it is started again, or :meth:`give_room_up`.
+        ``comes_back``: it keeps its room on the bus until it is started again, or :meth:`give_room_up`.
         """
         self._why, self._comes_back = why, comes_back
         self._stop.set()
         self._anew.set()
 
     def command(self, command: SetPointCommand) -> None:
-        """A set point for one of its actuators; dropped while it is not there."""
+        """Take a set point for one of its actuators; dropped while the node is absent."""
         driven = self._driven
         if driven is not None:
             driven.queue_command(command)
@@ -345,7 +344,7 @@ class NodeSupervisor:
         ]
 
     def _sensors(self, every: Sequence[Channel], actuators: list[Channel]) -> list[Channel]:
-        """Sensors to measure; none where only actuators were asked for, or the node has nothing else."""
+        """Return the sensors to measure; empty if only actuators were requested, or the node has nothing else."""
         moved = {channel.number for channel in actuators}
         asked = [number for number in self._request.channels if number not in moved]
         nothing_else = all(channel.actuator for channel in every) or (self._request.channels and not asked)
@@ -354,7 +353,7 @@ class NodeSupervisor:
         return sensors_of(every, asked, self._request.kind)
 
     def _claim(self, trusted: VerifiedSession, channels: list[Channel]) -> None:
-        """Claim the sensors one by one, or the whole node at once where every sensor is measured."""
+        """Claim the sensors one by one, or the whole node at once if every sensor is measured."""
         sensors = [channel for channel in trusted.sheet.channels if not channel.actuator]
         whole = bool(channels) and len(channels) == len(sensors)
         self._claimed = [0] if whole else [channel.number for channel in channels]
@@ -363,7 +362,10 @@ class NodeSupervisor:
             claim(trusted, number, lease=self._lease)
 
     def _lease_now(self) -> int:
-        """The lease grows with the bus, and with it the pause between two Clocks, so that many nodes do not fill it."""
+        """Return the lease.
+
+        It grows with the bus, and with it the pause between two Clocks, so that many nodes do not fill it.
+        """
         nodes = self.bus.share.nodes if self.bus is not None else 0
         return min(LONGEST_LEASE, max(self._request.lease, math.ceil(LEASE_EACH * nodes)))
 
@@ -465,7 +467,7 @@ class NodeSupervisor:
                 raise LinkError(f"No message from the node for {silent:.1f} s.", hint="Check its power and the bus.")
 
     def _is_gone(self) -> bool:
-        """Whether it is of no use to wait for its answer: it is silent, or was since it was seen at another place."""
+        """True if the node is silent or was seen on another bus, so that waiting for its answer is useless."""
         now, since = time.monotonic(), self._elsewhere
         if since and now - since > max(LOOK_FOR_DATA, self.streams.every() or 0.0):
             return not self.streams.heard_since(since)
@@ -479,10 +481,10 @@ class NodeSupervisor:
         self._announced = self._announced or time.monotonic()
 
     def _doubted(self, now: float) -> bool:
-        """Whether to ask the node because it announced itself: then it has started anew, or moved.
+        """Return True if an Announce is a reason to ask the node: then it has started again, or moved.
 
-        But anyone can send an Announce. Data that still comes with good tags says more; where none comes, the session
-        is gone, and is opened again at once.
+        But any device can send an Announce. Data with good tags is better evidence; if none comes, the session is gone,
+        and is opened again at once.
         """
         since = self._announced
         if not since:

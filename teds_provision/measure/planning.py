@@ -1,7 +1,7 @@
-"""Which streams a node is asked for: channels by period, instants in a message, the gap, what the bus bears.
+"""Planning of a node's streams: channels by period, instants in a message, the gap, the bus's capacity.
 
-Raises PolicyError where an asked rate does not fit, with the fastest that does; without one the datasheet's periods
-are slowed to what fits, and ``NodePlans.slowed`` says so.
+Raises PolicyError if a requested rate does not fit, with the fastest that does; without one the datasheet's periods are
+slowed to what fits, and ``NodePlans.slowed`` reports it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ AIR_MESSAGES = 160.0  # notifications a second that an adapter is trusted with, 
 
 @dataclass(frozen=True)
 class BusTime:
-    """What a CAN bus carries: bit/s, and whether frames are FD; ``taken`` is the share of others' data frames.
+    """Capacity of a CAN bus: bit/s, and whether frames are FD; ``taken`` is the share of others' data frames.
 
     With an ``mtu`` it is a Bluetooth adapter, and a connection with that MTU.
     """
@@ -52,16 +52,16 @@ class BusTime:
 
     @property
     def fd(self) -> bool:
-        """Whether data goes in frames of 64 octets."""
+        """True if data goes in frames of 64 octets."""
         return self.data_bitrate is not None
 
 
 @dataclass
 class BusShare:
-    """How much of a bus this station's streams take; nodes ask for their share one after another.
+    """Share of a bus that this station's streams use; nodes request their share one after another.
 
-    ``expected`` are the nodes of the measurement. What those that do not stream yet want (``wanted``; a full part where
-    it is not known) is kept free for them, so that the first node does not take the room of the second.
+    ``expected`` are the nodes of the measurement. The share of those that do not stream yet (``wanted``; a full part if
+    it is not known) is reserved, so that the first node does not take the room of the second.
     """
 
     time: BusTime
@@ -71,21 +71,21 @@ class BusShare:
     lock: threading.Condition = field(default_factory=threading.Condition)
 
     def others(self, uuid: bytes, *, sharing: bool = False) -> BusTime:
-        """The bus as one node sees it; ``sharing`` leaves the nodes that are still to come their fair part."""
+        """Return the bus as one node sees it; ``sharing`` leaves the nodes that are still to come their fair part."""
         used = sum(load for key, load in self.taken.items() if key != uuid)
         if sharing:
             used += self._kept_for_others(uuid, MOST_LOAD - used)
         return replace(self.time, taken=used)
 
     def want(self, uuid: bytes, load: float) -> None:
-        """Say what a node would take of an empty bus, then wait (:data:`SAYING` at most) for the others to say it."""
+        """Report a node's share of an empty bus, then wait (:data:`SAYING` at most) for the others to do so."""
         with self.lock:
             self.wanted[uuid] = load
             self.lock.notify_all()
             self.lock.wait_for(lambda: self.expected <= self.wanted.keys(), SAYING)
 
     def expect(self, uuids: Iterable[bytes], load: float | None = None) -> None:
-        """More nodes are to come; ``load`` is what each would take of an empty bus, where that is known."""
+        """Expect more nodes; ``load`` is what each would take of an empty bus, if that is known."""
         with self.lock:
             self.expected.update(uuids)
             if load is not None:
@@ -105,7 +105,7 @@ class BusShare:
             return len(self.expected | self.taken.keys())
 
     def drop_node(self, uuid: bytes) -> None:
-        """A node that ended for good, or is on another bus, wants nothing any more."""
+        """Drop the share of a node that ended, or is on another bus."""
         with self.lock:
             self.expected.discard(uuid)
             self.wanted.pop(uuid, None)
@@ -118,7 +118,10 @@ class BusShare:
         self.drop_node(uuid)
 
     def _kept_for_others(self, uuid: bytes, room: float) -> float:
-        """What is kept for others of ``room``: whoever wants less than an equal part gets it, the rest share evenly."""
+        """Return the part of ``room`` reserved for others.
+
+        A node that wants less than an equal part gets it, the rest share evenly.
+        """
         coming = [self.wanted.get(key, MOST_LOAD) for key in self.expected - {uuid} - self.taken.keys()]
         left, level, kept = room, math.inf, len(coming) + 1
         for want in sorted([*coming, self.wanted.get(uuid, MOST_LOAD)]):
@@ -157,10 +160,10 @@ def plan_node(
     slower: float = 1.0,
     at_most: bool = False,
 ) -> NodePlans:
-    """Streams over these channels of one node; ``rate`` in Hz for all of them, ``slower`` multiplies every period.
+    """Plan streams over these channels of one node; ``rate`` in Hz for all of them, ``slower`` multiplies every period.
 
-    ``at_most``: a channel whose datasheet gives fewer samples than ``rate`` is measured at the datasheet's rate, where
-    an asked rate is refused otherwise.
+    ``at_most``: a channel whose datasheet gives fewer samples than ``rate`` is measured at the datasheet's rate;
+    without it the requested rate is refused.
     """
     groups = _groups(channels, rate, kind, at_most=at_most)
     factor = slower
@@ -186,7 +189,7 @@ def _fastest(groups: Sequence[_Group]) -> int:
 
 
 def _slowed(asked: int, fastest: int, rate: float | None, *, by_bus: bool) -> str:
-    """What to say where the shortest period (ns) became longer than the asked one; a ``--rate`` is refused instead."""
+    """Return the message if the shortest period (ns) became longer than requested; a ``--rate`` is refused instead."""
     if fastest <= asked * 1.000001:
         return ""
     possible = f"{1e9 / fastest:.6g}"
@@ -200,7 +203,7 @@ def _slowed(asked: int, fastest: int, rate: float | None, *, by_bus: bool) -> st
 
 
 def sensors_of(channels: Sequence[Channel], wanted: Sequence[int], kind: StreamKind | None) -> list[Channel]:
-    """The sensors to measure: those that were asked for, or all; raises BadDataError where one cannot be."""
+    """Return the sensors to measure: the requested ones, or all; raises BadDataError if one cannot be."""
     fitting = {channel.number: channel for channel in channels if channel.sample and channel.kind in _SENSORS_OF[kind]}
     for number in wanted:
         if number not in fitting:
@@ -224,7 +227,7 @@ _Group = tuple[int, StreamKind, list[Channel]]
 
 
 def _groups(channels: Sequence[Channel], rate: float | None, kind: StreamKind | None, *, at_most: bool) -> list[_Group]:
-    """Channels by period and kind, at most 16 each; all at the slowest period where that makes too many streams."""
+    """Return channels by period and kind, at most 16 each; all at the slowest period if that makes too many streams."""
     paced: _Paced = {}
     for channel in channels:
         event = channel.kind == ChannelKind.EVENT_SENSOR

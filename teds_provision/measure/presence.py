@@ -1,6 +1,6 @@
-"""Who was seen, where and when, on all links of a process: what the look-outs tell, and what waiting threads ask for.
+"""Sightings of nodes on all links of a process: written by the discoveries, read by waiting threads.
 
-What is seen is a hint: a session says who it is.
+A sighting is a hint: a session proves identity.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ TWIN = 0.5  # seconds in which the node itself may answer as well, where one tha
 
 @dataclass(frozen=True)
 class Sighting:
-    """A node that answered: where, as what it says it is, and when (time.monotonic). Nobody has proven any of it.
+    """A node that answered: its place, its Identify, and when (time.monotonic). All of it is unproven.
 
     ``address`` is its CAN address, over the air the number of its connection.
     """
@@ -42,7 +42,7 @@ class Sighting:
         return self.identity.uuid
 
     def contact(self) -> Contact:
-        """A line to it."""
+        """Return a link to it."""
         link, trace, bus = self.port.link(self.address), self.port.trace, self.port.place
         if isinstance(self.port, BlePort):
             return Contact(self.identity, link, connection=self.address, trace=trace, bus=bus)
@@ -54,9 +54,9 @@ Place = tuple[str, int]
 
 @dataclass
 class Presence:
-    """What the look-outs of all buses saw; :meth:`find` waits for one node. Thread-safe.
+    """Sightings of the discoveries of all buses; :meth:`find` waits for one node. Thread-safe.
 
-    A UUID may answer at two places, as anyone can send an Identify: one that turned out wrong goes behind the others.
+    A UUID may answer at two places, as any device can send an Identify: one that turned out wrong is tried last.
     """
 
     news: Callable[[Sighting], None] = lambda _sighting: None
@@ -72,7 +72,7 @@ class Presence:
     _turn: threading.Condition = field(default_factory=threading.Condition)
 
     def add_sighting(self, sighting: Sighting) -> None:
-        """Take what a look-out saw; who keeps this node at another place is told."""
+        """Take a sighting; a supervisor that has this node at another place is notified."""
         place = (sighting.port.place, sighting.address)
         with self._turn:
             self._unseen.discard(sighting.uuid)
@@ -101,13 +101,13 @@ class Presence:
     ) -> None:
         """Call ``tell``, which returns at once, when something announces itself as this node, or from its address.
 
-        ``moved`` (else ``tell``): when it answers at another place. Both are hints: anyone can send them.
+        ``moved`` (else ``tell``): when it answers at another place. Both are hints: any device can send them.
         """
         with self._turn:
             self._announced[sighting.uuid] = ((sighting.port.place, sighting.address), tell, moved or tell)
 
     def let_announce(self, uuid: bytes) -> None:
-        """Tell no more of it."""
+        """Stop notices about it."""
         with self._turn:
             self._announced.pop(uuid, None)
 
@@ -123,30 +123,30 @@ class Presence:
             tell()
 
     def awaits(self, announce: Announce) -> bool:
-        """Whether somebody waits for the node that this says it is."""
+        """True if a thread waits for the node that this claims to be."""
         with self._turn:
             return any(uuid_crc(uuid) == announce.crc for uuid in self._missing)
 
     def welcome(self, uuids: Iterable[bytes]) -> None:
-        """Nodes that are to be asked at once when they announce themselves: whoever waits for them, waits for none."""
+        """Name nodes to be asked at once when they announce themselves, although no thread waits for one."""
         self._welcome = frozenset(map(uuid_crc, uuids))
 
     def is_welcome(self, announce: Announce) -> bool:
-        """Whether this says that it is such a node."""
+        """True if this claims to be such a node."""
         return announce.crc in self._welcome
 
     def seen_at(self, uuid: bytes) -> Sighting | None:
-        """Where a node was seen last; None where it was not, or turned out not to be."""
+        """Return where a node was seen last; None if it was not, or turned out not to be."""
         with self._turn:
             return max(self._seen.get(uuid, {}).values(), key=lambda sighting: sighting.at, default=None)
 
     def missing(self) -> bool:
-        """Whether somebody waits for a node."""
+        """Return True if a thread waits for a node."""
         with self._turn:
             return bool(self._missing)
 
     def all(self) -> list[Sighting]:
-        """Every node that was seen, where it was seen last, by UUID."""
+        """Return every node with its last place, by UUID."""
         with self._turn:
             return [
                 max(places.values(), key=lambda sighting: sighting.at)
@@ -177,17 +177,17 @@ class Presence:
                     del self._missing[uuid]
 
     def wrong(self, sighting: Sighting) -> None:
-        """It was not that node, or it is gone from there: look again."""
+        """Record that it was not that node, or is gone from there, and search again."""
         place = (sighting.port.place, sighting.address)
         with self._turn:
             self._seen.get(sighting.uuid, {}).pop(place, None)
             self._wrong.setdefault(sighting.uuid, {})[place] = time.monotonic()
 
     def elsewhere(self, uuid: bytes) -> bool:
-        """Whether it answers, or ever answered, at more than one place; waits for the answer of a twin.
+        """Return True if it answers, or ever answered, at more than one place; waits for the answer of a twin.
 
-        A place that was wrong counts: the node itself may have been silent there for a moment, which is when whoever
-        says that he is it comes into question, and refuses.
+        A place that was wrong counts: the node itself may have been silent for a moment, in which an impostor answered
+        and then refused the session.
         """
 
         def other() -> bool:
@@ -197,7 +197,7 @@ class Presence:
             return self._turn.wait_for(other, TWIN)
 
     def _best(self, uuid: bytes, fresh: float) -> Sighting | None:
-        """Where to look for a node. A place that was wrong is not taken while another one may still answer."""
+        """Return where to search for a node. A place that was wrong is not tried while another one may still answer."""
         wrong, seen = self._wrong.get(uuid, {}), self._seen.get(uuid, {})
         places = [sighting for sighting in seen.values() if sighting.at >= fresh]
         best = min(

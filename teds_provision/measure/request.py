@@ -1,4 +1,4 @@
-"""What is wished for: what is to be measured of each node, and where news of it goes."""
+"""A measurement's request: what to measure of each node, and the receivers of news."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Requirements:
         self.fits: list[dict[str, Any]] = []
 
     def expect(self, uuids: Iterable[bytes]) -> None:
-        """These nodes will show a datasheet."""
+        """Expect these nodes to show a datasheet."""
         with self._turn:
             self._coming.update(uuids)
 
@@ -46,7 +46,7 @@ class Requirements:
             self._turn.notify_all()
 
     def offer(self, uuid: bytes, sheet: Sheet, stop: threading.Event) -> None:
-        """The datasheet that a node has now; returns where all of them suffice. Raises PolicyError (6)."""
+        """Check a node's present datasheet; returns when all of them suffice. Raises PolicyError (6)."""
         with self._turn:
             self._sheets[uuid] = sheet
             self._coming.discard(uuid)
@@ -76,7 +76,7 @@ class Requirements:
 
 @dataclass(frozen=True)
 class MeasurementRequest:
-    """What is to be measured of each node; ``channels`` empty: every sensor. ``rate`` in Hz, None: the datasheet's."""
+    """What to measure of each node; ``channels`` empty: every sensor. ``rate`` in Hz, None: the datasheet's."""
 
     channels: tuple[int, ...] = ()
     rate: float | None = None
@@ -97,7 +97,7 @@ class MeasurementRequest:
 
 @dataclass
 class Events:
-    """Where a node's news goes; each may be called from any thread and returns at once."""
+    """Receivers of a node's news; each may be called from any thread and returns at once."""
 
     block: Callable[[Block], None]
     facts: Callable[[Sequence[ChannelFacts]], None]

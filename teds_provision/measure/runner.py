@@ -1,7 +1,7 @@
-"""A measurement: nodes in, sinks out. Starts the keepers, the hearing thread and the sinks; ends them in order.
+"""A measurement: nodes in, sinks out. Starts the supervisors, the receiver thread and the sinks; ends them in order.
 
-The loop here moves no data. Blocks go from the hearing thread straight into the queues of the sinks; the loop gives out
-the rows of the group, reports once a second, and looks whether somebody has ended.
+The loop here moves no data. Blocks go from the receiver thread straight into the queues of the sinks; the loop emits
+the rows of the group, reports once a second, and checks for ended nodes and sinks.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Measurement:
     def run(self, stop: threading.Event, duration: float | None = None) -> MeasurementEnd:
         """Measure until ``stop``, for ``duration`` seconds of data, or until no node is left.
 
-        Raises what a sink's ``open`` raises; everything else stands in the result.
+        Raises what a sink's ``open`` raises; everything else is in the result.
         """
         self._host, self._lock = HostClock(), threading.Lock()
         self._setting = threading.Lock()  # of the clock: until it is free, no block goes on; taken after _lock
@@ -146,7 +146,7 @@ class Measurement:
                     return
 
     def _trigger(self) -> None:
-        """Pull the trigger when it is due; say for whom, and for how long, it waits."""
+        """Send the trigger when it is due; report the nodes that it waits for, and how long."""
         late = [supervisor for supervisor in self.supervisors if not supervisor.ready.is_set()]
         if self._common_start.due(len(self.supervisors) - len(late), len(self.supervisors)):
             trigger.pull(self._common_start, self.supervisors, self.watcher.note)
@@ -168,7 +168,7 @@ class Measurement:
         return not self._open and not self.lent and all(keeper.done.is_set() for keeper in self.supervisors)
 
     def _gave_up(self) -> bool:
-        """Whether no node ever ran and each has had its time."""
+        """True if no node ever ran and each has had its time."""
         return not self._open and all(
             not supervisor.ever_ran and isinstance(supervisor.error, NoNodeError) for supervisor in self.supervisors
         )
@@ -181,7 +181,7 @@ class Measurement:
                 self.watcher.sink(sink)
 
     def _is_news(self, sink: Sink) -> bool:
-        """Whether a sink failed, waits for its consumers for long or its disk for room, or goes on again."""
+        """Return True if a sink failed, waits for its consumers for long or its disk for room, or goes on again."""
         stats, now, recorder = sink.stats, time.monotonic(), sink.recorder
         state = "failed" if stats.error else str(stats.state)
         since = self._waits.setdefault(id(sink), now)
@@ -213,7 +213,7 @@ class Measurement:
         return [rows for grid in self._grids.values() if (rows := grid.rows(now)) is not None]
 
     def _follow_the_clock(self) -> None:
-        """The system's clock was set: what is measured until now is handed on by the old one, the rest by the new one.
+        """Handle a change of the system's clock: data until now are passed on by the old one, the rest by the new one.
 
         Without it a clock that was wrong when the daemon began would be wrong in every stamp until its end.
         """
@@ -229,9 +229,9 @@ class Measurement:
 
     @contextmanager
     def session(self, uuid: bytes) -> Iterator[VerifiedSession | None]:
-        """The session in which a node is measured now, for one more command; None where there is none.
+        """Give the session in which a node is measured now, for one more command; None if there is none.
 
-        The node's other exchanges wait meanwhile: be brief. Raises nothing of its own.
+        The node's other exchanges wait meanwhile: be brief. Raises no error by itself.
         """
         keeper = self._keeper(uuid)
         if keeper is None:
@@ -242,11 +242,14 @@ class Measurement:
 
     @property
     def _open(self) -> bool:
-        """Whether nodes come and go."""
+        """True if nodes come and go."""
         return self.request.newcomers
 
     def join(self, uuid: bytes) -> NodeSupervisor:
-        """Take in a node that has come, or come back; nobody else notices. Its counts go on where they ended."""
+        """Take in a node that has come, or come back; no other node notices.
+
+        Its counts go on from their last values.
+        """
         keeper = self._keeper(uuid)
         if keeper is None:
             keeper = NodeSupervisor(
@@ -265,7 +268,7 @@ class Measurement:
             keeper.join(ENDING)
 
     def suspend_node(self, uuid: bytes, why: str, seconds: float) -> bool:
-        """End one node in order for as long as somebody else works on it; False where that took longer."""
+        """End one node in order while a command works on it; False if that took longer."""
         self.lent.add(uuid)
         keeper = self._keeper(uuid)
         if keeper is None or not keeper.begun:
@@ -287,7 +290,7 @@ class Measurement:
         return next((supervisor for supervisor in self.supervisors if supervisor.uuid == uuid), None)
 
     def command(self, command: SetPointCommand) -> None:
-        """A set point that came by a sink."""
+        """Pass on a set point that came by a sink."""
         for keeper in self.supervisors:
             if keeper.uuid.hex() == command.uuid:
                 keeper.command(command)
@@ -306,7 +309,7 @@ class Measurement:
         self.watcher.block(block)
 
     def _with_names(self, facts: Sequence[ChannelFacts]) -> Sequence[ChannelFacts]:
-        """The facts of a node that joins, with the names of its topics as they are now: they may be newer than ours."""
+        """Return the facts of a node that joins, with the present names of its topics: they may be newer than ours."""
         uuids = {channel_facts.uuid for channel_facts in facts}
         names = {(uuid.hex(), channel): name for (uuid, channel), name in self.station.measurements.names.items()}
         own = {key: name for key, name in names.items() if key[0] in uuids}
@@ -383,7 +386,7 @@ class Measurement:
 
 
 def _summary(keeper: NodeSupervisor) -> dict[str, Any]:
-    """A node of the ``end`` event of ``measure --json``."""
+    """Return a node of the ``end`` event of ``measure --json``."""
     streams = [
         asdict(totals) | {"channels": list(totals.channels)} for _, totals in sorted(keeper.streams.totals.items())
     ]
@@ -394,7 +397,7 @@ def _summary(keeper: NodeSupervisor) -> dict[str, Any]:
 
 
 def _as_error(sink: Sink) -> TedsProvisionError | None:
-    """What ended a sink: of a recording it is the disk (7), of one that took nothing of what came the way to it (5)."""
+    """Return what ended a sink: of a recording the disk (7), of one that took nothing at all its transport (5)."""
     stats, recorder = sink.stats, sink.recorder
     if stats.dropped and not stats.written and not recorder:
         why = stats.error or f"{sink.name} accepted nothing: all {stats.dropped} values were dropped."

@@ -39,7 +39,7 @@ class SampleSeries:
     others: dict[int, NDArray[np.generic]]
 
     def calibrated(self) -> NDArray[np.float64]:
-        """Values in the calibrated unit, before limits; raises PolicyError where a raw value cannot be."""
+        """Return values in the calibrated unit, before limits; raises PolicyError if a raw value is impossible."""
         values, possible, _ = self.interpreter.calibrated(self.raw, self.others)
         if not (possible & np.isfinite(values)).all():
             raise PolicyError(
@@ -49,17 +49,17 @@ class SampleSeries:
 
     @property
     def extrapolated(self) -> bool:
-        """Whether it lies beyond the calibrated range."""
+        """True if it is beyond the calibrated range."""
         return bool(self.interpreter.calibrated(self.raw, self.others)[2].any())
 
 
 def take_samples_of(
     trusted: VerifiedSession, number: int, *, count: int = SAMPLES, seconds: float = SECONDS
 ) -> SampleSeries:
-    """Take ``count`` samples of a sensor over at least ``seconds``, and let it go.
+    """Take ``count`` samples of a sensor over at least ``seconds``, and release it.
 
-    Raises BadDataError (no such channel, an actuator, an event sensor), NodeRefusedError, LinkError; PolicyError where
-    the node marks a sample as not valid.
+    Raises BadDataError (no such channel, an actuator, an event sensor), NodeRefusedError, LinkError; PolicyError if the
+    node marks a sample as not valid.
     """
     channel = trusted.channel(number)
     if channel.actuator:
@@ -92,9 +92,9 @@ def take_samples_of(
 
 
 def require_still(settled: SampleSeries) -> SampleStatistics:
-    """The reading in the calibrated unit (of angles the circular mean); raises PolicyError where it is restless.
+    """Return the reading in the calibrated unit (of angles the circular mean); raises PolicyError if it is restless.
 
-    That is where it spreads, or drifts, by more than the stated uncertainty, or without one a hundredth of the range.
+    That is a spread, or drift, of more than the stated uncertainty, or without one a hundredth of the range.
     """
     channel = settled.interpreter.channel
     own = channel.calibration
@@ -114,10 +114,10 @@ def require_still(settled: SampleSeries) -> SampleStatistics:
 
 
 def reference_for(channel: Channel, value: float | None, unit: str | None, *, shown_unit_asked: bool) -> float:
-    """What a person says that a channel stands at, in SI units; None is 0 in the unit that is shown.
+    """Return an operator's reference value of a channel in SI units; None is 0 in the display unit.
 
-    ``shown_unit_asked``: who asks has to name the unit where the one that is shown is not SI. Raises UsageError for
-    that, and where 0 is not the same in both; BadDataError for a unit of another kind.
+    ``shown_unit_asked``: the caller has to name the unit if the display unit is not SI. Raises UsageError for that, and
+    if 0 is not the same in both; BadDataError for a unit of another kind.
     """
     other = (channel.shown.scale, channel.shown.offset) != (1.0, 0.0)
     unclear = bool(channel.shown.offset) if value is None else shown_unit_asked and other

@@ -25,9 +25,9 @@ ROOM = 180  # octets of data sets in one reply, so that it fits any node's maxMe
 
 @dataclass(frozen=True)
 class Sample:
-    """One value; ``value`` and ``uncertainty`` in ``unit`` (SI), None where not valid or not stated.
+    """One value; ``value`` and ``uncertainty`` in ``unit`` (SI), None if not valid or not stated.
 
-    ``shown`` is the unit in which people see it.
+    ``shown`` is the display unit.
     """
 
     channel: int
@@ -50,7 +50,7 @@ class Sample:
 
 
 def shown_json(value: float | None, uncertainty: float | None, unit: WrittenUnit) -> dict[str, Any]:
-    """A value and its uncertainty, both in SI, as people see them: ``{"value", "unit", "uncertainty"}``."""
+    """Return a value and its uncertainty, given in SI, in the display unit: ``{"value", "unit", "uncertainty"}``."""
     return {
         "value": None if value is None else unit.from_si(value),
         "unit": unit.text,
@@ -84,7 +84,7 @@ def take_samples(trusted: VerifiedSession, numbers: Sequence[int]) -> list[Sampl
 
 
 def _moment(clock: ClockMap, wall: WallClock, tick: int) -> float:
-    """Unix time of a sample that has just come; where the node's clock lies, that of its arrival."""
+    """Return the unix time of a sample that has just come; if the node's clock is dishonest, that of its arrival."""
     if clock.lie or tick >= END_OF_TICKS:
         return time.time()
     return float(wall.unix(np.array([clock.host_of(tick)]))[0])

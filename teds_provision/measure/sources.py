@@ -1,7 +1,7 @@
 """One process for each source address on a bus: a second Open on a pair of addresses ends the first's session.
 
-On this machine a mark in the home says who uses an address. Another machine, or another home, is noticed by the frames
-that it sends from the same address (operation.md section 6).
+On this machine a lock in the home records the user of an address. Another machine, or another home, is noticed by the
+frames that it sends from the same address (operation.md section 6).
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _MASK = 0x1FFF0000
 
 @contextmanager
 def sole_user(station: Station, ports: Sequence[CanPort], command: str) -> Iterator[None]:
-    """Use the source addresses of these ports alone; where none was named, each takes the next one that is free.
+    """Use the source addresses of these ports alone; without a named one, each takes the next free one.
 
-    Raises StoreLockedError (7) where another process of this home has the one that was named, and names it;
-    AddressConflictError (5) where another machine is heard to measure under it.
+    Raises StoreLockedError (7) if another process of this home has the named one; AddressConflictError (5) if another
+    machine is heard to measure under it.
     """
     with ExitStack() as stack:
         for port in ports:
@@ -47,8 +47,8 @@ def sole_user(station: Station, ports: Sequence[CanPort], command: str) -> Itera
 def beside(station: Station, links: LinkSettings, command: str, *, shared: bool = True) -> Iterator[LinkSettings]:
     """Have short sessions from the source address of ``links``, beside others who do; over a reader there is none.
 
-    Gives the links with the address in them: the next free one where none was named and a measurement has it, or, not
-    ``shared``, anybody. Raises StoreLockedError (7) where a measurement has the one that was named.
+    Yields the links with the address in them: the next free one if none was named and a measurement has it, or, not
+    ``shared``, any process. Raises StoreLockedError (7) if a measurement has the named one.
     """
     if links.via != "can":
         yield links
@@ -89,7 +89,7 @@ def _enter(stack: ExitStack, station: Station, spec: CanSpec, command: str, *, s
 
 
 def _require_alone(port: CanPort) -> None:
-    """Raise AddressConflictError where data comes for our address, and somebody who is not us sends from it."""
+    """Raise AddressConflictError if data comes for our address, and another station sends from it."""
     bus, own = port.bus(), port.spec.source & 7
 
     def ours(frame: Frame) -> bool:

@@ -78,9 +78,9 @@ def require_whitelisted(station: Station, uuid: bytes) -> None:
 class NodeStanding:
     """What a node may do while its session lasts, by today's decisions and today's verdict on its datasheet.
 
-    ``drives``: True while set points are taken for its actuators. ``unsigned``: True if a datasheet that nobody signed
-    is enough. ``mark`` is why its values are unproven, "" if they are not. ``ended`` is the error with which this
-    station itself ended the session: no other try changes that.
+    ``drives``: True while set points are taken for its actuators. ``unsigned``: True if an unsigned datasheet is
+    enough. ``mark`` is why its values are unproven, "" if they are not. ``ended`` is the error with which this station
+    itself ended the session: no other try changes that.
     """
 
     def __init__(self, station: Station, uuid: bytes) -> None:

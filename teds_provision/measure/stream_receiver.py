@@ -1,7 +1,7 @@
-"""One thread for each bus hears the data frames of all its nodes, puts messages together, checks and calibrates them.
+"""One thread for each bus receives the data frames of all its nodes, reassembles messages, checks and calibrates them.
 
-Nothing here waits for a sink, a disk or a node. A stream is heard from the moment when it is registered until it is
-taken away; what comes for nobody is dropped.
+Nothing here waits for a sink, a disk or a node. A stream is received from its registration until its removal; frames
+for no stream are dropped.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _STREAM = 0x18FF  # of an identifier: node and stream
 
 @dataclass
 class ReceivedStream:
-    """A running stream: what opens its messages, and where its blocks go.
+    """A running stream: what opens its messages, and the receiver of its blocks.
 
     ``mapping`` guards the clock map, which the node's own thread feeds. ``heard`` is when the last good message came.
     """
@@ -63,7 +63,7 @@ class ReceivedStream:
         self._test_pattern = plan.subscribe.test_pattern
 
     def handle_frame(self, frame: Frame) -> None:
-        """A frame of this stream."""
+        """Handle a frame of this stream."""
         self._take_early()
         self._assemble(frame)
 
@@ -78,18 +78,21 @@ class ReceivedStream:
             self.whole(octets, int((frame.at or time.monotonic()) * 1e9))
 
     def whole(self, octets: bytes, at: int) -> None:
-        """A whole message of this stream, which came at ``at`` (monotonic ns); it waits for others that come soon."""
+        """Handle a whole message of this stream, which came at ``at`` (monotonic ns).
+
+        It waits for others that come soon.
+        """
         if not self._came:
             self._since = time.monotonic()
         self._came.append((octets, at))
 
     @property
     def due(self) -> bool:
-        """Whether a message waits which no other will join soon."""
+        """True if a message waits which no other will join soon."""
         return self._at_once and bool(self._came)
 
     def begin(self, start: int) -> None:
-        """The first instant of a stream that waited for a trigger is known: from now on its silence counts."""
+        """Begin a triggered stream, as its first instant is known: from now on its silence counts."""
         self.finish()
         self.heard = time.monotonic()
         with self.mapping:
@@ -119,7 +122,10 @@ class ReceivedStream:
         self._hand_on(messages, blocks)
 
     def _note_arrival(self, came: list[tuple[bytes, int]], messages: list[StreamMessage]) -> None:
-        """Tell the clock which message came soonest after its samples; of a batch with drops the last one will do."""
+        """Pass the message that came soonest after its samples to the clock.
+
+        Of a batch with drops the last one will do.
+        """
         at, tick = came[-1][1], messages[-1].tick
         if len(messages) == len(came) > 1:
             soonest = at - tick
@@ -140,7 +146,7 @@ class ReceivedStream:
             self.deliver(block)
 
     def ending(self) -> int:
-        """The measurement ends now: how many messages of the run are wanted, the one that is being filled included."""
+        """End the measurement now: return how many messages of the run are wanted, including the one being filled."""
         with self.mapping:
             return self.receiver.begun(self.clock.tick_at(time.monotonic_ns()))
 
@@ -160,7 +166,7 @@ class EarlyFrames:
 
 
 class StreamReceiver:
-    """The listening thread of one link that carries data; a kind of link says in :meth:`_hear` how it hears."""
+    """The listening thread of one link that carries data; a kind of link implements :meth:`_hear`."""
 
     def __init__(self, place: str) -> None:
         self._streams: dict[tuple[int, int], ReceivedStream] = {}
@@ -169,7 +175,7 @@ class StreamReceiver:
         self._stop = threading.Event()
         self.lost_frames = 0
         self.failure: LinkError | None = None
-        """Why the bus itself cannot be heard now; None where it can."""
+        """Why the bus itself cannot be heard now; None if it can."""
         self._thread = threading.Thread(target=self._run, name=f"hearing {place}", daemon=True)
         self._thread.start()
 
@@ -228,7 +234,7 @@ class StreamReceiver:
 
 
 class CanStreamReceiver(StreamReceiver):
-    """The listening thread of one bus; nodes are told apart by their address."""
+    """The listening thread of one bus; their address identifies nodes."""
 
     def __init__(self, port: CanPort) -> None:
         self._port = port

@@ -1,13 +1,13 @@
 """Actuators of a node in a measurement: set points that come by topics, applied in the node's session.
 
 An actuator is claimed when its first set point comes, not before (operation.md section 7), and the dead-man is fed by
-set points alone: when they stop, the node goes to its safe state by itself, and the next one claims it anew. A set
-point beyond the limits of the datasheet, or older than the dead-man, is refused and told; it is never changed. It is
-looked at again right before it leaves, because the session may have been busy. More than DRIVE_ABOVE set points a
+set points alone: when they stop, the node goes to its safe state by itself, and the next one claims it again. A set
+point beyond the limits of the datasheet, or older than the dead-man, is refused and reported; it is never changed. Its
+age is checked again right before it leaves, because the session may have been busy. More than DRIVE_ABOVE set points a
 second to one actuator go as Drive messages, which need no reply.
 
-No late orders (operation.md section 2): a value that nobody answers is given up at the end of the dead-man, and no
-value leaves after it before the node has answered a Clock: its counter makes the older frame worthless.
+No late orders (operation.md section 2): an unanswered value is abandoned at the end of the dead-man, and no value
+leaves after it before the node has answered a Clock: its counter makes the older frame worthless.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class _Actuator:
 
     @property
     def fast(self) -> bool:
-        """Whether set points come so fast that a reply to each would hold them up."""
+        """True if set points come so fast that a reply to each would delay them."""
         full = len(self.came) == WATCHED
         return full and self.came[-1] - self.came[0] < (WATCHED - 1) / DRIVE_ABOVE
 
@@ -87,7 +87,7 @@ class TopicActuators:
         self._thread.start()
 
     def queue_command(self, command: SetPointCommand) -> None:
-        """A set point in the SI unit of the datasheet."""
+        """Queue a set point in the SI unit of the datasheet."""
         with self._news:
             if command.channel in self._actuators and not self._stop:
                 self._newest[command.channel] = command
@@ -136,7 +136,7 @@ class TopicActuators:
         self._echo_sample(command.channel, actuator, octets)
 
     def _seconds_left(self, command: SetPointCommand) -> float:
-        """Seconds until a set point is too old; raises LinkError where it is."""
+        """Return seconds until a set point is too old; raises LinkError if it is."""
         age = time.monotonic() - command.received
         if age > self._dead_man / 1000:
             raise LinkError(f"It is {age:.2f} s old; the dead-man is {self._dead_man} ms.")
@@ -187,7 +187,7 @@ class TopicActuators:
                 raise
 
     def _is_driven(self, command: SetPointCommand, actuator: _Actuator, octets: bytes) -> bool:
-        """Send it as a Drive message; False where the node takes none: then values go by command, as fast as it can."""
+        """Send it as a Drive message; False if the node takes none: then values go by command, as fast as it can."""
         if not actuator.drivable:
             return False
         try:

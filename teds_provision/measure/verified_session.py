@@ -1,4 +1,4 @@
-"""A session with a node whose datasheet stands: what must hold before a value of it counts (operation.md section 1)."""
+"""A session with a node whose datasheet is verified: the conditions for its values (operation.md section 1)."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def facts_of(sheet: Sheet, channel: Channel, *, name: str, fingerprint: str, per
 
 
 def _deviation(of_type: ChannelProfile | None, channel: Channel) -> float | None:
-    """Standard deviation in SI units; a profile of another unit than the datasheet's says nothing of it."""
+    """Return the standard deviation in SI units; a profile with another unit than the datasheet gives none."""
     if of_type is None or of_type.units != channel.units or of_type.calibration.standard_deviation is None:
         return None
     return _if_finite(of_type.unit.difference_to_si(of_type.calibration.standard_deviation))
@@ -88,11 +88,11 @@ DEAD_MAN = 1000  # milliseconds without a set point after which an actuator is s
 class VerifiedSession:
     """A node in a session, with a datasheet that was verified just now.
 
-    ``digest`` is what Operate takes (16 octets), ``fingerprint`` the SHA-256 of the Security TEDS in hex.
-    ``unsigned``: nobody has signed the datasheet; there are raw values alone, and nothing is moved.
-    ``profiles`` are the channels of its type, ``frames`` those that somebody chose (0: for the whole node).
-    ``unverified``: nobody has signed it either, and values are calibrated by it by a person's word; nothing is moved.
-    ``kept``: all but its Security TEDS was read before the node's last start; values come from the signed copy.
+    ``digest`` is Operate's (16 octets), ``fingerprint`` the SHA-256 of the Security TEDS in hex. ``unsigned``: the
+    datasheet has no signature; there are raw values alone, and nothing is moved. ``profiles`` are the channels of its
+    type, ``frames`` the chosen coordinate frames (0: for the whole node). ``unverified``: it has no signature either,
+    and an operator allowed to calibrate values by it; nothing is moved. ``kept``: all but its Security TEDS was read
+    before the node's last start; values come from the signed copy.
     """
 
     node: Conversation
@@ -116,7 +116,7 @@ class VerifiedSession:
         return bytes.fromhex(self.fingerprint)[: commands.DIGEST_OCTETS]
 
     def facts(self, channel: Channel, period: float | None) -> ChannelFacts:
-        """What goes with every value of a channel that gives one every ``period`` seconds."""
+        """Return the facts for every value of a channel that gives one every ``period`` seconds."""
         siblings = tuple((channel.number, channel.name) for channel in self.sheet.channels)
         if self.unsigned:  # a name to tell channels apart; nothing else that the node says of itself is repeated
             kind = facts_of(self.sheet, channel, name=self.name, fingerprint="", period=period).kind
@@ -131,7 +131,7 @@ class VerifiedSession:
         return replace(known, siblings=siblings, frame=frame, deviation=_deviation(of_type, channel))
 
     def channel(self, number: int) -> Channel:
-        """A channel of the datasheet; raises BadDataError where there is none."""
+        """Return a channel of the datasheet; raises BadDataError if there is none."""
         found = self.sheet.channel(number)
         if found is None:
             numbers = ", ".join(str(channel.number) for channel in self.sheet.channels) or "none"
@@ -140,7 +140,7 @@ class VerifiedSession:
 
 
 def open_trusted(station: Station, node: Conversation, *, by: str, unsigned: bool = False) -> VerifiedSession:
-    """Open a session and verify the datasheet for the command ``by``; ``unsigned`` also takes one that nobody signed.
+    """Open a session and verify the datasheet for the command ``by``; ``unsigned`` also accepts an unsigned one.
 
     Raises PolicyError (no key, not listed), NotAuthenticError and UnprovenError (revoked, the datasheet), LinkError.
     """
@@ -150,10 +150,10 @@ def open_trusted(station: Station, node: Conversation, *, by: str, unsigned: boo
 
 
 def open_unverified(station: Station, node: Conversation, *, by: str) -> VerifiedSession:
-    """Open a session with a node whose datasheet nobody has signed, all of it read in a session since its last start.
+    """Open a session with a node with an unsigned datasheet, all of it read in a session since its last start.
 
-    The session says that it is this node's; that it is right, nobody says. Raises PolicyError where somebody signed
-    it, and what :func:`open_trusted` raises.
+    The session proves that it is this node's, not that it is right. Raises PolicyError if it is signed, and what
+    :func:`open_trusted` raises.
     """
     require_measurable(station, node.uuid)
     require_session(station, node)
@@ -177,7 +177,7 @@ def open_unverified(station: Station, node: Conversation, *, by: str) -> Verifie
 def trusted_from(
     station: Station, node: Conversation, looked: NodeVerification, *, unsigned: bool = False
 ) -> VerifiedSession:
-    """The node in its session, by what was seen there; raises as :func:`open_trusted` does."""
+    """Return the node in its session, by what was seen there; raises as :func:`open_trusted` does."""
     image = looked.image
     bare = unsigned and looked.verified.verdict == "unsigned"
     if not bare:
@@ -191,7 +191,7 @@ def trusted_from(
 
 
 def exchange_clock(node: Conversation, clock: ClockMap) -> ClockReply:
-    """One Clock command, taken into the map; the map's ``lie`` says where the node's clock cannot be believed."""
+    """Do one Clock exchange into the map; the map's ``lie`` is set if the node's clock cannot be believed."""
     reply, exchange = ask_clock(node)
     clock.exchange(exchange)
     return reply
@@ -220,5 +220,5 @@ def claim(trusted: VerifiedSession, channel: int, *, lease: int, dead_man: int |
 
 
 def operation(node: Conversation) -> OperationReply:
-    """What the node claims and does (128.19)."""
+    """Return what the node claims and does (128.19)."""
     return OperationReply.decode(node.request(commands.OPERATION, "to tell its mode"))

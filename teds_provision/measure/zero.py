@@ -1,7 +1,7 @@
-"""``calibrate zero``: "this is 0 now", where the sensor is mounted. Read, build, sign, write, verify: one step.
+"""``calibrate zero``: define the present reading as 0. Read, build, sign, write, verify: one step.
 
-The curve stays, and so does the date of its calibration; its zero offset moves, and the date of that stands beside it.
-The guard judges the result as it judges any calibration. What is on the node counts, no profile is asked for.
+The curve stays, and so does the date of its calibration; its zero offset moves, and the date of that is stored beside
+it. The guard judges the result as it judges any calibration. The node's own datasheet counts, no profile is needed.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ _AFTERWARDS: Final = 16
 
 @dataclass(frozen=True)
 class ZeroOrder:
-    """Which channel reads ``value`` (None: 0) now, in ``unit`` (None: SI).
+    """The channel that reads ``value`` (None: 0) now, in ``unit`` (None: SI).
 
-    ``shown_unit_asked``: a person at a terminal has to name the unit where the one that is shown is not SI.
+    ``shown_unit_asked``: an operator at a terminal has to name the unit if the display unit is not SI.
     ``accept_calibration`` is the reason given for a result that the guard would refuse.
     """
 
@@ -67,8 +67,8 @@ class ZeroOrder:
 class ZeroResult:
     """What was done, or with a dry run would be: numbers are in SI units, ``offset`` and ``moved`` are differences.
 
-    ``before`` is what the channel read, ``after`` what it reads now (for a dry run: will read). ``moved`` is 0 where
-    there was nothing to do.
+    ``before`` is the channel's reading before, ``after`` the one now (for a dry run: expected). ``moved`` is 0 if there
+    was nothing to do.
     """
 
     uuid: bytes
@@ -98,8 +98,8 @@ def zero_at(
 ) -> ZeroResult:
     """Have a channel of the node that ``node`` names read ``order.value`` now.
 
-    A running `ncap` of this home that measures the node lets it go, and gets it back. Raises PolicyError (too
-    restless, no calibration whose offset could carry it, a value beyond the limits, the guard), NotAuthenticError where
+    A running `ncap` of this home that measures the node releases it, and gets it back. Raises PolicyError (too
+    restless, no calibration whose offset could carry it, a value beyond the limits, the guard), NotAuthenticError if
     the datasheet on the node is not good, and what reading, signing and writing raise.
     """
     uuid = station.nodes.resolve(node)
@@ -177,7 +177,7 @@ class _ZeroRun:
         return self._bring(wanted_image, found)
 
     def _wanted(self, channel: Channel, own: Calibration) -> float:
-        """What the channel is to read, in the calibrated unit; raises PolicyError beyond its limits."""
+        """Return the wanted reading of the channel, in the calibrated unit; raises PolicyError beyond its limits."""
         order = self.order
         si = reference_for(channel, order.value, order.unit, shown_unit_asked=order.shown_unit_asked)
         if not channel.full_turn:
@@ -238,7 +238,7 @@ class _ZeroRun:
 
 
 def _require_nobody_else(trusted: VerifiedSession) -> None:
-    """Raise PolicyError where another session claims a channel: the node would refuse what was signed by then."""
+    """Raise PolicyError if another session claims a channel: the node would refuse the signed datasheet."""
     claimed = [state for state in operation(trusted.node).channels.values() if state[0] & ChannelState.CLAIMED_BY_OTHER]
     if claimed:
         raise PolicyError(
@@ -248,7 +248,7 @@ def _require_nobody_else(trusted: VerifiedSession) -> None:
 
 
 def _adjustable(trusted: VerifiedSession, number: int) -> tuple[Channel, Calibration]:
-    """A sensor and its calibration; raises PolicyError where there is no offset that could be moved."""
+    """Return a sensor and its calibration; raises PolicyError if it has no adjustable offset."""
     channel = trusted.channel(number)
     if channel.actuator:
         raise BadDataError(f"Channel {number} of node {trusted.uuid} is an actuator, not a sensor.")
@@ -263,6 +263,6 @@ def _adjustable(trusted: VerifiedSession, number: int) -> tuple[Channel, Calibra
 
 
 def _si(channel: Channel, own: Calibration, value: float) -> float:
-    """A reading in the calibrated unit, in SI units, as it is shown: within its turn."""
+    """Return a reading in the calibrated unit, in SI units, as it is shown: within its turn."""
     si = own.unit.to_si(value)
     return float(wrapped(np.asarray(si), channel.low, channel.high, TURN)) if channel.full_turn else si

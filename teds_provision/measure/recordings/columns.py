@@ -23,7 +23,7 @@ _EXACT = 2**53  # integers up to here are floats without loss
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of one node, in their order; ``value`` (NaN where there is none) and ``raw`` for each of its channels."""
+    """Rows of one node, in their order; ``value`` (NaN if there is none) and ``raw`` for each of its channels."""
 
     uuid: str
     channels: tuple[int, ...]
@@ -44,7 +44,7 @@ class Streams:
         self._numbers: dict[str, dict[tuple[int, ...], int]] = {}
 
     def blocks(self, rows: Rows) -> Iterator[Block]:
-        """The blocks of these rows: a gap of ``index`` begins another one."""
+        """Yield the blocks of these rows: a gap of ``index`` begins another one."""
         numbers = self._numbers.setdefault(rows.uuid, {})
         patterns, which = np.unique(rows.there, axis=0, return_inverse=True)
         for number, pattern in enumerate(patterns):
@@ -69,7 +69,7 @@ def _block(rows: Rows, part: NDArray[Any], columns: list[int], channels: tuple[i
 
 
 def _runs(part: NDArray[Any], rows: Rows) -> list[NDArray[Any]]:
-    """Cut where the sample number jumps, or what holds for a whole block changes."""
+    """Cut at gaps of the sample number, and at changes of what is constant in a block."""
     error = rows.clock_error[part]
     cut = np.diff(rows.index[part]) != 1
     cut |= (error[1:] != error[:-1]) & ~(np.isnan(error[1:]) & np.isnan(error[:-1]))
@@ -78,7 +78,7 @@ def _runs(part: NDArray[Any], rows: Rows) -> list[NDArray[Any]]:
 
 
 def stacked(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Raw values of a block: of one type where they can be without loss, else Python's objects."""
+    """Return raw values of a block: of one type if that is possible without loss, else Python's objects."""
     kinds = {column.dtype.kind for column in columns}
     if len(kinds) == 1 or (kinds == {"i", "f"} and all(_are_floats(column) for column in columns)):
         return np.column_stack(columns)
@@ -98,7 +98,9 @@ _INTEGERS: Final = ("unsigned integer", "bit sequence", "long integer")
 
 
 def raw_kind(form: str) -> RawKind:
-    """What holds the raw values of a form (``SampleForm.name``, "unsigned integer, 2 octets"); "" for an unknown one.
+    """Return the type for raw values of a form (``SampleForm.name``, "unsigned integer, 2 octets").
+
+    "" for an unknown one.
 
     ``integer``: whole numbers of more than 64 bits.
     """
@@ -170,6 +172,6 @@ _BY_ROW = ("time", "tick", "raw", "value", "valid")
 
 
 def part_of(block: Block, rows: slice) -> Block:
-    """Some rows of a block."""
+    """Return some rows of a block."""
     parts: dict[str, Any] = {name: getattr(block, name)[rows] for name in _BY_ROW}
     return replace(block, index=block.index + (rows.start or 0), **parts)

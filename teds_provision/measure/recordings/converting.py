@@ -1,7 +1,7 @@
 """A recording in another format: read by its reader, written by the recorder of the other format.
 
-The result gets its name when all of it is on the disk: until then it lies in a folder of our own beside it, which the
-next conversion to that name removes where a killed one left it. Nothing is written over.
+The result gets its name when all of it is on the disk: until then it is in a private folder beside it, which the next
+conversion to that name removes if a killed one left it. Nothing is overwritten.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _BURST: Final = 5000  # rows of a grid at a time
 
 @dataclass(frozen=True)
 class ConversionResult:
-    """What became of a recording: the files, oldest part first, and what went into them."""
+    """Result of a conversion: the files, oldest part first, and what went into them."""
 
     recording: Recording
     files: tuple[Path, ...]
@@ -113,7 +113,7 @@ def _as_parquet(path: Path, entries: Iterator[Entry], recording: Recording, *, w
 
 
 def _counted(recording: Recording, summary: RecordingSummary) -> Iterator[Entry]:
-    """The entries, each counted; a channel that no head named gets a place among the facts."""
+    """Yield the entries, each counted; a channel that no head named is added to the facts."""
     for entry in recording.entries():
         summary.add_entry(entry)
         if isinstance(entry, Block):
@@ -125,7 +125,7 @@ def _counted(recording: Recording, summary: RecordingSummary) -> Iterator[Entry]
 
 
 def _gridded(entries: Iterator[Entry], recording: Recording) -> Iterator[Entry]:
-    """The same as rows of one grid, of every sensor. A row is made when no stream can bring a value before it."""
+    """Yield the same as rows of one grid, of every sensor. A row is made when no stream can bring a value before it."""
     facts = [facts for _, facts in sorted(recording.facts.items()) if facts.kind != "actuator"]
     periods = {channel_facts.key: channel_facts.period for channel_facts in facts if channel_facts.period}
     grid = Grid(recording.station.group or "all", facts, patience=0.0)
@@ -146,7 +146,7 @@ def _gridded(entries: Iterator[Entry], recording: Recording) -> Iterator[Entry]:
 
 
 def _rows_until(until: float, waiting: list[Block], grid: Grid) -> tuple[list[Block], list[GroupRows]]:
-    """The blocks that are left, and the rows that are due; times without any value are left out."""
+    """Return the blocks that are left, and the rows that are due; times without any value are left out."""
     made: list[GroupRows] = []
     while waiting and (begin := min(float(block.time[0]) for block in waiting)) <= until:
         end = min(until, begin + _BURST * grid.period, max(float(block.time[-1]) for block in waiting))
@@ -170,7 +170,7 @@ _SUFFIX: Final = ".teds-part"
 
 @contextmanager
 def _folder_for(target: Path) -> Iterator[Path]:
-    """A folder of our own beside the file, locked while it is used; it goes with all that is left in it."""
+    """Make a private folder beside the file, locked while it is used; it is removed with its content."""
     _sweep(target)
     folder = target.with_name(f".{target.name}.{secrets.token_hex(8)}{_SUFFIX}")
     folder.mkdir(mode=0o700)
@@ -185,7 +185,7 @@ def _folder_for(target: Path) -> Iterator[Path]:
 
 
 def _sweep(target: Path) -> None:
-    """Remove what a killed conversion to this name left: a folder of such a name, ours, locked by nobody."""
+    """Remove what a killed conversion to this name left: a folder of such a name, ours, without a lock."""
     name = re.compile(re.escape(f".{target.name}.") + "[0-9a-f]{16}" + re.escape(_SUFFIX))
     with suppress(OSError):
         for found in [file_name for file_name in os.listdir(target.parent) if name.fullmatch(file_name)]:

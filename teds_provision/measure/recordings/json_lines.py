@@ -136,7 +136,7 @@ class JsonLines(Recording):
 
 
 def _goes_with(lines: list[dict[str, Any]], event: dict[str, Any]) -> bool:
-    """Whether a line is another channel of the block that began with these lines."""
+    """True if a line is another channel of the block that began with these lines."""
     first = lines[0]
     return (
         event.get("event") == "data"
@@ -157,7 +157,7 @@ def _raw(values: list[Any]) -> NDArray[Any]:
 
 
 def report_of(words: dict[str, Any]) -> NodeReport | None:
-    """The state of a node as a recording has it; None where it is none."""
+    """Return the state of a node as a recording has it; None if it is malformed."""
     uuid, state = words.get("uuid"), words.get("state")
     if not isinstance(uuid, str) or state not in _STATES or len(uuid) > MOST.text:
         return None

@@ -1,7 +1,7 @@
 """Reads MCAP as ``sinks/mcap/recording.py`` writes it, from the first octet to the last whole record.
 
-An unfinished file is read to its torn end. Damage inside is refused: ``measure recover`` says what is damaged, and
-writes all else into another file.
+An unfinished file is read to its torn end. Damage inside is refused: ``measure recover`` reports the damage, and writes
+everything else into another file.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _STRING: Final = "std_msgs/msg/String"
 
 @dataclass(frozen=True)
 class _Topic:
-    """A topic of the file; ``channels`` empty where it holds no samples."""
+    """A topic of the file; ``channels`` empty if it holds no samples."""
 
     topic: str
     schema: str
@@ -82,7 +82,7 @@ class McapRecording(Recording):
         )
 
     def _records(self, *, chunks: bool = True) -> Iterator[tuple[int, bytes]]:
-        """Records up to the end of the data, those in chunks too; ``chunks`` False goes past them."""
+        """Yield records up to the end of the data, those in chunks too; ``chunks`` False skips them."""
         self.complete, self.torn = False, 0
         with open_to_read(self.path) as file:
             if file.read(len(MAGIC)) != MAGIC:
@@ -106,7 +106,7 @@ class McapRecording(Recording):
                     yield code, content
 
     def _content(self, file: BinaryIO, code: int, length: int, *, chunks: bool) -> bytes | None:
-        """Content of a record; None where the file ends before, or nothing can be so long."""
+        """Return the content of a record; None if the file ends before, or the length is impossible."""
         if length > MOST.chunk:
             return None
         if code == CHUNK and not chunks:
@@ -116,7 +116,7 @@ class McapRecording(Recording):
         return content if len(content) == length else None
 
     def _inside(self, content: bytes, at: int) -> Iterator[tuple[int, bytes]]:
-        """Records of a chunk."""
+        """Yield the records of a chunk."""
         found = unpacked(content, self.path, MOST.chunk)
         if found is None or not found[1]:
             raise self._bad(f"the chunk at octet {at - HEAD.size} is damaged")
@@ -253,7 +253,7 @@ class McapRecording(Recording):
 
 
 def _ends(file: BinaryIO) -> bool:
-    """Whether the file has the mark of an end."""
+    """True if the file has the mark of an end."""
     size = file.seek(0, 2)
     if size < 2 * len(MAGIC):
         return False
@@ -310,7 +310,7 @@ _TEXTS: Final = frozenset(
 
 
 def _reported(topic: _Topic, content: bytes) -> Entry | None:
-    """A report, as the recorder puts it on its topic: JSON in a string."""
+    """Return a report, as the recorder puts it on its topic: JSON in a string."""
     data = content[MESSAGE_HEAD.size - HEAD.size :]
     try:
         words = json.loads(data[8:].rstrip(b"\0"))

@@ -1,4 +1,4 @@
-"""Opens a recording of any format, told by its first octets, whatever its name is."""
+"""Opens a recording of any format, identified by its first octets, whatever its name is."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Parquet, by pyarrow (extra ``parquet``): the columns of a CSV, typed, with what its head says in the file's metadata.
+"""Parquet, by pyarrow (extra ``parquet``): the columns of a CSV, typed, with its header in the file's metadata.
 
-A file of Parquet has no use before its end is written, so nothing records to it: it is what a recording is converted
-to. Columns are ``time`` (unix seconds), ``uuid``, ``index``, ``tick``, ``clock_error``, ``note``, then values and raw
+A file of Parquet is unusable before its end is written, so nothing records to it: recordings are converted to it.
+Columns are ``time`` (unix seconds), ``uuid``, ``index``, ``tick``, ``clock_error``, ``note``, then values and raw
 values as in CSV; of a grid ``time`` and the values.
 """
 
@@ -36,7 +36,7 @@ _FORMAT: Final = "teds-provision/measurement-1"
 
 
 def library() -> Any:
-    """Module pyarrow, with its Parquet; raises UsageError where it is not installed."""
+    """Return module pyarrow, with its Parquet; raises UsageError if it is not installed."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -85,7 +85,7 @@ class ParquetWriter:
         return {"float": pa.float64(), "uint64": pa.uint64(), "int64": pa.int64()}.get(raw_kind(form), pa.string())
 
     def add_entry(self, entry: Entry) -> None:
-        """One entry; raises BadDataError for a raw value that is not what its channel's datasheet says."""
+        """Add one entry; raises BadDataError for a raw value that contradicts its channel's datasheet."""
         if isinstance(entry, Block | GroupRows):
             self._waiting.append(entry)
             self._rows += len(entry.time)
@@ -97,7 +97,7 @@ class ParquetWriter:
             self._log.append({"event": "note", "time": entry.at, "why": entry.text})
 
     def finish(self) -> None:
-        """The rest, and the end of the file."""
+        """Write the rest, and the end of the file."""
         self._flush()
         self._writer.add_key_value_metadata({_AFTER: json.dumps(self._log)})
         self.close()

@@ -1,7 +1,7 @@
-"""What every format of a recording is read as: facts of channels, blocks of samples, rows of a grid, reports, notes.
+"""The common form of every recording format: facts of channels, blocks of samples, rows of a grid, reports, notes.
 
-A recording may come from anybody: sizes and counts are limited (:data:`MOST`), so that memory stays small whatever the
-file says, and what is malformed raises BadDataError with the place.
+A recording may come from any source: sizes and counts are limited (:data:`MOST`), so that memory stays small whatever
+the file contains, and malformed content raises BadDataError with the place.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ Entry = Block | GroupRows | NodeReport | Note | tuple[ChannelFacts, ...]
 
 
 class Recording(ABC):
-    """A recording that is open for reading: what its head says, then its entries in the order of the file.
+    """A recording that is open for reading: its head, then its entries in the order of the file.
 
-    ``facts`` has the first facts of each channel, wherever in the file they stand. ``torn`` is known when all entries
+    ``facts`` has the first facts of each channel, wherever in the file they are. ``torn`` is known when all entries
     were read: octets at the end that are no whole piece (a killed recorder, or one that still writes).
     """
 
     form: str
     """Name of the format."""
     wide = False
-    """Whether it has rows of one grid in place of blocks."""
+    """True if it has rows of one grid in place of blocks."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -64,12 +64,12 @@ class Recording(ABC):
         self.facts: dict[tuple[str, int], ChannelFacts] = {}
         self.torn = 0
         self.complete = True
-        """Whether the file has its end, where the format has one."""
+        """True if the file has its end, in a format that has one."""
         self.being_written = is_locked(path)
 
     @abstractmethod
     def entries(self) -> Iterator[Entry]:
-        """All that is in it; each call begins anew. Raises BadDataError, NotFoundError."""
+        """Yield all that is in it; each call starts from the beginning. Raises BadDataError, NotFoundError."""
 
     def know(self, facts: ChannelFacts) -> None:
         """Keep the first facts of a channel; raises BadDataError for more channels than are read."""
@@ -79,7 +79,7 @@ class Recording(ABC):
 
 
 def first_instants(entry: Entry, channels: Collection[int], most: float) -> Block | GroupRows | None:
-    """The first ``most`` instants of these channels (all where empty); None where the entry has none of them."""
+    """Return the first ``most`` instants of these channels (all if empty); None if the entry has none of them."""
     if not isinstance(entry, Block | GroupRows):
         return None
     kept = [column for column, (_, number) in enumerate(entry.keys) if not channels or number in channels]
@@ -101,7 +101,7 @@ def first_instants(entry: Entry, channels: Collection[int], most: float) -> Bloc
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a recorder holds the file now."""
+    """True if a recorder holds the file now."""
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError:
@@ -118,7 +118,7 @@ def is_locked(path: Path) -> bool:
 
 
 def station_of(words: Mapping[str, Any]) -> StationFacts:
-    """Who measured, of a head that anybody may have written."""
+    """Return the station facts of an untrusted head."""
     name, group, clock = (str(words.get(key) or "")[: MOST.text] for key in ("station", "group", "clock"))
     test = words.get("test_pattern") in (True, "true")
     plain = StationFacts(name, group=group, test_pattern=test, started=unix_of(words.get("started")))
@@ -126,7 +126,7 @@ def station_of(words: Mapping[str, Any]) -> StationFacts:
 
 
 def unix_of(text: object) -> float:
-    """Unix seconds of an ISO time; 0.0 where it is none."""
+    """Return unix seconds of an ISO time; 0.0 if it is none."""
     from datetime import datetime
 
     try:
@@ -145,9 +145,10 @@ _FIELDS = frozenset(field.name for field in fields(ChannelFacts))
 
 
 def facts_of(words: object, where: str) -> ChannelFacts:
-    """Facts of a channel as a recording has them (``lines.facts_as_json``); raises BadDataError, ``where`` before it.
+    """Return facts of a channel as a recording has them (``lines.facts_as_json``).
 
-    The exponents of the unit are read from its text: a unit that is none (another program's) stays text alone.
+    Raises BadDataError that begins with ``where``. The exponents of the unit are parsed from its text: an unknown unit
+    (another program's) stays text alone.
     """
     if not isinstance(words, dict):
         raise BadDataError(f"{where}: the facts of a channel are not a JSON object.")
@@ -169,7 +170,7 @@ def facts_of(words: object, where: str) -> ChannelFacts:
 
 
 def _fact(name: str, value: Any, where: str) -> Any:
-    """One fact as :class:`ChannelFacts` has it; raises BadDataError where the value is not of its kind."""
+    """Return one fact as :class:`ChannelFacts` has it; raises BadDataError if the value is of the wrong kind."""
     if name in _TEXTS and isinstance(value, str) and len(value) <= MOST.text:
         return value
     if name in _NUMBERS and isinstance(value, int | float) and not isinstance(value, bool):
@@ -184,7 +185,7 @@ def _fact(name: str, value: Any, where: str) -> Any:
 
 
 def channel_number(value: object, where: str) -> int:
-    """Number of a TransducerChannel; raises BadDataError."""
+    """Return the number of a TransducerChannel; raises BadDataError."""
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 0xFFFF:
         raise BadDataError(f"{where}: {_short(value)} is no number of a channel.")
     return value

@@ -1,4 +1,4 @@
-"""What is in a recording: channels, from when to when, how much, what is not valid, what was lost."""
+"""Summary of a recording: channels, time span, counts, invalid and lost values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _COUNTED = ("samples", "lost", "late", "bad", "invalid")
 
 @dataclass
 class ChannelStatistics:
-    """What was seen of a channel; times are unix seconds."""
+    """Statistics of a channel; times are unix seconds."""
 
     samples: int = 0
     invalid: int = 0
@@ -39,10 +39,10 @@ class ChannelStatistics:
 
 @dataclass
 class RecordingSummary:
-    """Counts what goes by. ``missing`` samples are gaps of the sample number within a run of a stream.
+    """Counts entries as they pass. ``missing`` samples are gaps of the sample number within a run of a stream.
 
-    A measurement's counts go on from part to part. What was reported of a node with samples before its first sample in
-    this file belongs to the parts before.
+    A measurement's counts go on from part to part. Reports about a node with samples before its first sample in this
+    file belong to the parts before.
     """
 
     channels: dict[tuple[str, int], ChannelStatistics] = field(default_factory=dict)
@@ -91,9 +91,9 @@ class RecordingSummary:
             self._seen_of((block.uuid, number)).saw(block.time, block.value[:, column])
 
     def to_json(self, recording: Recording) -> dict[str, Any]:
-        """The result of ``record info``: ``lost`` counts messages of nodes in this file, as the recorder reported them.
+        """Return the result of ``record info``; ``lost`` counts messages of nodes in this file.
 
-        null where it reported nothing; times are ISO 8601.
+        It comes from the recorder's reports, null without one; times are ISO 8601.
         """
         seen = self.channels.values()
         reports = [self._of_this_file(report) for report in self.reports.values()]
@@ -127,7 +127,7 @@ class RecordingSummary:
         }  # fmt: skip
 
     def _of_this_file(self, last: NodeReport) -> NodeReport:
-        """What was counted of a node since this file began."""
+        """Return the counts of a node since this file began."""
         before = self._before.get(last.uuid)
         if before is None:
             return last

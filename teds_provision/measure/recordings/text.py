@@ -190,7 +190,7 @@ def _number(cell: str) -> float:
 
 
 def _raw(cells: Sequence[str], form: str) -> NDArray[Any]:
-    """A column of raw values, exactly; where the datasheet does not say what they are, what they look like."""
+    """Return a column of raw values, exactly; without a form in the datasheet, by their appearance."""
     if raw_kind(form) != "float":
         try:
             return integers([int(cell) if cell else 0 for cell in cells])

@@ -1,8 +1,8 @@
 """Streams of several nodes that begin together: by one trigger frame, or by a start time (operation.md sections 4, 5).
 
-*Start time*: every node has been asked for its clock; as soon as all are there (:data:`WAITING` after the first at
-most) one moment is chosen, and each is given the tick of its own clock that stands for it. *Trigger*: streams wait for
-a frame (``trigger.py``). A node that comes later begins when it comes.
+*Start time*: every node has exchanged Clock; as soon as all are there (:data:`WAITING` after the first at most) one
+moment is chosen, and each gets the corresponding tick of its clock. *Trigger*: streams wait for a frame
+(``trigger.py``). A node that comes later begins when it comes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class CommonStart:
         self._begun: dict[bytes, tuple[ClockMap, int]] = {}
 
     def start(self, uuid: bytes, clock: ClockMap) -> int:
-        """What the node's Subscribe is to say; waits for the others. ``SOON`` where there is nobody to wait for."""
+        """Return the start for the node's Subscribe; waits for the others. ``SOON`` if there are none to wait for."""
         if self._trigger:
             return SOON if self._triggered else WAITS
         if self._alone:
@@ -60,24 +60,24 @@ class CommonStart:
         return len(self._begun) + len(self._coming) + 1
 
     def drop_node(self, uuid: bytes) -> None:
-        """A node that will not come: nobody waits for it any more."""
+        """Stop waiting for a node that will not come."""
         with self._turn:
             self._coming.discard(uuid)
             self._turn.notify_all()
 
     def start_by_itself(self, uuid: bytes) -> None:
-        """The node called its start too late: it begins by itself."""
+        """Let a node begin by itself that reported its start as too late."""
         self._begun.pop(uuid, None)
 
     def seconds_until(self, start: int) -> float:
-        """Seconds from now to a start; 0 where it is soon, or waits."""
+        """Return seconds from now to a start; 0 if it is soon, or waits."""
         if start in (SOON, WAITS) or self._at is None:
             return 0.0
         return max(0.0, self._at - time.monotonic())
 
     @property
     def seconds_left(self) -> float | None:
-        """Seconds from now until the first values are taken; None where the trigger has not gone out yet."""
+        """Seconds from now until the first values are taken; None if the trigger has not gone out yet."""
         if self._trigger:
             return 0.0 if self._triggered else None
         return max(0.0, (self._at or 0.0) - time.monotonic())
@@ -91,7 +91,7 @@ class CommonStart:
     # -- for the trigger -----------------------------------------------------------------------------------------------
 
     def due(self, ready: int, all_of: int) -> bool:
-        """Whether the trigger is to go out now: all are ready, or the first has waited long enough for the rest."""
+        """True if the trigger has to go out now: all are ready, or the first has waited long enough for the rest."""
         if not self._trigger or self._triggered:
             return False
         if ready and self._first is None:
@@ -100,16 +100,16 @@ class CommonStart:
         return ready == all_of or late
 
     def tells(self) -> bool:
-        """Whether it is to be told now, once, for whom the trigger waits."""
+        """Return True once, when the "waiting for" notice is due."""
         long = self._first is not None and time.monotonic() - self._first > TELLING
         tells = self._trigger and not self._triggered and long and not self._told
         self._told |= tells
         return tells
 
     def triggered(self) -> None:
-        """The trigger goes out: who comes later begins by itself."""
+        """Record that the trigger goes out: later nodes begin by themselves."""
         self._triggered = True
 
     def begun(self, uuid: bytes, clock: ClockMap, tick: int) -> None:
-        """The node saw the trigger at this tick of its clock."""
+        """Record that the node saw the trigger at this tick of its clock."""
         self._begun[uuid] = (clock, tick)

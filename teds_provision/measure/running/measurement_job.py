@@ -40,7 +40,7 @@ AGAIN, LONGEST = 1.0, 30.0  # seconds until a measurement that failed as a whole
 
 
 def whole_path(spec: str) -> str:
-    """The words for a sink as they can be kept: a file's path from the root on, whatever folder comes next time."""
+    """Return the string of a sink as it can be stored: a file's absolute path, whatever the folder is next time."""
     if spec.partition(":")[0] in _SERVICES:
         return spec
     wide = WIDE if spec.startswith(WIDE) else ""
@@ -53,9 +53,9 @@ _SERVICES = frozenset({"ros1", "ros2", "mqtt", "mqtts"})
 class MeasurementJob:
     """One measurement: ``sinks`` are made (and opened by the run), ``ended`` is how the last run ended.
 
-    ``more`` makes the sinks beside those that are kept, anew for each run; it gets what takes set points of topics.
-    ``admits`` says of each set point whether it may pass; None: none may, whatever is kept. ``opened`` makes a sink of
-    a kept word. Raises UsageError where a sink cannot be named so.
+    ``more`` makes the sinks beside those that are kept, for each run; it gets the receiver of set points from topics.
+    ``admits`` decides on each set point; None: none may pass, whatever is kept. ``opened`` makes a sink of a kept
+    string. Raises UsageError if a sink cannot be named so.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class MeasurementJob:
     ) -> MeasurementEnd:
         """Measure until ``stop``, for ``duration`` seconds of data, or to the kept end; nodes and group are held.
 
-        Raises PolicyError where another measurement holds one of them, and what a sink's ``open`` raises.
+        Raises PolicyError if another measurement holds one of them, and what a sink's ``open`` raises.
         """
         uuids = self.station.measurements.nodes_of(self.kept)
         name = self.kept.group or ", ".join(uuid.hex()[:8] for uuid in uuids[:3])
@@ -129,7 +129,7 @@ class MeasurementJob:
             self.kept = measurements.keep(kept)
 
     def start(self, buses: Buses, watcher: Watcher | None = None) -> None:
-        """Measure on a thread of its own until :meth:`stop`, or to its end; begun again after what ends it."""
+        """Measure in a thread until :meth:`stop`, or to its end; restarted after an error that ends it."""
         self._thread = threading.Thread(
             target=self._carry_on, args=(buses, watcher), name=f"measurement {self.kept.id}", daemon=True
         )
@@ -142,7 +142,7 @@ class MeasurementJob:
             self._thread.join(seconds)
 
     def suspend_node(self, uuid: bytes, why: str, seconds: float) -> bool:
-        """Measure a node no more until :meth:`resume_node`; False where it did not end in order within ``seconds``."""
+        """Stop measuring a node until :meth:`resume_node`; False if it did not end in order within ``seconds``."""
         self.lent.add(uuid)
         measurement = self.measurement
         return measurement is None or measurement.suspend_node(uuid, why, seconds)
@@ -156,7 +156,7 @@ class MeasurementJob:
 
     @property
     def alive(self) -> bool:
-        """Whether its thread still lives."""
+        """True if its thread still lives."""
         return self._thread is not None and self._thread.is_alive()
 
     def _carry_on(self, buses: Buses, watcher: Watcher | None) -> None:
@@ -178,7 +178,7 @@ class MeasurementJob:
             self.sinks = self._new_sinks()
 
     def _began(self, duration: float | None) -> None:
-        """Its end is known from its first value on, and stands in the store, so that a restart does not move it."""
+        """Store the end, which is known from its first value on, so that a restart does not move it."""
         if duration is not None and self.kept.ends is None:
             self.kept = replace(self.kept, ends=time.time() + duration)
             if self.kept.id:
@@ -201,13 +201,13 @@ class MeasurementJob:
         return [*(self._opened(spec, admit) for spec in self.kept.sinks), *self._more(admit)]
 
     def _admit(self, command: SetPointCommand) -> None:
-        """A set point that came by a topic."""
+        """Pass on a set point that came by a topic, if it is admitted."""
         if self._admits is not None and self._admits(command):
             self._commands(command)
 
 
 def request_of(kept: KeptMeasurement, more: MeasurementRequest) -> MeasurementRequest:
-    """What is asked of each node; ``more`` has what is not kept: patience, time-out, lease."""
+    """Return the request for each node; ``more`` has what is not kept: patience, time-out, lease."""
     return replace(
         more,
         channels=kept.channels,
@@ -224,7 +224,7 @@ def request_of(kept: KeptMeasurement, more: MeasurementRequest) -> MeasurementRe
 
 
 def station_facts(station: Station) -> StationFacts:
-    """What the sinks are told of the station: its name, those of its nodes, and the names that somebody chose."""
+    """Return the station's facts for the sinks: its name, those of its nodes, and the names that an operator chose."""
     names = {(uuid.hex(), channel): name for (uuid, channel), name in station.measurements.names.items()}
     nodes = {record.uuid.hex(): record.name or "" for record in station.nodes.all()}
     return StationFacts(names.pop((STATION.hex(), 0), station.name), names=names, nodes=nodes)

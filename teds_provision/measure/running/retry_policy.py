@@ -48,9 +48,9 @@ class RetryPolicy:
     ) -> bool:
         """True if no other try is worth it.
 
-        ``decided``: this station itself decided so, by a ban, its whitelist or its trust.
-        ``proven``: the error came in a session. Outside one anybody on the bus can have given himself the node's UUID
-        and refuse to open one: then it is looked for ``elsewhere``.
+        ``decided``: this station itself decided so, by a ban, its whitelist or its trust. ``proven``: the error came in
+        a session. Outside one any device on the bus can take the node's UUID and refuse to open one: then the node is
+        searched ``elsewhere``.
         """
         if self.seconds_left == math.inf:  # a datasheet that was changed under its values ends what has an end
             return self._ends and (decided or (proven and isinstance(error, BadDatasheetError)))

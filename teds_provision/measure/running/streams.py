@@ -27,7 +27,7 @@ SILENT = 2.0  # seconds without a good message, beside three messages' time: the
 
 @dataclass
 class StreamTotals:
-    """What became of one stream over all its runs."""
+    """Totals of one stream over all its runs."""
 
     channels: tuple[int, ...]
     period: float
@@ -54,7 +54,7 @@ class StreamTotals:
         self.clock_error = heard.bound if heard.bound is not None else self.clock_error
 
     def with_run(self, heard: ReceivedStream | None) -> StreamTotals:
-        """These totals with those of the run that still goes on; themselves stay as they are."""
+        """Return these totals plus those of the current run; the object itself stays unchanged."""
         sums = replace(self)
         if heard is not None:
             sums.add(heard)
@@ -62,7 +62,7 @@ class StreamTotals:
 
 
 def added(*parts: Sequence[InvalidValues]) -> tuple[InvalidValues, ...]:
-    """Counts of the same channel and reason put together."""
+    """Return counts of the same channel and reason added up."""
     counts: Counter[tuple[int, str]] = Counter()
     for invalid in chain.from_iterable(parts):
         counts[invalid.channel, invalid.why] += invalid.count
@@ -87,7 +87,7 @@ class NodeStreams:
         self._monotone: dict[int, MonotonicStamps] = {}
 
     def new_session(self) -> None:
-        """Nothing is known of the node's clock: it may have started anew. Runs begin at 1 again.
+        """Start with an unknown clock: the node may have restarted. Runs begin at 1 again.
 
         Values are held back until :meth:`described`.
         """
@@ -98,10 +98,10 @@ class NodeStreams:
             self.clock = ClockMap()
 
     def described(self) -> None:
-        """Every sink knows the channels: what was held back is handed on, and all that comes.
+        """Release held values, and all that come: every sink knows the channels.
 
-        On a busy machine values come before the thread that subscribed gets to tell whose they are. They were recorded
-        without unit and calibration then, and published without the mark of a datasheet that nobody signed.
+        On a busy machine values come before the thread that subscribed has described them. They were recorded without
+        unit and calibration then, and published without the mark of an unsigned datasheet.
         """
         with self._gate:
             held, self._held = self._held or [], None
@@ -154,10 +154,12 @@ class NodeStreams:
         bus.receiver.register(address, number, heard)
 
     def stop(self, bus: MeasuredBus, trusted: VerifiedSession | None, address: int) -> None:
-        """Stop each in order, so that its counter tells what was lost at the end; without a session hear no more.
+        """Stop each in order, so that its counter shows what was lost at the end.
 
-        First the messages that are being filled may come: the samples until now are all wanted, and Stop takes back
-        what has not left (operation.md section 4).
+        Without a session just stop listening.
+
+        First wait for the messages that are being filled: the samples until now are all wanted, and Stop withdraws what
+        has not left (operation.md section 4).
         """
         wanted = {number: heard.ending() for number, heard in self.running.items()} if trusted is not None else {}
         for number, due in wanted.items():
@@ -174,13 +176,13 @@ class NodeStreams:
         self.running.clear()
 
     def first_sample(self) -> float:
-        """When the last of its streams takes its first sample (monotonic seconds); 0.0 where none has a start."""
+        """Return when the last of its streams takes its first sample (monotonic seconds); 0.0 if none has a start."""
         with self.mapping:
             starts = [stream.receiver.start for stream in list(self.running.values())]
             return max((self.clock.host_of(start) for start in starts if start is not None), default=0.0)
 
     def summed(self) -> list[StreamTotals]:
-        """What became of each stream until now."""
+        """Return the totals of each stream until now."""
         return [past.with_run(self.running.get(number)) for number, past in self.totals.items()]
 
     # -- whether the node is still there -----------------------------------------------------------------------------
@@ -194,15 +196,15 @@ class NodeStreams:
         ]
 
     def every(self) -> float | None:
-        """Seconds in which a message comes for sure while the node is there; None where nobody can say."""
+        """Return the seconds in which a message certainly comes while the node is there; None if unknown."""
         return min((3 * stream.receiver.plan.span / 1e9 for stream in self._steady()), default=None)
 
     def heard_since(self, moment: float) -> bool:
-        """Whether a good message came after ``moment`` (time.monotonic)."""
+        """True if a good message came after ``moment`` (time.monotonic)."""
         return any(stream.heard > moment for stream in self.running.values())
 
     def silent(self, now: float) -> float:
-        """Seconds of silence where that is too long, else 0.0."""
+        """Return seconds of silence if that is too long, else 0.0."""
         for stream in self._steady():
             if now - stream.heard > SILENT + 3 * stream.receiver.plan.span / 1e9:
                 return now - stream.heard

@@ -1,6 +1,6 @@
-"""The trigger: streams wait, one frame goes out on each bus, each node says at which tick it saw it (operation.md, 5).
+"""The trigger: streams wait, one frame goes out on each bus, each node reports its tick (operation.md, 5).
 
-Streams begin 10 ms after that mark. A node whose mark does not meet the time of sending is stopped and named.
+Streams begin 10 ms after that mark. A node whose mark does not match the time of sending is stopped and named.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def pull(common_start: CommonStart, keepers: Sequence[NodeSupervisor], note: Cal
 
 
 def _send(port: CanPort, token: TriggerToken) -> tuple[int, int]:
-    """The trigger on one bus; between which two times (monotonic ns) it went out."""
+    """Send the trigger on one bus; return between which two times (monotonic ns) it went out."""
     before = time.monotonic_ns()
     port.send(Frame(trigger_identifier(port.spec.source), token.octets))
     return before, time.monotonic_ns() + HELD_BACK
@@ -53,7 +53,7 @@ def _send(port: CanPort, token: TriggerToken) -> tuple[int, int]:
 def _arm(
     token: TriggerToken, keepers: Sequence[NodeSupervisor], note: Callable[[str], None]
 ) -> list[tuple[NodeSupervisor, VerifiedSession]]:
-    """The nodes that wait for the trigger now."""
+    """Return the nodes that wait for the trigger now."""
     armed = []
     for keeper in keepers:
         trusted = keeper.verified
@@ -71,9 +71,9 @@ def _arm(
 def _mark(
     keeper: NodeSupervisor, trusted: VerifiedSession, before: int, after: int, note: Callable[[str], None]
 ) -> int | None:
-    """The tick at which the node saw the trigger, which went out between two times (monotonic ns).
+    """Return the tick at which the node saw the trigger, which went out between two times (monotonic ns).
 
-    None where it does not say, or names a moment at which the frame was not on the bus; such a node is stopped.
+    None if it does not report one, or reports a moment at which the frame was not on the bus; such a node is stopped.
     """
     try:
         with keeper.turn:

@@ -1,6 +1,6 @@
-"""Where measured values go: text, MCAP and JSON-line files, ROS 1, ROS 2, MQTT. One file each, one line below.
+"""Destinations of measured values: text, MCAP and JSON-line files, ROS 1, ROS 2, MQTT. One file each, one line below.
 
-:func:`open_sink` makes a sink from the words of the command line. A new sink is a module with a class that follows
+:func:`open_sink` makes a sink from the string of the command line. A new sink is a module with a class that follows
 :class:`Sink` (most easily a :class:`ThreadedSink`), and a line in FILES or SERVICES.
 """
 
@@ -43,9 +43,10 @@ SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {
 
 
 def open_sink(spec: str, commands: CommandTaker | None = None) -> Sink:
-    """The sink of a spec, not yet opened: a file, ``wide:FILE``, ``ros1[:URL]``, ``ros2[:DOMAIN]``, ``mqtt://HOST``.
+    """Return the sink of a spec, not yet opened.
 
-    ``commands`` takes set points that come by the sink; None where no actuator may be moved. Raises UsageError.
+    A file, ``wide:FILE``, ``ros1[:URL]``, ``ros2[:DOMAIN]`` or ``mqtt://HOST``. ``commands`` receives set points that
+    come by the sink; None if no actuator may be moved. Raises UsageError.
     """
     service = spec.partition(":")[0]
     if service in SERVICES:

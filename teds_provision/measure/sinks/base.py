@@ -1,8 +1,8 @@
 """The interface of a sink, and its thread: the measuring loop never waits for a disk, a broker or a subscriber.
 
 A *recorder* drops nothing that the disk has room for. If it cannot keep up, the recording ends with an error that stays
-in its statistics, and what was written until then is whole; while the disk is full it waits for room, counts and tells
-what is lost (:mod:`files`). A *live* sink drops the oldest waiting block and counts it.
+in its statistics, and what was written until then is whole; while the disk is full it waits for room, counts and
+reports losses (:mod:`files`). A *live* sink drops the oldest waiting block and counts it.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ CLOSING = 30.0  # seconds for a recorder to write what it owes
 class Sink(Protocol):
     """Takes what is measured. ``write``, ``write_group``, ``describe`` and ``report`` return at once, from any thread.
 
-    ``open`` raises TedsProvisionError where the sink cannot work at all (no folder, no library). What goes wrong later
-    stands in ``stats``; the measurement goes on.
+    ``open`` raises TedsProvisionError if the sink cannot work at all (no folder, no library). Later failures are in
+    ``stats``; the measurement goes on.
     """
 
     @property
@@ -53,11 +53,11 @@ class Sink(Protocol):
 
     @property
     def recorder(self) -> bool:
-        """Whether it keeps whatever the disk has room for; else it is live, and counts against the budget."""
+        """True if it keeps whatever the disk has room for; else it is live, and counts against the budget."""
 
     @property
     def wants_rows(self) -> bool:
-        """Whether rows of a group are of use to it."""
+        """True if rows of a group are of use to it."""
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -83,14 +83,14 @@ class Sink(Protocol):
         """Take the state of a node."""
 
     def clock_set(self, news: ClockSet) -> None:
-        """The system's clock was set: what comes from now on follows the new one."""
+        """Handle a change of the system's clock: later items follow the new one."""
 
     def close(self) -> None:
         """Write out what is owed, end, give back what was opened. A second call does nothing."""
 
 
 class ThreadedSink(ABC):
-    """A sink whose work is done by one thread of its own; subclasses fill in four steps and the name.
+    """A sink whose work is done by one thread; subclasses fill in four steps and the name.
 
     The steps are called on that thread alone, one after another: ``_begin`` before anything else, ``_process_item`` for
     each item, ``_idle`` at least every TICK, ``_finish`` at the end (also after an error of ``_process_item``).
@@ -130,7 +130,7 @@ class ThreadedSink(ABC):
         self._put(tuple(facts), 0)
 
     def write(self, block: Block) -> None:
-        """Samples of one stream."""
+        """Queue samples of one stream."""
         self._put(block, int(block.value.size))
 
     def write_group(self, rows: GroupRows) -> None:
@@ -143,7 +143,7 @@ class ThreadedSink(ABC):
         self._put(report, 0)
 
     def clock_set(self, news: ClockSet) -> None:
-        """The clock was set."""
+        """Queue a change of the clock."""
         self._put(news, 0)
 
     def close(self) -> None:
@@ -236,7 +236,7 @@ class ThreadedSink(ABC):
         self._items.popleft()
 
     def _next(self) -> tuple[list[Item], bool]:
-        """What waits, or nothing after TICK; and whether all is done.
+        """Return what waits, or nothing after TICK; and whether all is done.
 
         A recorder takes several at a time; of a live sink the others may still be dropped.
         """
@@ -290,7 +290,7 @@ class ThreadedSink(ABC):
 
 
 def as_sink_failure(error: OSError, name: str) -> TedsProvisionError:
-    """What the system refused, in the words of the tool."""
+    """Return the error for a refusal of the system."""
     import errno
 
     cures = {

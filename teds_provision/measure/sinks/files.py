@@ -1,9 +1,9 @@
-"""Files of a recorder: never written over, each complete in itself, whole lines and records only.
+"""Files of a recorder: never overwritten, each complete in itself, whole lines and records only.
 
-What stands in the file is at most FLUSH old, so a kill -9 costs no more than that; it goes to the disk itself once a
-second (power loss). If the disk fills up, the file is cut back to the last whole piece, values are counted as dropped,
-and the next part begins as soon as there is room; then it says what is missing. When the system's clock is set, the
-next part begins too, and both say so.
+Data reach the file within FLUSH, so a kill -9 costs no more than that; the file goes to the disk itself once a second
+(power loss). If the disk fills up, the file is cut back to the last whole piece, values are counted as dropped, and the
+next part begins as soon as there is room, with a note of what is missing. When the system's clock is set, the next part
+begins too, and both contain a note.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Part:
             self._synced = now
 
     def flush(self) -> None:
-        """Hand over what waits; where not all of it goes, the file is cut back to whole pieces and OSError raised."""
+        """Write what waits; if not all of it goes, the file is cut back to whole pieces and OSError raised."""
         self._flushed = time.monotonic()
         if not self._waiting:
             return
@@ -107,7 +107,7 @@ class Part:
 
 
 class FileSink(ThreadedSink):
-    """A recorder over parts: ``run.csv``, then ``run.2.csv`` where another one is needed or the first is there."""
+    """A recorder over parts: ``run.csv``, then ``run.2.csv`` if another one is needed or the first exists."""
 
     recorder = True
 
@@ -164,9 +164,9 @@ class FileSink(ThreadedSink):
     def copy(
         self, entries: Iterable[Item | Note], facts: tuple[ChannelFacts, ...], station: StationFacts
     ) -> list[Path]:
-        """Write what was recorded before, on the caller's thread: nothing is waited for, and an error ends it.
+        """Write what was recorded before, on the caller's thread: without waiting, and an error ends it.
 
-        Gives the files, whole and closed. Raises OSError, and TedsProvisionError where the first cannot be made.
+        Returns the files, whole and closed. Raises OSError, and TedsProvisionError if the first cannot be made.
         """
         self._prepare(facts, station)
         try:
@@ -234,7 +234,7 @@ class FileSink(ThreadedSink):
             self._wait_for_room(error)
 
     def _miss(self, item: Item) -> None:
-        """What comes while there is no room: counted, and known to the next part."""
+        """Count an item that comes while there is no room, for the next part's note."""
         if isinstance(item, Block):
             self._count(dropped=int(item.value.size))
         elif isinstance(item, tuple):
@@ -244,7 +244,7 @@ class FileSink(ThreadedSink):
             self._unsaid.append(item)
 
     def _wait_for_room(self, error: OSError) -> None:
-        """Give the part up and wait; raises the error where it is another one than a full disk."""
+        """Give the part up and wait; raises the error if it is another one than a full disk."""
         if error.errno not in FULL:
             raise error
         before = self.stats.dropped
@@ -268,10 +268,10 @@ class FileSink(ThreadedSink):
         return lost
 
     def _mend(self, path: Path) -> None:
-        """Make the part whole that a full disk cut off; raises OSError where the disk is full again."""
+        """Make the part whole that a full disk cut off; raises OSError if the disk is full again."""
 
     def _try_again(self) -> None:
-        """Begin the next part where there is room by now."""
+        """Begin the next part if there is room by now."""
         assert self._full is not None
         since, before, what = self._full
         try:
@@ -309,7 +309,7 @@ class FileSink(ThreadedSink):
         self._go_on()
 
     def _go_on(self) -> None:
-        """The counts of a measurement go on from part to part: say with which this one begins."""
+        """Record the counts with which this part begins: those of a measurement go on from part to part."""
         for report in self.reports.values():
             self._tell_counts(report)
 

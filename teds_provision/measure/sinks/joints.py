@@ -41,7 +41,7 @@ class Joint:
     state: Mapping[Interface, int]
 
     def values(self, newest: Mapping[tuple[str, int], float]) -> dict[Interface, float]:
-        """Its state out of the newest values; the set point that was applied stands in where no sensor is."""
+        """Return its state from the newest values; the applied set point is used if there is no sensor."""
         found = {kind: newest.get((self.uuid, number), math.nan) for kind, number in self.state.items()}
         if self.command not in found:
             found[self.command] = newest.get((self.uuid, self.actuator), math.nan)
@@ -49,7 +49,7 @@ class Joint:
 
 
 def joints_of(facts: Iterable[ChannelFacts], topics: Topics) -> list[Joint]:
-    """The joints of some nodes, by name."""
+    """Return the joints of some nodes, by name."""
     nodes: dict[str, list[ChannelFacts]] = {}
     for channel_facts in facts:
         if _kind(channel_facts) is not None and not (channel_facts.unsigned or channel_facts.unverified):

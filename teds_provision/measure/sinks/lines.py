@@ -22,7 +22,7 @@ def iso(seconds: float) -> str:
 
 
 def plain(value: Any) -> Any:
-    """A raw or calibrated value as JSON takes it: octets as hex, what is not a finite number as null."""
+    """Return a raw or calibrated value for JSON: octets as hex, non-finite numbers as null."""
     if isinstance(value, bytes):
         return value.hex()
     if isinstance(value, float) and not math.isfinite(value):
@@ -77,7 +77,7 @@ def data_lines(block: Block, facts: Mapping[tuple[str, int], ChannelFacts]) -> I
 
 
 def row_lines(rows: GroupRows, facts: Mapping[tuple[str, int], ChannelFacts]) -> Iterator[dict[str, Any]]:
-    """The same for each channel of a grid, which has neither sample numbers nor raw values."""
+    """Yield the same for each channel of a grid, which has neither sample numbers nor raw values."""
     times = [round(instant, 6) for instant in rows.time.tolist()]
     for column, (uuid, number) in enumerate(rows.channels):
         known = facts.get((uuid, number)) or ChannelFacts(uuid, "", number, "")
@@ -96,7 +96,7 @@ def row_lines(rows: GroupRows, facts: Mapping[tuple[str, int], ChannelFacts]) ->
 
 
 def status_line(report: NodeReport) -> dict[str, Any]:
-    """The ``status`` event of a node."""
+    """Return the ``status`` event of a node."""
     return {
         "event": "status",
         "uuid": report.uuid,
@@ -114,5 +114,5 @@ def status_line(report: NodeReport) -> dict[str, Any]:
 
 
 def as_line(event: Mapping[str, Any]) -> bytes:
-    """One line of JSON; raises ValueError where a NaN is left in it."""
+    """Return one line of JSON; raises ValueError if a NaN is left in it."""
     return json.dumps(event, allow_nan=False, separators=(",", ":")).encode() + b"\n"

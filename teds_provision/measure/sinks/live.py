@@ -105,7 +105,7 @@ class TopicSink(ThreadedSink):
 
     @abstractmethod
     def _advertise(self, topic: str, kind: str) -> None:
-        """Make a topic known before its first message, so that whoever waits for it is there in time."""
+        """Advertise a topic before its first message, so that waiting subscribers connect in time."""
 
     @abstractmethod
     def _array(
@@ -117,7 +117,7 @@ class TopicSink(ThreadedSink):
         velocity: Sequence[float] = (),
         effort: Sequence[float] = (),
     ) -> None:
-        """One JointState; NaN where there is no value."""
+        """Publish one JointState; NaN for a missing value."""
 
     @abstractmethod
     def _scalar(self, topic: str, meaning: Meaning, stamp: float, frame: str, value: float, variance: float) -> None:
@@ -129,7 +129,7 @@ class TopicSink(ThreadedSink):
 
     @abstractmethod
     def _latched(self, topic: str, words: str) -> None:
-        """A String that late comers get too."""
+        """Publish a String that late subscribers receive too."""
 
     @abstractmethod
     def _retire(self, topic: str) -> None:
@@ -137,7 +137,7 @@ class TopicSink(ThreadedSink):
 
     @abstractmethod
     def _parameter(self, name: str, value: object) -> None:
-        """Facts for a parameter server, where there is one."""
+        """Set a parameter on a parameter server, if there is one."""
 
     @abstractmethod
     def _listen(self, topic: str, uuid: str, channel: int) -> None:
@@ -166,7 +166,7 @@ class TopicSink(ThreadedSink):
         self._announce(tuple(self._facts.values()))
 
     def write(self, block: Block) -> None:
-        """Samples of one stream; what comes before its topics are due is left out here, not queued."""
+        """Queue samples of one stream; those before their topics are due are left out here."""
         if self._station.scalar_rate <= 0:
             return
         scalars = self._scalars.get((block.uuid, block.stream, block.channels))
@@ -203,7 +203,7 @@ class TopicSink(ThreadedSink):
         return changed
 
     def _announce(self, facts: Sequence[ChannelFacts]) -> None:
-        """Metadata, parameters and command topics of channels; again when a way to the consumers opened anew."""
+        """Publish metadata, parameters and command topics of channels; again after a reconnection."""
         whole = {channel_facts.uuid for channel_facts in facts} if self._station.each_node else {self._station.group}
         for array in () if self._station.test_pattern else map(self._array_topic, sorted(whole)):
             for topic in (array, f"{array}/age"):
@@ -228,7 +228,7 @@ class TopicSink(ThreadedSink):
                     )
 
     def _metadata(self, uuid: str, channels: Sequence[ChannelFacts]) -> dict[str, Any]:
-        """What a consumer has to know of a node's values, as plain data."""
+        """Return what a consumer has to know of a node's values, as plain data."""
         return {
             "uuid": uuid,
             "station": self._station.name,
@@ -258,7 +258,7 @@ class TopicSink(ThreadedSink):
         self._publish(block, scalars)
 
     def _publish(self, block: Block, scalars: _Scalars) -> None:
-        """The last instant of a block: each channel that stands alone, and what several make together."""
+        """Publish the last instant of a block: each single channel, and the compounds of several."""
         if self._joints:
             self._newest |= dict(zip(block.keys, block.value[-1].tolist(), strict=True))
         stamp = float(block.time[-1])
@@ -299,7 +299,7 @@ class TopicSink(ThreadedSink):
         )
 
     def _array_topic(self, whole: str) -> str:
-        """Of a group, or of a node (its UUID) where each has its own."""
+        """Return the topic of a group, or of a node (its UUID) if each has one."""
         return self._topics.of_node(whole, "array") if self._station.each_node else self._topics.of_group(whole)
 
     def _rows(self, rows: GroupRows) -> None:
@@ -397,7 +397,7 @@ class TopicSink(ThreadedSink):
         )
 
     def _command(self, uuid: str, channel: int, value: float) -> None:
-        """A set point came; what is no finite number is refused here, limits are kept where units are known."""
+        """Handle a set point; non-finite numbers are refused here, limits are applied where units are known."""
         if self._commands is None or not math.isfinite(value):
             self.refused_commands += 1
             return

@@ -94,7 +94,7 @@ class MqttSink(ThreadedSink):
         self._facts: dict[tuple[str, int], ChannelFacts] = {}
         self._units: dict[tuple[str, int], WrittenUnit | None] = {}
         self._parts_of_topics: dict[str, str] = {}
-        """What each node is called in topics, as it was announced last."""
+        """The name of each node in topics, as it was announced last."""
         self._owed_entities: dict[tuple[str, int], None] = {}  # to be announced, in this order
         self._left: list[str] = []  # topics of names that nodes had, whose retained states go
         self._newest: dict[str, dict[str, float | None]] = {}
@@ -123,7 +123,7 @@ class MqttSink(ThreadedSink):
 
     @property
     def _status(self) -> str:
-        """Topic that says whether this measurement is there."""
+        """Topic of this measurement's availability."""
         return "/".join(filter(None, (self._topics.station, slug(self._station.instance), "status")))
 
     def _password(self) -> str | None:
@@ -162,7 +162,7 @@ class MqttSink(ThreadedSink):
         self._anew.set()
 
     def _on_connect_fail(self, *_: Any) -> None:
-        """No connection came about; the library calls this where it caught why."""
+        """Record that no connection was made; the library calls this after it caught the cause."""
         error = sys.exc_info()[1]
         self._waits(_in_words(error, self._host, self._port) if error is not None else "")
 
@@ -231,7 +231,7 @@ class MqttSink(ThreadedSink):
             self._announce()
 
     def _announce(self) -> None:
-        """Tell Home Assistant of what it was not told yet, as far as the library takes it for now."""
+        """Announce new entities to Home Assistant, as far as the library takes them for now."""
         if not self._connected.is_set() or self._anew.is_set():
             return
         while self._left:
@@ -243,7 +243,7 @@ class MqttSink(ThreadedSink):
             del self._owed_entities[key]
 
     def _discover(self, facts: ChannelFacts) -> bool:
-        """Announce a channel; False where it has to be done again."""
+        """Announce a channel; False if it has to be done again."""
         if facts.unsigned:  # raw values alone, which are none of anything: no sensor to show
             return True
         node = f"{self._topics.station}/{self._topics.node(facts.uuid)}"
@@ -296,14 +296,14 @@ class MqttSink(ThreadedSink):
                 self._count(dropped=len(newest))
 
     def _shown(self, facts: ChannelFacts, value: float) -> float | None:
-        """A value in people's unit, None where there is none."""
+        """Return a value in its display unit, None if there is none."""
         unit = self._units.get(facts.key)
         if not math.isfinite(value):
             return None
         return value if unit is None else unit.from_si(value)
 
     def _publish(self, topic: str, words: dict[str, Any], *, qos: int = 0, retain: bool = False) -> bool:
-        """Whether the library took it; without a connection it keeps what has to arrive (QoS 1) and drops the rest."""
+        """Return True if the library took it; without a connection it keeps QoS 1 messages and drops the rest."""
         octets = json.dumps(words, allow_nan=False).encode()
         if self._client.publish(topic, octets, qos=qos, retain=retain).rc == _FULL:
             return False
@@ -322,7 +322,7 @@ class MqttSink(ThreadedSink):
             self._fail(TedsProvisionError(f"{self.name} accepted nothing: {why}.", hint="Fix that and measure again."))
 
     def _said_offline(self) -> bool:
-        """Whether the broker knows that this measurement has ended."""
+        """Return True if the broker knows that this measurement has ended."""
         until = time.monotonic() + _FAREWELL
         said = self._client.publish(self._status, "offline", qos=1, retain=True)
         while said.rc == _FULL and time.monotonic() < until:
@@ -334,7 +334,7 @@ class MqttSink(ThreadedSink):
         return False
 
     def _cut(self) -> None:
-        """End the connection without a farewell, so that the broker says offline by the will that it holds."""
+        """End the connection without DISCONNECT, so that the broker publishes offline by its will."""
         connection = self._client.socket()
         if connection is not None:
             with suppress(OSError):
@@ -346,7 +346,7 @@ def _host(name: str) -> str:
 
 
 def _files_of(query: str, *, tls: bool) -> dict[str, str]:
-    """The files that a URL names; raises UsageError for another key, one that comes twice, a CA without TLS."""
+    """Return the files that a URL names; raises UsageError for another key, one that comes twice, a CA without TLS."""
     known = FILES if tls else FILES[:1]
     named: dict[str, str] = {}
     for key, path in parse_qsl(query, keep_blank_values=True):
@@ -361,7 +361,7 @@ def _files_of(query: str, *, tls: bool) -> dict[str, str]:
 
 
 def _octets(key: str, path: str) -> bytes:
-    """A small regular file that the URL names by this key; raises NotFoundError, BadDataError."""
+    """Return a small regular file that the URL names by this key; raises NotFoundError, BadDataError."""
     try:
         if not stat.S_ISREG(Path(path).stat().st_mode):  # a pipe would hold the sink up until somebody writes
             raise BadDataError(f"{key}={path} is no regular file.", hint="Check the URL of the broker.")
@@ -371,7 +371,7 @@ def _octets(key: str, path: str) -> bytes:
 
 
 def _no_password() -> str:
-    """Nobody is asked for a key's passphrase: the library would do so on the terminal."""
+    """Return no passphrase for a key: the library would ask for it on the terminal."""
     raise ValueError("the key is encrypted")
 
 

@@ -22,14 +22,14 @@ TOKEN = re.compile(r"[A-Za-z](?:[A-Za-z0-9]|_(?=[A-Za-z0-9]))*\Z")
 
 
 def slug(text: str) -> str:
-    """A name from a person or a datasheet as one part of a topic; empty where nothing is left of it."""
+    """Return an operator's or a datasheet's name as one part of a topic; empty if nothing is left of it."""
     letters = unicodedata.normalize("NFKD", text.casefold()).encode("ascii", "ignore").decode().lower()
     joined = re.sub(r"[^a-z0-9]+", "_", letters).strip("_")[:LONGEST].strip("_")
     return f"n_{joined}" if joined and not joined[0].isalpha() else joined
 
 
 def is_topic(text: str) -> bool:
-    """Whether a name that a person chose follows the rules; parts are divided by ``/``."""
+    """True if a chosen name follows the rules; parts are divided by ``/``."""
     return all(TOKEN.match(part) and "__" not in part for part in text.strip("/").split("/"))
 
 
@@ -37,16 +37,16 @@ FRAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*\Z")
 
 
 def is_frame(text: str) -> bool:
-    """Whether a text can be a coordinate frame (``frame_id``), of a person or a file."""
+    """True if a text can be a coordinate frame (``frame_id``), of an operator or a file."""
     return len(text) <= LONGEST and FRAME.match(text) is not None
 
 
 class Topics:
     """Names of all nodes and channels of one station: no two topics are equal, whatever names there are.
 
-    Chosen names go before made ones; a made one that is taken, or stands for something else (``teds``, ``imu``), gets
-    its number or the digits of its UUID behind it. What is made follows from ``station`` and from each node's own
-    datasheet alone (:attr:`ChannelFacts.siblings`), so that every measurement and ``/names`` make the same.
+    Chosen names go before derived ones; a derived one that is taken, or reserved (``teds``, ``imu``), gets its number
+    or the digits of its UUID behind it. Derived names follow from ``station`` and from each node's own datasheet alone
+    (:attr:`ChannelFacts.siblings`), so that every measurement and ``/names`` make the same.
     """
 
     def __init__(self, station: StationFacts) -> None:
@@ -90,7 +90,7 @@ class Topics:
             self._name_nodes()
 
     def _name_unverified(self, uuid: str, name: str) -> None:
-        """Whoever came first keeps its name: one that nobody vouches for renames no other."""
+        """Name an unverified node; an unproven name never renames another node."""
         own = name or f"n{uuid[:8]}"
         if self._unverified.get(uuid, "").startswith(own):
             return
@@ -114,10 +114,10 @@ class Topics:
         self._made = {}
 
     def _own_name(self, uuid: str, name: str) -> str:
-        """The name, with its own digits behind it where it ends in those of another node.
+        """Return the name, with its own digits behind it if it ends in those of another node.
 
         Two namesakes have their digits behind their names. When one of them goes, the running measurement goes on under
-        that name, and a third node that is called so must not get it in the next one.
+        that name, and a third node of that name must not get it in the next one.
         """
         digits = name.rpartition("_")[2]
         if len(digits) not in (8, 20) or not all(digit in "0123456789abcdef" for digit in digits):
@@ -126,7 +126,10 @@ class Topics:
         return f"{name}_{uuid[:8]}" if another else name
 
     def node(self, uuid: str) -> str:
-        """Part of the node: ``arm``, ``n8d4d9da6``; ``unverified/arm``, whatever somebody chose for the signed one."""
+        """Return the node's part: ``arm``, ``n8d4d9da6``.
+
+        ``unverified/arm``, whatever was chosen for the signed one.
+        """
         if uuid in self._unverified:
             return f"{UNVERIFIED}/{self._unverified[uuid]}"
         return self._chosen.get((uuid, 0)) or self._nodes.get(uuid) or f"n{uuid[:8]}"
@@ -140,7 +143,7 @@ class Topics:
         return f"/{self.station}/{self.node(uuid)}/{self._made[uuid].get(number, f'ch{number}')}"
 
     def _make(self, uuid: str) -> dict[int, str]:
-        """Names of a node's channels that nobody chose one for."""
+        """Return the derived names of a node's channels."""
         prefix = f"/{self.station}/{self.node(uuid)}/"
         channels = self._channels.get(uuid, {})
         apart = uuid in self._unverified
@@ -152,20 +155,20 @@ class Topics:
         return _apart(wishes, more, taken, _NOT_CHANNELS)
 
     def of_node(self, uuid: str, what: str) -> str:
-        """A topic beside the channels of a node: ``/bench/arm/teds``."""
+        """Return a topic beside the channels of a node: ``/bench/arm/teds``."""
         return f"/{self.station}/{self.node(uuid)}/{what}"
 
     def of_group(self, group: str) -> str:
-        """The array of a group: ``/bench/hand``; of a measurement without one ``/bench/all``."""
+        """Return the array topic of a group: ``/bench/hand``; of a measurement without one ``/bench/all``."""
         name = slug(group) or "all"
         return f"/{self.station}/{name}{'_group' if name in _JOINTS else ''}"
 
     def of_station(self, what: str) -> str:
-        """A topic of the whole station: ``/bench/joint_states``."""
+        """Return a topic of the whole station: ``/bench/joint_states``."""
         return f"/{self.station}/{what}"
 
     def require_free(self, uuid: str, channel: int, name: str) -> None:
-        """Raise UsageError where a name that is to be chosen is, or would be taken for, another one's."""
+        """Raise UsageError if a name that is to be chosen is, or would be mistaken for, another one's."""
         name = name.strip("/")
         if not channel:
             other = next(
@@ -185,7 +188,7 @@ class Topics:
                     raise _taken(name, f"channel {number} of node {other}")
 
     def _stands_for_else(self, topic: str) -> bool:
-        """Whether a topic is that of a node as a whole, of a group, or of what goes with them."""
+        """True if a topic is that of a node as a whole, of a group, or of their companions."""
         _, _, rest = topic.partition(f"/{self.station}/")
         if not topic.startswith(f"/{self.station}/") or not rest:
             return False
@@ -198,7 +201,7 @@ _JOINTS: Final = frozenset({"joint_states", "joint_commands"})
 _NOT_NODES: Final = frozenset({"all", "reports", "status", UNVERIFIED}) | _JOINTS
 """Parts of topics of the station itself: no node is called so."""
 _NOT_CHANNELS: Final = re.compile(r"(array|teds|state|status|age|cmd|(stream|imu|magnetic_field|wrench)(_[0-9]+)?)")
-"""Parts of topics that stand beside the channels of a node (live.py, vectors.py, mcap/recording.py, mqtt.py)."""
+"""Parts of topics beside the channels of a node (live.py, vectors.py, mcap/recording.py, mqtt.py)."""
 _NOT_TOPICS: Final = frozenset(
     {"diagnostics", "diagnostics_agg", "rosout", "rosout_agg", "parameter_events", "tf", "tf_static", "clock"}
 )
@@ -216,7 +219,7 @@ def _apart(
     taken: Set[str],
     forbidden: re.Pattern[str] | None = None,
 ) -> dict[_Key, str]:
-    """Each its wish where nobody else has it, else the first of ``more`` that is free, else that with a number."""
+    """Return each wish if it is unique, else the first of ``more`` that is free, else that with a number."""
 
     def may(name: str) -> bool:
         return bool(name) and name not in taken and not (forbidden and forbidden.fullmatch(name))

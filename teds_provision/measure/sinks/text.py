@@ -1,8 +1,8 @@
-"""Text and CSV: a header that says what a reader needs, then a row for each instant of a stream.
+"""Text and CSV: a header for readers, then a row for each instant of a stream.
 
 The header is lines that begin with ``#``; each channel's facts are one JSON object. Columns: ``time`` (unix seconds),
-``uuid``, ``index`` (sample number in the run of the stream), ``clock_error`` (seconds, empty where no bound is known),
-``note`` (``test pattern``, else empty), the value of each channel in its SI unit (empty where it is not valid), and the
+``uuid``, ``index`` (sample number in the run of the stream), ``clock_error`` (seconds, empty if no bound is known),
+``note`` (``test pattern``, else empty), the value of each channel in its SI unit (empty if it is not valid), and the
 raw value of each. Cells of channels that another node or stream measures are empty. A ``.csv`` has commas, a ``.txt``
 tabs. Channels that come later, or another datasheet, begin a new part: each file is complete in itself.
 """
@@ -38,7 +38,7 @@ class TextSink(FileSink):
         self._columns: dict[tuple[str, int], int] = {}
         self._headed = False  # whether this part has its head
         self._states: dict[str, str] = {}
-        """What stands in this part of each node that is not measured: it is tried again without a line each time."""
+        """State of each unmeasured node in this part: repeated tries get no line each."""
         self._templates: dict[tuple[str, tuple[int, ...], bool, str], tuple[str, list[int]]] = {}
         self._not_a_number = re.compile(f"(?<={self._comma})nan(?=[{self._comma}\n])")
 
@@ -72,7 +72,7 @@ class TextSink(FileSink):
             self._state(report)
 
     def _close_part(self) -> None:
-        """A file without a value says why, and each says what was counted of its nodes."""
+        """Add the reason to a file without a value, and the counts of its nodes to each."""
         if self._part is not None:
             if not self._headed:
                 self._header()
@@ -111,9 +111,9 @@ class TextSink(FileSink):
         self._line(self._comma.join(map(self._cell, columns)))
 
     def _cell(self, text: str) -> str:
-        """A name from a datasheet as a cell: quoted where needed, never a formula of a spreadsheet.
+        """Return a name from a datasheet as a cell: quoted if needed, never a formula of a spreadsheet.
 
-        A # outside quotes would begin a comment for whoever skips the lines above (pandas).
+        A # outside quotes would begin a comment for readers that skip the lines above (pandas).
         """
         text = printable(text)
         if text.startswith(FORMULA):
@@ -150,7 +150,7 @@ class TextSink(FileSink):
         return self._not_a_number.sub("", text) if "nan" in text else text
 
     def _template(self, block: Block, kind: str) -> tuple[str, list[int]]:
-        """Formats of a row, and the order of the block's columns in it where that is not theirs."""
+        """Return formats of a row, and the order of the block's columns in it if that differs."""
         key = (block.uuid, block.channels, block.test_pattern, kind)
         if key not in self._templates:
             form = {"f": "%.17g", "O": "%s"}.get(kind, "%d")
@@ -159,7 +159,7 @@ class TextSink(FileSink):
         return self._templates[key]
 
     def _row(self, block: Block, raw: str) -> str:
-        """A row of formats in the columns' order, which is by channel number."""
+        """Return a row of formats in the columns' order, which is by channel number."""
         width = len(self._columns)
         cells = [""] * (2 * width)
         for number in block.channels:
@@ -170,14 +170,14 @@ class TextSink(FileSink):
 
 
 def note_of(facts: Sequence[ChannelFacts]) -> str:
-    """What stands beside values that nobody vouches for, "" for others."""
+    """Return the note beside unproven values, "" for others."""
     if any(channel_facts.unverified for channel_facts in facts):
         return "unverified datasheet"
     return "unsigned datasheet" if any(channel_facts.unsigned for channel_facts in facts) else ""
 
 
 def counted(report: NodeReport) -> str:
-    """What became of a node's values, as the lines of the file's end say it."""
+    """Return the counts of a node's values for the lines at the file's end."""
     text = (
         f"{report.samples} values, lost {report.lost}, late {report.late}, bad {report.bad}, invalid {report.invalid}"
     )
@@ -202,7 +202,7 @@ def names_of(known: Sequence[ChannelFacts]) -> list[str]:
 
 
 def heads_of(known: Sequence[ChannelFacts]) -> list[str]:
-    """Columns of values: the name of each channel, and its unit where it has one."""
+    """Return columns of values: the name of each channel, and its unit if it has one."""
     return [
         f"{name} [{facts.unit}]" if facts.unit else name for name, facts in zip(names_of(known), known, strict=True)
     ]

@@ -60,7 +60,7 @@ ILLUMINANCE = Meaning("sensor_msgs/Illuminance", "illuminance", 0.0, True)
 
 
 def meaning_of(facts: ChannelFacts) -> Meaning:
-    """Typed only where unit and meaning fit: a ratio is humidity only where the names say so."""
+    """Return the meaning, typed only if unit and meaning fit: a ratio is humidity only if the names mean it."""
     if facts.kind == "actuator":
         return NUMBER
     words = f"{facts.quantity} {facts.name}".lower().replace("_", " ").replace("-", " ")
@@ -74,7 +74,7 @@ def meaning_of(facts: ChannelFacts) -> Meaning:
 
 
 def variance_of(facts: ChannelFacts) -> float:
-    """Variance for sensor_msgs; 0 where neither profile nor datasheet says."""
+    """Return the variance for sensor_msgs; 0 if neither profile nor datasheet has one."""
     if facts.deviation:
         return facts.deviation**2
     return facts.uncertainty**2 / 3 if facts.uncertainty else 0.0
@@ -95,7 +95,7 @@ _INFRARED: Final = 1
 
 @dataclass(frozen=True)
 class Compound:
-    """One message: its type (ROS 1 spelling), the end of its topic ("" for the channel's own), and where values go.
+    """One message: its type (ROS 1 spelling), the end of its topic ("" for the channel's own), and its values.
 
     ``parts`` are (path of the field, channel number), ``fixed`` the other fields by path.
     """
@@ -106,7 +106,7 @@ class Compound:
     fixed: Mapping[str, FieldValue] = field(default_factory=dict)
 
     def fields(self, values: Mapping[int, float]) -> dict[str, FieldValue] | None:
-        """All fields by path; None where a value is missing or not finite: half a vector is none."""
+        """Return all fields by path; None if a value is missing or not finite: half a vector is none."""
         found: dict[str, FieldValue] = dict(self.fixed)
         for path, number in self.parts:
             value = values.get(number, math.nan)
@@ -117,7 +117,7 @@ class Compound:
 
 
 def compounds_of(facts: Iterable[ChannelFacts]) -> list[Compound]:
-    """The messages that the channels of one stream of one node make together."""
+    """Return the messages that the channels of one stream of one node make together."""
     sensors = {channel_facts.number: channel_facts for channel_facts in facts if channel_facts.kind == "sensor"}
     by_unit = _vectors(sensors)
     found = [_magnetic(axes) for axes in by_unit.get(_FIELD, [])]
@@ -145,7 +145,7 @@ def _vectors(sensors: Mapping[int, ChannelFacts]) -> dict[object, list[list[Chan
 
 
 def is_range(facts: ChannelFacts) -> bool:
-    """Whether a channel is a range finder: by its unit and what the profile or its name calls it."""
+    """True if a channel is a range finder: by its unit and the name in profile or datasheet."""
     words = f"{facts.quantity} {facts.name}".lower().replace("_", " ").replace("-", " ")
     return facts.kind == "sensor" and facts.units == _LENGTH and any(word in words for word in _RANGE_WORDS)
 
@@ -181,7 +181,7 @@ def _imus(accelerations: list[list[ChannelFacts]], rates: list[list[ChannelFacts
 
 
 def _range(facts: ChannelFacts) -> Compound:
-    """The angle of its cone is not in a datasheet: 0."""
+    """Return a Range; the angle of its cone is not in a datasheet: 0."""
     fixed: dict[str, FieldValue] = {
         "radiation_type": _INFRARED,
         "min_range": 0.0 if facts.low is None else facts.low,

@@ -1,8 +1,8 @@
 """Wide CSV: one grid of times for all channels, one row a time, a column for each channel with its unit in the name.
 
 For spreadsheets and data frames. A cell holds the last value that is not newer than the row and not older than two
-periods of its channel (``grid.py``); it is empty where there is none. Raw values, sample numbers and the bounds of the
-clock do not fit a grid: they are in the other formats. Lines with ``#`` say what those of ``text.py`` say.
+periods of its channel (``grid.py``); it is empty if there is none. Raw values, sample numbers and the bounds of the
+clock do not fit a grid: they are in the other formats. The header is that of ``text.py``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from teds_provision.measure.sinks.text import TextSink, heads_of
 from teds_provision.sanitize import printable
 
 WIDE = "wide:"
-"""What stands before the path of such a file in the words for a sink."""
+"""Prefix of the path of such a file in a sink's string."""
 
 
 class WideSink(TextSink):
@@ -45,11 +45,11 @@ class WideSink(TextSink):
             super()._process_item(item)
 
     def _begin(self) -> None:
-        """Begin with the first row, which says what channels there are."""
+        """Begin with the first row, which determines the channels."""
         self._columns, self._changed, self._headed = {}, False, False
 
     def _header(self) -> None:
-        """The head of a part that no row came for."""
+        """Write the header of a part without a row."""
         self._head_of([self.facts[key] for key in sorted(self.facts)])
 
     def _head_of(self, known: list[ChannelFacts]) -> None:

@@ -1,9 +1,9 @@
 """MCAP recorder: one topic for each stream at full rate, the datasheet's facts beside it, reports as diagnostics.
 
-A message holds one instant of a stream (definition SAMPLES below, CDR, described in the file itself, so that readers
-of ROS 2 messages decode it): calibrated values, NaN where not valid, and the raw values. Its log time is the instant.
-Chunks are 64 KiB and at most FLUSH old. The facts of channels stand in the metadata of their stream's topic, in a
-metadata record, and as a ``std_msgs/String`` on ``…/teds`` at the start of each file, where ``ros2 bag`` users look.
+A message holds one instant of a stream (definition SAMPLES below, CDR, described in the file itself, so that readers of
+ROS 2 messages decode it): calibrated values, NaN where not valid, and the raw values. Its log time is the instant.
+Chunks are 64 KiB and at most FLUSH old. The facts of channels are in the metadata of their stream's topic, in a
+metadata record, and in a ``std_msgs/String`` on ``…/teds`` at the start of each file, where ``ros2 bag`` users look.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ uint32 nanosec
 """
 STRING = "string data\n"
 QOS = "offered_qos_profiles"
-"""What rosbag2 keeps of each topic, for `ros2 bag play` to offer what the publisher offered: YAML, as from Iron on."""
+"""QoS that rosbag2 keeps of each topic, so that `ros2 bag play` offers the publisher's: YAML, as from Iron on."""
 _NEVER = "{sec: 9223372036, nsec: 854775807}"
 _OFFERED = (
     "- history: keep_last\n  depth: {depth}\n  reliability: reliable\n  durability: {durability}\n"
@@ -162,7 +162,7 @@ class McapSink(FileSink):
         self._string(f"/{self._names.station}/reports", json.dumps(words), report.time or time.time())
 
     def _stream(self, block: Block) -> tuple[int, np.ndarray]:
-        """The topic of a stream, and a message of it in which all stands that is the same in each."""
+        """Return the topic of a stream, and a message of it with all that is the same in each."""
         integral = block.raw.dtype.kind in "uib"
         key = (block.uuid, block.stream, block.channels, "i" if integral else "f")
         if key not in self._streams:
@@ -225,12 +225,12 @@ class McapSink(FileSink):
 
 
 def _as_texts(facts: dict[str, Any]) -> dict[str, str]:
-    """Metadata of MCAP are texts: what is none stands as JSON."""
+    """Return metadata of MCAP as texts: other values become JSON."""
     return {name: value if isinstance(value, str) else json.dumps(value) for name, value in facts.items()}
 
 
 def _plain(channel: int, channels: int, integral: bool) -> np.ndarray:
-    """An array of one message record without its numbers; those of a block are as many copies of it."""
+    """Return an array of one message record without its numbers; those of a block are as many copies of it."""
     row = np.zeros(1, dtype=layout(channels, integral))
     row["code"], row["length"], row["channel"] = MESSAGE, row.dtype.itemsize - 9, channel
     row["cdr"] = LITTLE_ENDIAN
@@ -240,7 +240,10 @@ def _plain(channel: int, channels: int, integral: bool) -> np.ndarray:
 
 
 def layout(channels: int, integral: bool) -> np.dtype[Any]:
-    """A message record of SAMPLES as a packed structure: CDR aligns to 8 octets, counted behind its first four."""
+    """Return a message record of SAMPLES as a packed structure.
+
+    CDR aligns to 8 octets, counted behind its first four.
+    """
     head: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [
         ("code", "u1"),
         ("length", "<u8"),

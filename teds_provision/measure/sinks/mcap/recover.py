@@ -54,7 +54,7 @@ _IN_A_CHUNK: Final = HEAD.size + CHUNK_HEAD.size  # where the name of the compre
 
 @dataclass(frozen=True)
 class Damage:
-    """A piece that is damaged: ``what`` it is, where it stands and how long it is."""
+    """A damaged piece: ``what`` it is, its position and length."""
 
     what: str
     offset: int
@@ -63,10 +63,10 @@ class Damage:
 
 @dataclass(frozen=True)
 class RecoveryResult:
-    """What a recording holds: messages, the last one's time (unix seconds), whether it was whole before.
+    """Content of a recording: messages, the last one's time (unix seconds), whether it was whole before.
 
-    ``cut`` octets at its end were of no use. ``damaged`` pieces inside are left out of ``output``, the new file; that
-    is None where the recording itself is whole now.
+    ``cut`` octets at its end were useless. ``damaged`` pieces inside are left out of ``output``, the new file; that is
+    None if the recording itself is whole now.
     """
 
     messages: int
@@ -101,7 +101,7 @@ def recover(path: Path, output: Path | None = None) -> RecoveryResult:
 
 @contextmanager
 def _map_alone(path: Path) -> Iterator[tuple[int, mmap.mmap]]:
-    """The octets of a file that no recorder writes; none begins to while this is open."""
+    """Map a file that no recorder writes; none begins to while this is open."""
     file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     try:
         status = os.fstat(file)
@@ -158,7 +158,7 @@ def _end_in_place(scan: _Scan, summary: McapSummary, file: int, path: Path) -> N
 
 @dataclass
 class _Chunk:
-    """A chunk whose checksum holds; what it holds is read again where it is needed, for there are many.
+    """A chunk with a good checksum; its content is read again when it is needed, for there are many.
 
     ``indexes`` are (channel, offset, octets) of the message indexes behind it; ``found`` their contents until it is
     known whether they name exactly its messages.
@@ -191,7 +191,7 @@ def _places(body: bytes) -> _Places:
 
 
 def _indexes(places: _Places) -> list[bytes]:
-    """Message indexes of a chunk, made anew."""
+    """Return new message indexes of a chunk."""
     return [
         record(
             MESSAGE_INDEX,
@@ -202,13 +202,13 @@ def _indexes(places: _Places) -> list[bytes]:
 
 
 def _names_all(found: dict[int, bytes], places: _Places) -> bool:
-    """Whether the contents of message indexes name exactly these messages."""
+    """True if the contents of message indexes name exactly these messages."""
     told = {channel: sorted(struct.iter_unpack("<QQ", index[6:])) for channel, index in found.items() if len(index) > 6}
     return told == {channel: sorted(entries) for channel, entries in places.items()}
 
 
 class _Scan:
-    """Walks through a file: what of it is whole, what is damaged, and where a torn end begins."""
+    """Walks through a file and records which parts are whole or damaged, and where a torn end begins."""
 
     def __init__(self, octets: mmap.mmap, path: Path) -> None:
         if octets[: len(MAGIC)] != MAGIC:
@@ -247,7 +247,7 @@ class _Scan:
         self._join_damage()
 
     def _read_end(self) -> bool:
-        """Whether the summary of a finished file holds; then its data end where it says."""
+        """Return True if the summary of a finished file is valid; then its data end where it states."""
         foot = len(self.octets) - len(MAGIC) - _FOOTER_OCTETS
         if foot < len(MAGIC) or HEAD.unpack_from(self.octets, foot) != (FOOTER, 20):
             return False
@@ -262,7 +262,7 @@ class _Scan:
         return True
 
     def _head(self, at: int) -> tuple[int, int] | None:
-        """Op code and length of a record that fits into the file; None where there is none."""
+        """Return op code and length of a record that fits into the file; None if there is none."""
         if at + HEAD.size > len(self.octets):
             return None
         code, length = HEAD.unpack_from(self.octets, at)
@@ -272,7 +272,7 @@ class _Scan:
         return code, length
 
     def _keep_record(self, at: int, code: int, length: int) -> int | None:
-        """Keep a record; where the next one begins, or None where it is damaged."""
+        """Keep a record; return where the next one begins, or None if it is damaged."""
         after = at + HEAD.size + length
         content = self.octets[at + HEAD.size : after]
         if code == MESSAGE_INDEX:
@@ -335,7 +335,7 @@ class _Scan:
         self.damaged.append(Damage(what, at, after - at))
 
     def _join_damage(self) -> None:
-        """What touches is one piece, called by what begins it."""
+        """Join damaged pieces that touch, named by the first one."""
         joined: list[Damage] = []
         for damage in sorted(self.damaged, key=lambda damage: damage.offset):
             last = joined[-1] if joined else None
@@ -347,7 +347,7 @@ class _Scan:
         self.damaged = joined
 
     def _next_chunk(self, at: int) -> int:
-        """Where something stands that has the form of a chunk; the end of the data where nothing does."""
+        """Return where something has the form of a chunk; the end of the data if nothing does."""
         place = at + _IN_A_CHUNK
         while (place := self.octets.find(_ZSTD, place, self._limit)) >= 0:
             begin = place - _IN_A_CHUNK
@@ -362,7 +362,7 @@ class _Scan:
         return self._limit
 
     def _whole_chunk(self, at: int, content: bytes) -> _Chunk | None:
-        """A chunk with its messages; None where its checksum does not hold, or it cannot be unpacked."""
+        """Return a chunk with its messages; None if its checksum is wrong, or it cannot be unpacked."""
         found = unpacked(content, self.path)
         if found is None:
             return None
@@ -385,7 +385,7 @@ class _Scan:
     # -- the end that belongs to it -----------------------------------------------------------------------------------
 
     def assembled(self, put: Callable[[bytes], object] | None) -> McapSummary:
-        """The summary of all that is whole, as it stands, or as ``put`` gets it, from the first octet to the last."""
+        """Return the summary of all that is whole, in order, unchanged or as ``put`` gets it."""
         summary, at = McapSummary(), len(MAGIC)
         if put is not None:
             put(MAGIC)
@@ -433,7 +433,7 @@ class _Scan:
         return _indexes(_places(self._body(self.chunk))) if self.chunk is not None else []
 
     def _rescued(self) -> list[bytes]:
-        """Schemas and channels of messages that are whole, which stood in a damaged chunk: as the summary has them."""
+        """Return schemas and channels of whole messages that were in a damaged chunk, as the summary has them."""
         known, used = McapSummary(), set[int]()
         for kept in self._kept:
             if isinstance(kept, _Chunk):
@@ -454,12 +454,12 @@ class _Scan:
 
 
 def _shapeless(number: int) -> bytes:
-    """A schema of which nothing is known any more."""
+    """Return a schema of which nothing is known any more."""
     return record(SCHEMA, struct.pack("<H", number) + text("recovered/unknown") + text("") + bytes(4))
 
 
 def _nameless(number: int) -> bytes:
-    """A channel of which nothing is known any more but its messages."""
+    """Return a channel of which nothing is known any more but its messages."""
     note = text("note") + text("the description of this topic stood in a damaged chunk")
     topic = text(f"/recovered/channel_{number}")
     content = struct.pack("<HH", number, 0) + topic + text("cdr") + struct.pack("<I", len(note)) + note
@@ -483,7 +483,7 @@ def _record_into(summary: McapSummary, octets: bytes, at: int, put: Callable[[by
 
 
 def _describe(summary: McapSummary, code: int, content: bytes) -> None:
-    """Take a schema or a channel into the summary, wherever it stands."""
+    """Take a schema or a channel into the summary, wherever it is."""
     number = int.from_bytes(content[:2], "little")
     if code == SCHEMA:
         summary.schemas[number] = record(SCHEMA, content)
@@ -492,7 +492,7 @@ def _describe(summary: McapSummary, code: int, content: bytes) -> None:
 
 
 def _fits(content: bytes) -> bool:
-    """Whether the lengths within a chunk and the chunk's own agree."""
+    """True if the lengths within a chunk and the chunk's own agree."""
     if len(content) < CHUNK_HEAD.size + 12:
         return False
     name = int.from_bytes(content[CHUNK_HEAD.size : CHUNK_HEAD.size + 4], "little")
@@ -501,7 +501,10 @@ def _fits(content: bytes) -> bool:
 
 
 def unpacked(content: bytes, path: Path, most: int = LARGEST_RECORD) -> tuple[bytes, bool] | None:
-    """The records in a chunk, and whether its checksum holds; None where it cannot be unpacked to ``most`` octets."""
+    """Return the records in a chunk, and whether its checksum is right.
+
+    None if it exceeds ``most`` octets or is damaged.
+    """
     if not _fits(content):
         return None
     _, _, size, checksum = CHUNK_HEAD.unpack_from(content)
@@ -526,7 +529,7 @@ def unpacked(content: bytes, path: Path, most: int = LARGEST_RECORD) -> tuple[by
 
 
 def _parses(code: int, content: bytes) -> bool:
-    """Whether the parts of a record end where it ends; of others than these nothing is known."""
+    """True if the parts of a record end at its end; other records than these are not checked."""
     try:
         if code == METADATA:
             return _after_map(content, _after_text(content, 0)) == len(content)
@@ -545,7 +548,7 @@ def _parses(code: int, content: bytes) -> bool:
 
 
 def _after_text(content: bytes, at: int) -> int:
-    """Where a text ends; raises ValueError where it is none."""
+    """Return where a text ends; raises ValueError if it is none."""
     end = at + 4 + int(struct.unpack_from("<I", content, at)[0])
     if end > len(content):
         raise ValueError("beyond the record")
@@ -562,7 +565,7 @@ def _after_map(content: bytes, at: int) -> int:
 
 
 def _inside(body: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """Records of a chunk or of a summary: offset, op code, content."""
+    """Yield records of a chunk or of a summary: offset, op code, content."""
     at = 0
     while at + HEAD.size <= len(body):
         with suppress(struct.error):

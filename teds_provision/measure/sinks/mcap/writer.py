@@ -22,12 +22,12 @@ CHUNK_HEAD = struct.Struct("<QQQI")
 
 
 def record(code: int, content: bytes) -> bytes:
-    """A record: op code, length, content."""
+    """Return a record: op code, length, content."""
     return HEAD.pack(code, len(content)) + content
 
 
 def text(value: str) -> bytes:
-    """A string: u32 length, UTF-8."""
+    """Return a string: u32 length, UTF-8."""
     octets = value.encode()
     return struct.pack("<I", len(octets)) + octets
 
@@ -39,7 +39,7 @@ def _map(pairs: Mapping[str, str]) -> bytes:
 
 @dataclass
 class McapSummary:
-    """What the end of a file says of all of it; kept while writing, gathered anew when a file is made whole."""
+    """Summary of a whole file; kept while writing, gathered again when a file is made whole."""
 
     schemas: dict[int, bytes] = field(default_factory=dict)  # whole records
     channels: dict[int, bytes] = field(default_factory=dict)
@@ -120,7 +120,7 @@ class McapWriter:
         self._chunk_offset += len(octets)
 
     def schema(self, name: str, definition: str) -> int:
-        """A ROS 2 message definition; its number."""
+        """Add a ROS 2 message definition; return its number."""
         number = len(self.summary.schemas) + 1
         octets = definition.encode()
         content = struct.pack("<H", number) + text(name) + text("ros2msg") + struct.pack("<I", len(octets)) + octets
@@ -129,7 +129,7 @@ class McapWriter:
         return number
 
     def channel(self, topic: str, schema: int, metadata: Mapping[str, str]) -> int:
-        """A topic of CDR messages; its number."""
+        """Add a topic of CDR messages; return its number."""
         number = len(self.summary.channels) + 1
         content = struct.pack("<HH", number, schema) + text(topic) + text("cdr") + _map(metadata)
         self.summary.channels[number] = record(CHANNEL, content)
@@ -185,7 +185,7 @@ class McapWriter:
         self._put(chunk + b"".join(indexes))
 
     def finish(self) -> None:
-        """The last chunk, the summary and the footer."""
+        """Write the last chunk, the summary and the footer."""
         self.close_chunk()
         self._put(self.summary.tail(self._offset))
 
@@ -193,7 +193,7 @@ class McapWriter:
 def chunk_index(
     first: int, last: int, offset: int, length: int, places: bytes, end: int, packed: int, unpacked: int
 ) -> bytes:
-    """The record that finds a chunk: log times, offset and length, where its message indexes lie, sizes."""
+    """Return the record that locates a chunk: log times, offset and length, its message indexes, sizes."""
     content = struct.pack("<QQQQI", first, last, offset, length, len(places)) + places
     content += struct.pack("<Q", end - offset - length) + text("zstd") + struct.pack("<QQ", packed, unpacked)
     return record(CHUNK_INDEX, content)

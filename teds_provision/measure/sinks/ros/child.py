@@ -1,8 +1,8 @@
 """ROS by a child process: topics, parameters, metadata and set points as lines of JSON through two pipes.
 
-A child, because rospy and rclpy want the Python and the libraries that ROS came with, throw away log handlers, and
-block for ever where there is no master. If it dies it is started anew (1 s, doubling to 30 s), and everything is
-advertised again. What is measured meanwhile is counted as dropped; the measurement goes on.
+A child, because rospy and rclpy need the Python and the libraries that ROS came with, remove log handlers, and block
+for ever without a master. If it dies it is started again (1 s, doubling to 30 s), and everything is advertised again.
+Values measured meanwhile are counted as dropped; the measurement goes on.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PROBING = 60.0  # seconds: an import of rospy takes one on a machine that is not
 
 
 def imports(python: str, packages: str, environment: dict[str, str]) -> bool:
-    """Whether this Python can import these packages (``a, b.c``) in this environment."""
+    """True if this Python can import these packages (``a, b.c``) in this environment."""
     try:
         probe = [python, "-s", "-c", f"import {packages}"]
         done = subprocess.run(probe, env=environment, capture_output=True, timeout=PROBING, check=False)
@@ -57,7 +57,7 @@ COMPLAINT = 200  # characters of the last line of stderr that are told
 
 
 class ChildSink(TopicSink):
-    """What the sinks by a child have in common; ``library`` is the Python package that works there."""
+    """The common part of sinks with a child; ``library`` is the Python package that works there."""
 
     def __init__(self, name: str, library: str, commands: CommandTaker | None) -> None:
         super().__init__(name, commands)
@@ -74,11 +74,11 @@ class ChildSink(TopicSink):
 
     @abstractmethod
     def _program(self) -> list[str]:
-        """The child: its Python, and its script."""
+        """Return the child's command: its Python, and its script."""
 
     @abstractmethod
     def _environment(self) -> dict[str, str]:
-        """The child's."""
+        """Return the child's environment."""
 
     def _begin(self) -> None:
         self._start()
@@ -104,7 +104,7 @@ class ChildSink(TopicSink):
         self._set_state("waiting", f"{self._library} is starting")
 
     def _hear(self, child: subprocess.Popen[bytes]) -> None:
-        """The child's lines, on a thread of their own."""
+        """Read the child's lines, in a thread."""
         assert child.stdout is not None
         for line in child.stdout:
             try:
@@ -122,7 +122,7 @@ class ChildSink(TopicSink):
         child.stdout.close()
 
     def _hear_complaints(self, child: subprocess.Popen[bytes]) -> None:
-        """What it writes to stderr: read, so that it never waits for us; the last line is kept."""
+        """Read its stderr, so that it never blocks; keep the last line."""
         assert child.stderr is not None
         for line in child.stderr:
             self._complaint = line.decode(errors="replace").strip()[:COMPLAINT] or self._complaint
@@ -141,7 +141,7 @@ class ChildSink(TopicSink):
             super()._idle(now)
 
     def _up(self) -> bool:
-        """Whether there is a child with a master; starts one when it is time."""
+        """Return True if there is a child with a master; starts one when it is time."""
         now = time.monotonic()
         child = self._child
         if child is not None and child.poll() is None:
@@ -162,7 +162,7 @@ class ChildSink(TopicSink):
         return False
 
     def _cause(self, code: int) -> str:
-        """Why a child ended; after another program took its name, the next one has a name that nobody else has."""
+        """Return why a child ended; after another program took its name, the next one gets a unique name."""
         if code == NO_MASTER:
             return "the ROS master is gone"
         if code == NAME_TAKEN:
@@ -194,7 +194,7 @@ class ChildSink(TopicSink):
             self._lost(f"{self._library} died")
 
     def _number(self, topic: str, kind: str, *, latch: bool = False) -> int:
-        """The child's number of a topic, which has one publisher whatever goes out on it."""
+        """Return the child's number of a topic, which has one publisher for all messages on it."""
         if topic not in self._numbers:
             self._numbers[topic] = next(self._count_up)
             self._send(op="topic", id=self._numbers[topic], topic=topic, type=kind, latch=latch)

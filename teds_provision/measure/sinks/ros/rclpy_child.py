@@ -32,7 +32,7 @@ _OUT = threading.Lock()
 
 
 def plain(value: Any) -> Any:
-    """A value as a parameter may have it: lists of one type, no null, no table."""
+    """Return a value as a parameter may have it: lists of one type, no null, no table."""
     if isinstance(value, list):
         kinds = {type(element) for element in value}
         if kinds <= {int, float}:
@@ -42,7 +42,7 @@ def plain(value: Any) -> Any:
 
 
 def ports_of(domain: int, count: int = PORTS) -> range:
-    """The first so many ports of a DDS domain; a participant has two of them."""
+    """Return the first so many ports of a DDS domain; a participant has two of them."""
     first = FIRST_PORT + PORTS * domain
     return range(first, first + count)
 
@@ -50,8 +50,8 @@ def ports_of(domain: int, count: int = PORTS) -> range:
 def keep_on_loopback(ports: range) -> None:
     """Bind those ports on which this process listens to the loopback device.
 
-    Cyclone DDS and Fast DDS announce themselves on loopback alone where they are told to, but listen on every address:
-    anybody on the network could send them set points. Linux 5.7 and later let a process do so without privileges.
+    Cyclone DDS and Fast DDS can be restricted to announce themselves on loopback alone, but listen on every address:
+    any host on the network could send them set points. Linux 5.7 and later let a process do so without privileges.
     """
     for name in os.listdir("/proc/self/fd"):
         try:
@@ -69,7 +69,7 @@ def keep_on_loopback(ports: range) -> None:
 
 
 def on_this_machine_alone() -> bool:
-    """Whether the environment keeps ROS 2 on this machine; ROS_LOCALHOST_ONLY is its older name."""
+    """True if the environment keeps ROS 2 on this machine; ROS_LOCALHOST_ONLY is its older name."""
     local = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() in ("LOCALHOST", "OFF")
     return (local and not os.environ.get("ROS_STATIC_PEERS")) or os.environ.get("ROS_LOCALHOST_ONLY") == "1"
 
@@ -87,7 +87,7 @@ class Bridge:
         node.add_on_set_parameters_callback(self._may_set)
 
     def _may_set(self, _parameters: Any) -> Any:
-        """Parameters are facts of datasheets: nobody sets them from outside."""
+        """Refuse parameters from outside: they are facts of datasheets."""
         answer = importlib.import_module("rcl_interfaces.msg").SetParametersResult()
         answer.successful = self._own
         answer.reason = "" if self._own else "a fact of a signed datasheet"
@@ -122,7 +122,7 @@ class Bridge:
         self.node.destroy_publisher(self.publishers.pop(line["id"])[0])
 
     def message(self, line: dict[str, Any]) -> tuple[Any, Any]:
-        """The publisher of a line, and an empty message with its header."""
+        """Return the publisher of a line, and an empty message with its header."""
         publisher, kind = self.publishers[line["id"]]
         message = kind()
         if hasattr(message, "header"):
@@ -132,11 +132,11 @@ class Bridge:
         return publisher, message
 
     def named(self, line: dict[str, Any]) -> None:
-        """What the values of the next rows are called."""
+        """Store the names for the values of the next rows."""
         self.names[line["id"]] = line["v"]
 
     def joint(self, line: dict[str, Any]) -> None:
-        """A row of a group."""
+        """Publish a row of a group."""
         publisher, message = self.message(line)
         message.name = self.names[line["id"]]
         message.position = [float("nan") if value is None else float(value) for value in line["v"]]
@@ -152,7 +152,7 @@ class Bridge:
         publisher.publish(message)
 
     def compound(self, line: dict[str, Any]) -> None:
-        """A message of several values, its fields by path; what this distribution's type has not is left out."""
+        """Publish a message of several values, its fields by path; fields that this distribution lacks are left out."""
         publisher, message = self.message(line)
         for path, value in line["v"].items():
             *way, last = path.split(".")
@@ -170,7 +170,7 @@ class Bridge:
         publisher.publish(message)
 
     def status(self, line: dict[str, Any]) -> None:
-        """A DiagnosticArray; rclpy has an octet as bytes of length 1."""
+        """Publish a DiagnosticArray; rclpy has an octet as bytes of length 1."""
         publisher, message = self.message(line)
         entry, pair = self.type_of("diagnostic_msgs/DiagnosticStatus"), self.type_of("diagnostic_msgs/KeyValue")
         message.status = [

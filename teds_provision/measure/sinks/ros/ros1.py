@@ -1,6 +1,6 @@
 """ROS 1: topics, parameters, latched metadata and actuator subscribers by Debian's rospy, in a child process.
 
-When the master goes, the child is started anew and waits for it.
+When the master goes, the child is restarted and waits for it.
 """
 
 from __future__ import annotations

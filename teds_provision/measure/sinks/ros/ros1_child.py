@@ -45,7 +45,7 @@ _OUT = threading.Lock()
 
 
 def wait_for_master(rosgraph: Any) -> None:
-    """Until there is a master: init_node without one would block for ever, and say nothing that we could pass on."""
+    """Wait for a master: init_node without one would block for ever, without any message to pass on."""
     told, parent = False, os.getppid()
     while not rosgraph.is_master_online():
         if os.getppid() != parent:
@@ -72,7 +72,7 @@ def watch_master(rosgraph: Any, name: str) -> None:
 
 
 def leave(reason: str) -> None:
-    """The master ends a node whose name another one takes: say why, where rospy would go on without a connection."""
+    """End with the reason when another node takes our name; rospy would go on without a connection."""
     if "same name" in reason:
         os._exit(NAME_TAKEN)
 
@@ -80,7 +80,7 @@ def leave(reason: str) -> None:
 class Outlet:
     """A publisher. Its first messages wait for subscribers that the master knows of, MEETING seconds at most.
 
-    A subscriber connects some tenths of a second after the publisher was told of; rows of that time would be lost.
+    A subscriber connects some tenths of a second after it learned of the publisher; rows of that time would be lost.
     """
 
     def __init__(self, publisher: Any, kind: Any, expected: int) -> None:
@@ -97,7 +97,7 @@ class Outlet:
         self.met()
 
     def met(self) -> bool:
-        """Whether nobody is waited for any more; then what waited has gone."""
+        """Return True if no subscriber is waited for any more; then the waiting messages have gone."""
         if self._waiting is None:
             return True
         if time.monotonic() < self._until and self.publisher.get_num_connections() < self._expected:
@@ -110,7 +110,7 @@ class Outlet:
         return True
 
     def sent(self) -> bool:
-        """Whether its connections have taken all of it; their queues are rospy's own."""
+        """True if its connections have taken all of it; their queues are rospy's own."""
         connections = getattr(self.publisher.impl, "connections", ()) if self.publisher.impl else ()
         return not any(getattr(connection, "_queue", ()) for connection in connections)
 
@@ -154,7 +154,7 @@ class Bridge:
         return self.rospy.Time.from_sec(seconds)
 
     def topic(self, line: dict[str, Any]) -> None:
-        """Advertise; each subscriber has a queue of his own, so that a slow one holds up nobody."""
+        """Advertise; each subscriber has a separate queue, so that a slow one delays no other."""
         kind, latch = self.type_of(line["type"]), line["latch"]
         made = self.rospy.Publisher(line["topic"], kind, queue_size=QUEUE, latch=latch)
         self.publishers[line["id"]] = Outlet(made, kind, 0 if latch else self.subscribers(line["topic"]))
@@ -164,11 +164,11 @@ class Bridge:
         self.publishers.pop(line["id"]).publisher.unregister()
 
     def named(self, line: dict[str, Any]) -> None:
-        """What the values of the next rows are called."""
+        """Store the names for the values of the next rows."""
         self.names[line["id"]] = line["v"]
 
     def joint(self, line: dict[str, Any]) -> None:
-        """A row of a group."""
+        """Publish a row of a group."""
         publisher = self.publishers[line["id"]]
         message = publisher.kind()
         message.header.stamp = self.stamp(line["t"])
@@ -190,7 +190,7 @@ class Bridge:
         publisher.publish(message)
 
     def compound(self, line: dict[str, Any]) -> None:
-        """A message of several values, its fields by path; what this distribution's type has not is left out."""
+        """Publish a message of several values, its fields by path; fields that this distribution lacks are left out."""
         publisher = self.publishers[line["id"]]
         message = publisher.kind()
         message.header.stamp = self.stamp(line["t"])
@@ -210,7 +210,7 @@ class Bridge:
         publisher.publish(publisher.kind(line["v"]))
 
     def status(self, line: dict[str, Any]) -> None:
-        """A DiagnosticArray."""
+        """Publish a DiagnosticArray."""
         publisher = self.publishers[line["id"]]
         message = publisher.kind()
         message.header.stamp = self.stamp(line["t"])
@@ -221,7 +221,7 @@ class Bridge:
         publisher.publish(message)
 
     def param(self, line: dict[str, Any]) -> None:
-        """A parameter; the master may be gone just now, which is found out elsewhere."""
+        """Set a parameter; the master may be gone just now, which is detected elsewhere."""
         try:
             self.rospy.set_param(line["key"], line["value"])
         except Exception as error:  # noqa: BLE001  rospy lets sockets' and XML-RPC's exceptions through

@@ -1,10 +1,10 @@
 """ROS 2 without ROS: a DDS participant that ROS 2 tools take for a node (Humble to Lyrical).
 
 What makes it one: ``enclave=/;`` as the participant's user data, topics ``rt/…`` of types ``pkg::msg::dds_::Type_`` in
-XCDR1, the type's hash in each endpoint's user data, and ``ros_discovery_info``, written anew after each new endpoint.
+XCDR1, the type's hash in each endpoint's user data, and ``ros_discovery_info``, rewritten after each new endpoint.
 Unless the user brings a configuration (CYCLONEDDS_URI), nothing leaves this machine: loopback only, no multicast.
 Writers are reliable with a short history, so that best-effort and reliable readers both match; metadata is transient
-local, so that late comers get it.
+local, so that late subscribers get it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _domains: dict[int, Any] = {}  # a domain is configured once in a process
 
 
 def domain_of(spec: str) -> int:
-    """The domain of ``ros2`` or ``ros2:DOMAIN``, else ROS_DOMAIN_ID's, else 0; raises UsageError."""
+    """Return the domain of ``ros2`` or ``ros2:DOMAIN``, else ROS_DOMAIN_ID's, else 0; raises UsageError."""
     domain = spec.partition(":")[2] or os.environ.get("ROS_DOMAIN_ID", "0")
     if not domain.isdecimal() or int(domain) > 232:
         raise UsageError(f"{domain!r} is no ROS 2 domain.", hint="Name a number from 0 to 232: ros2:7")
@@ -54,7 +54,7 @@ def domain_of(spec: str) -> int:
 
 
 class Ros2Sink(TopicSink):
-    """``ros2`` or ``ros2:DOMAIN`` (else ROS_DOMAIN_ID, else 0); ROS_DISTRO says which release the readers have."""
+    """``ros2`` or ``ros2:DOMAIN`` (else ROS_DOMAIN_ID, else 0); ROS_DISTRO is the release of the readers."""
 
     def __init__(self, spec: str, commands: CommandTaker | None = None) -> None:
         super().__init__("ROS 2", commands)
@@ -94,9 +94,9 @@ class Ros2Sink(TopicSink):
         self._graph = self._new_writer(GRAPH, "ros_discovery_info", latched=True)
 
     def _qos(self, kind: str, *, latched: bool, reading: bool = False) -> Any:
-        """What a writer offers, or a reader asks for.
+        """Return the QoS that a writer offers, or a reader requests.
 
-        A reader asks for best effort: it hears both kinds of writers, and no set point that was lost comes later.
+        A reader requests best effort: it receives from both kinds of writers, and no lost set point comes later.
         """
         from cyclonedds.qos import Policy, Qos
         from cyclonedds.util import duration
@@ -120,7 +120,7 @@ class Ros2Sink(TopicSink):
         return Topic(self._participant, name, self._type(kind))
 
     def _type(self, kind: str) -> Any:
-        """The type of ``package/Type`` in this distribution."""
+        """Return the type of ``package/Type`` in this distribution."""
         of_humble = self._types.HUMBLE_TYPES.get(kind) if self._distribution == "humble" else None
         return of_humble or self._types.TYPES[kind]
 
@@ -136,7 +136,7 @@ class Ros2Sink(TopicSink):
         return self._writers[topic]
 
     def _show_node(self) -> None:
-        """Tell the graph which endpoints are this node's: all of them, so once for all that are new."""
+        """Publish this node's endpoints to the graph: all of them, so once for all that are new."""
         self._unshown = False
         humble = self._distribution == "humble"
         types = self._types
@@ -160,7 +160,7 @@ class Ros2Sink(TopicSink):
             self._show_node()
 
     def _write(self, writer: Any, message: Any, values: int) -> None:
-        """A reader that takes nothing costs at most BLOCKING_MS, and the values of this message."""
+        """Write a message; a reader that takes nothing costs at most BLOCKING_MS, and the values of this message."""
         from cyclonedds.core import DDSException
 
         try:

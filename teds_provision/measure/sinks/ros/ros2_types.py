@@ -77,7 +77,7 @@ class JointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
     effort: sequence[float64] = field(default_factory=list)
 
     def serialize(self, buffer: Any = None, endianness: Any = None, use_version_2: bool | None = None) -> bytes:
-        """The octets that Cyclone DDS makes of it, number by number and name by name: those of XCDR1 at once.
+        """Return the octets that Cyclone DDS makes of it number by number and name by name: XCDR1, all at once.
 
         A group's row has hundreds of names, the same in every row; one by one they took most of a millisecond.
         """
@@ -100,7 +100,7 @@ _STAMP: Final = struct.Struct("<4siI")
 
 @lru_cache(maxsize=64)
 def _names_in_cdr(frame: str, names: tuple[str, ...]) -> bytes:
-    """What stands between stamp and positions, each text at a multiple of four; the stamp has eight octets."""
+    """Return the octets between stamp and positions, each text at a multiple of four; the stamp has eight octets."""
     return _text_in_cdr(frame) + struct.pack("<I", len(names)) + b"".join(map(_text_in_cdr, names))
 
 
@@ -110,7 +110,7 @@ def _text_in_cdr(text: str) -> bytes:
 
 
 def _numbers_in_cdr(numbers: Sequence[float], at: int) -> bytes:
-    """A sequence of float64 that begins ``at`` so many octets of the message, a multiple of four."""
+    """Return a sequence of float64 that begins ``at`` so many octets of the message, a multiple of four."""
     count = struct.pack("<I", len(numbers))
     return count + bytes(-(at + 4) % 8) + packed("d", numbers).tobytes() if len(numbers) else count
 

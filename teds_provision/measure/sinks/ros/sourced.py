@@ -1,9 +1,9 @@
 """ROS 2 by rclpy: the one that the user sourced, or the one that is installed from PyPI beside this tool.
 
-``source /opt/ros/jazzy/setup.bash`` sets AMENT_PREFIX_PATH. Then a Python that can import rclpy carries the topics in
-a child process, and RMW_IMPLEMENTATION, ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE are the user's. Without it the
-Python that TEDS_PROVISION_ROS_PYTHON names does so, or our own where rclpy is installed in it; that one stays on this
-machine unless the user's environment says otherwise. Where there is no rclpy, Cyclone DDS does it (:mod:`ros2`).
+``source /opt/ros/jazzy/setup.bash`` sets AMENT_PREFIX_PATH. Then a Python that can import rclpy carries the topics in a
+child process, and RMW_IMPLEMENTATION, ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE are the user's. Without it the
+Python that TEDS_PROVISION_ROS_PYTHON names does so, or our own if rclpy is installed in it; that one stays on this
+machine unless the user's environment differs. Without rclpy, Cyclone DDS does it (:mod:`ros2`).
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _REACH: Final = frozenset(
     {"ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY", "ROS_DISCOVERY_SERVER"}
     | {"FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE", "CYCLONEDDS_URI", "ZENOH_SESSION_CONFIG_URI"}
 )
-"""Whoever sets one of these has said who may hear."""
+"""Variables by which a user limits the reach; if one is set, it is left alone."""
 
 
 def ros2_sink(spec: str, commands: CommandTaker | None = None) -> Sink:
-    """The sink of ``ros2`` or ``ros2:DOMAIN``: by an rclpy, else by Cyclone DDS. Raises UsageError."""
+    """Return the sink of ``ros2`` or ``ros2:DOMAIN``: by an rclpy, else by Cyclone DDS. Raises UsageError."""
     domain = domain_of(spec)
     sourced = os.environ.get("AMENT_PREFIX_PATH", "")
     if sourced and (python := _python(sourced, os.environ.get("PYTHONPATH", ""))) is not None:
@@ -47,7 +47,7 @@ def ros2_sink(spec: str, commands: CommandTaker | None = None) -> Sink:
 
 @functools.cache
 def _python(_sourced: str, _paths: str) -> str | None:
-    """The Python that imports rclpy in this environment, None where none does; found out once in a process."""
+    """Return the Python that imports rclpy in this environment, None if none does; found out once in a process."""
     around = child.environment(sourced=True)
     conda = os.environ.get("CONDA_PREFIX", "")
     found = [f"{conda}/bin/python3" if conda else "", SYSTEM, shutil.which("python3") or ""]
@@ -73,7 +73,8 @@ def _require_rclpy(python: str) -> None:
 class RclpySink(ChildSink):
     """Carries the topics by rclpy under ``python``; ``domain`` as ROS_DOMAIN_ID has it.
 
-    ``own``: it belongs to no ROS that the user sourced, so nothing leaves this machine unless his environment says so.
+    ``own``: it belongs to no ROS that the user sourced, so nothing leaves this machine unless the environment allows
+    it.
     """
 
     def __init__(self, python: str, domain: int, commands: CommandTaker | None = None, *, own: bool = False) -> None:
