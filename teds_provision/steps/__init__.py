@@ -1,4 +1,4 @@
-"""Each step of provisioning in a module of its own, and what the commands make of the steps."""
+"""The steps of provisioning, one module each, and the commands composed of them."""
 
 from typing import TYPE_CHECKING
 

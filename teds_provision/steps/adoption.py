@@ -1,7 +1,7 @@
-"""The datasheet that a board brought itself: shown with its findings, and signed by a person's word.
+"""The datasheet that a board brought itself: shown with its findings, and signed after an operator's confirmation.
 
-It came from nobody whom this station trusts, so it is judged as a profile's is, and harder: the guard, every finding of
-severity error, names and texts that people and topics will see. What the board says decides nothing: the yes does.
+Its author is not trusted, so it is judged as a profile is, and more strictly: the guard, every finding of severity
+error, names and texts that people and topics will see. The board's own claims decide nothing: the confirmation does.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ else:  # numpy: not for a datasheet without calibration
 
 _NAME: Final = (0, int(AccessCode.NAME))
 _PREFIX: Final = 4
-"""Digits from which on a word stands for a UUID."""
+"""Number of digits from which a text means a UUID."""
 
 
 @dataclass(frozen=True)
 class FactoryDatasheet:
-    """What a board says it is: ``image`` is what would be signed, ``name`` the node's, "" where it has none.
+    """A board's own datasheet: ``image`` is what would be signed, ``name`` the node's, "" if it has none.
 
-    ``errors`` ask for a reason, ``warnings`` are to be known; a sentence each.
+    ``errors`` need a reason, ``warnings`` are for information; a sentence each.
     """
 
     image: Image
@@ -57,11 +57,11 @@ class FactoryDatasheet:
 
 
 Adopt = Callable[[FactoryDatasheet], None]
-"""Asked before a board's own datasheet is signed; raises where the answer is no."""
+"""Asks before a board's own datasheet is signed; raises if the answer is no."""
 
 
 class NotAdoptedError(PolicyError):
-    """A board's own datasheet was not signed; ``brought`` is what it says, and what was found."""
+    """A board's own datasheet was not signed; ``brought`` is that datasheet with its findings."""
 
     code = "not-adopted"
 
@@ -71,7 +71,7 @@ class NotAdoptedError(PolicyError):
 
 
 def refuse_adoption(brought: FactoryDatasheet) -> None:
-    """The answer where nobody can be asked: no. Raises NotAdoptedError."""
+    """Refuse, as without a terminal there is no confirmation. Raises NotAdoptedError."""
     raise NotAdoptedError(
         f"Node {brought.image.uuid.hex()} brought its own datasheet, and nobody has approved signing it.",
         brought,
@@ -80,7 +80,7 @@ def refuse_adoption(brought: FactoryDatasheet) -> None:
 
 
 def read_factory_datasheet(station: Station, image: Image, *, name: str | None = None) -> FactoryDatasheet:
-    """What the TEDS on a board say, judged; ``name`` goes before the one that it gives itself.
+    """Return the judged datasheet of a board's TEDS; ``name`` replaces its own name.
 
     Raises BadDataError (no datasheet, damaged or hostile TEDS, another node's), PolicyError (another node's name).
     """
@@ -128,7 +128,7 @@ def _wrong_with(sheet: Sheet, blocks: Mapping[BlockId, bytes]) -> tuple[list[str
 
 
 def require_a_reason(station: Station, brought: FactoryDatasheet, reason: str | None) -> None:
-    """Raise NotAdoptedError where something is wrong with it and nobody said why it is right; that reason is logged."""
+    """Raise NotAdoptedError if it has errors and no reason was given to accept them; that reason is logged."""
     if not brought.errors:
         return
     if reason is None:

@@ -35,12 +35,12 @@ from teds_provision.teds.image import SECURITY
 _BEGINNINGS = 5
 
 TakeOver = Callable[[str], object]
-"""Asked before another station of the owner is locked out of a node; raises where the answer is no."""
+"""Asks before another station of the owner is locked out of a node; raises if the answer is no."""
 
 
 @dataclass(frozen=True)
 class AgreeResult:
-    """The key that a session is open under now; ``fresh`` says whether this run agreed on it."""
+    """The key of the open session; ``fresh``: this run agreed on it."""
 
     epoch: int
     key_id: str
@@ -48,12 +48,12 @@ class AgreeResult:
 
 
 def open_session(station: Station, node: Conversation, *, word: bool = False) -> NodeKey | None:
-    """Open a session under the first key that the node knows, newest pending first; None where it knows none.
+    """Open a session under the first key that the node knows, newest pending first; None if it knows none.
 
-    The key that worked becomes the active one and the others go, but for a newer one whose Confirm may still be on its
-    way (:meth:`NodeKeys.outdated`): that is the only thing that ever deletes a key.
-    ``word``: a person said that this node may be used although its key came back from a backup. Raises PolicyError
-    for a node that was moved away, or that is neither tapped nor vouched for then; LinkError.
+    The key that worked becomes the active one and the others are deleted, but for a newer one whose Confirm may still
+    be on its way (:meth:`NodeKeys.outdated`): nothing else ever deletes a key. ``word``: an operator confirmed that
+    this node may be used although its key came back from a backup. Raises PolicyError for a node that was moved away,
+    or whose key came from a backup and that is neither tapped nor confirmed; LinkError.
     """
     station.policy.require_not_given_away(node.uuid)
     if not (node.tapped or word):
@@ -96,7 +96,7 @@ def _take_up(station: Station, node: Conversation, held: NodeKey) -> NodeKey:
 
 
 def _is_taken_up(station: Station, record: KeyRecord) -> bool:
-    """Whether the key is the active one already, no other of its time is left, and its epoch is known."""
+    """True if the key is the active one already, no other of its time is left, and its epoch is known."""
     if record.state == "pending" or station.pins.is_unsettled(record.uuid) or station.keys.outdated(record):
         return False
     known = station.nodes.get(record.uuid)
@@ -119,7 +119,7 @@ def _activate(station: Station, record: KeyRecord) -> None:
 
 
 def session_if_keyed(station: Station, node: Conversation) -> NodeKey | None:
-    """Open a session as :func:`open_session` does; where a handover demands a new key, go on under that new key.
+    """Open a session as :func:`open_session` does; if a handover requires a new key, continue under that new key.
 
     None for a node whose keys this station does not hold, or gave away.
     """
@@ -138,7 +138,7 @@ def session_if_keyed(station: Station, node: Conversation) -> NodeKey | None:
 
 
 def require_session(station: Station, node: Conversation) -> NodeKey:
-    """Open a session or say why there is none: given away, no key held (PolicyError), or the node has another."""
+    """Open a session or raise why there is none: given away, no key held (PolicyError), or the node has another."""
     station.policy.require_not_given_away(node.uuid)
     held = session_if_keyed(station, node)
     if held is not None:
@@ -152,7 +152,7 @@ def require_session(station: Station, node: Conversation) -> NodeKey:
 
 
 def unknown_key(station: Station, node: Conversation) -> PolicyError:
-    """The error where every key held here was answered with "unknown key" (16), which anyone on the link can say.
+    """Return the error if every key held here was answered with "unknown key" (16), which any device can send.
 
     The operator decides what that means, never the tool (profile, section 2).
     """
@@ -171,10 +171,10 @@ def unknown_key(station: Station, node: Conversation) -> PolicyError:
 
 
 def agreed_elsewhere(station: Station, node: Conversation) -> str:
-    """What a node outside a session hints of a key that another station agreed on, in words; empty for no such hint.
+    """Return a node's hint, outside a session, of a key that another station agreed on, in words; empty for none.
 
-    The epoch is that of a plain Identify. Who agreed is seen only from a datasheet that this station's trust vouches
-    for, and the new owner may not have signed one yet.
+    The epoch is that of a plain Identify. The other station is known only from a datasheet that this station trusts,
+    and the new owner may not have signed one yet.
     """
     held = max((record.epoch for record in station.keys.keys_of(node.uuid)), default=0)
     said = node.identity.epoch
@@ -208,13 +208,12 @@ def agree(
 ) -> AgreeResult:
     """End with a session open under an agreed key: the present one, or a new one.
 
-    ``rotate`` demands a new one, by a person's word: inside a session where a key is known, else by tap.
-    ``take_over`` is asked, with a question, before a node that has a key gets one without a session under a key of
-    ours: whoever holds the present one is locked out (Figure 5 of the paper). None: ``rotate`` itself is that word.
-    ``newcomer`` is the whitelist entry that is made together with the first key: a board of another owner refuses, and
-    never comes onto the list. On a link that loses messages an agreement begins anew, five times at most.
-    Raises NotWhitelistedError, KeyMismatchError, PolicyError, NodeRefusedError, NotAuthenticError, LinkError; whatever
-    is cut, the same call carries on.
+    ``rotate`` requests a new one: inside a session if a key is known, else by tap. ``take_over`` is asked, with a
+    question, before a node that has a key gets one without a session under a key of ours: the holder of the present one
+    is locked out (Figure 5 of the paper). None: ``rotate`` itself is the confirmation. ``newcomer`` is the whitelist
+    entry that is made together with the first key: a board of another owner refuses, and is never whitelisted. On a
+    link that loses messages an agreement is repeated, five times at most. Raises NotWhitelistedError, KeyMismatchError,
+    PolicyError, NodeRefusedError, NotAuthenticError, LinkError; after any interruption, the same call carries on.
     """
     again, word = 0, _TakeoverConsent(rotate, take_over)
     while True:
@@ -267,7 +266,7 @@ class _TakeoverConsent:
     given: bool = False
 
     def require(self, station: Station, node: Conversation) -> None:
-        """Raise PolicyError, or what the question raises, where nobody gives it."""
+        """Raise PolicyError, or the question's error, if it is not confirmed."""
         if self.given:
             return
         if station.keys.held(node.uuid) and not self.rotate:
@@ -284,7 +283,7 @@ class _TakeoverConsent:
 
 
 def must_take_over(uuid: bytes) -> PolicyError:
-    """The error where a node has another station's key, and nobody said that it is to be taken over."""
+    """Return the error if a node has another station's key, and a take-over was not confirmed."""
     return PolicyError(
         f"Node {uuid.hex()} has a key that this station does not hold; a new key would lock out the current holder.",
         hint=f"Have the key handed over (export-keys there), or take the node over: agree {uuid.hex()} --rotate --yes",
@@ -294,7 +293,7 @@ def must_take_over(uuid: bytes) -> PolicyError:
 def _new_key(
     station: Station, node: Conversation, who: IdentifiedNode, entry: WhitelistEntry, *, returning: bool, demanded: bool
 ) -> AgreeResult:
-    """Agree on a key; where none is ``demanded``, one that a new node has stored after all is as good."""
+    """Agree on a key; if none is ``demanded``, one that a new node has stored after all is as good."""
     new = who.state == NodeState.FACTORY
     if new:
         station.plant.require_undisputed(node.uuid)
@@ -330,7 +329,7 @@ def _enlist(station: Station, entry: WhitelistEntry) -> None:
 
 
 def _may_return(station: Station, who: IdentifiedNode) -> bool:
-    """Whether a node whose move was closed by its receipt may be keyed here again, should it prove to be reset."""
+    """True if a node whose move was closed by its receipt may be keyed here again, if it proves to be reset."""
     if who.state != NodeState.FACTORY:
         return False
     uuid = who.uuid
@@ -340,7 +339,10 @@ def _may_return(station: Station, who: IdentifiedNode) -> bool:
 
 
 def _pin_for(entry: WhitelistEntry, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
-    """The entry with its fingerprint, pinned now where this contact may pin: tapped, or the bus of a new CAN node."""
+    """Return the entry with its fingerprint, pinned now if this contact may pin.
+
+    A contact pins by a tap, or over the bus of a new CAN node.
+    """
     if entry.fingerprint is not None:
         return entry
     if node.tapped:
@@ -363,11 +365,11 @@ def _agree_anew(
     returning: bool = False,
     only_new: bool = False,
 ) -> AgreeResult:
-    """Request, Confirm, Open; ``ca`` is the one that the node keeps, or shall keep from now on.
+    """Request, Confirm, Open; ``ca`` is the one that the node keeps, or will keep from now on.
 
-    ``teds`` is the node's Security TEDS as it was read on this link, in the session where there is one.
-    ``returning`` nodes were given away: only a signed-for initial Security TEDS shows that they were reset since.
-    ``only_new``: nobody said that a node may be taken over. Identify, which called it new, is a hint.
+    ``teds`` is the node's Security TEDS as it was read on this link, in the session if there is one. ``returning``
+    nodes were given away: only an initial Security TEDS that is covered by the signature proves that they were reset
+    since. ``only_new``: a take-over was not confirmed. Identify, which called it new, is a hint.
     """
     uuid = node.uuid
     try:
@@ -433,7 +435,7 @@ def _agree_anew(
 
 
 def _request(station: Station, node: Conversation, entry: WhitelistEntry, ca: bytes, teds: bytes) -> AgreedKey:
-    """One Request with a one-time key of its own, and its reply checked; nothing is kept on either side yet."""
+    """Send one Request with a one-time key, and check its reply; neither side keeps anything yet."""
     fit_to_agree(teds, node.uuid, entry.fingerprint)
     agreement = StationAgreement(station.identity.credentials(ca), node.uuid)
     reply = node.request_retry_once(
@@ -449,7 +451,7 @@ def _request(station: Station, node: Conversation, entry: WhitelistEntry, ca: by
 
 @dataclass(frozen=True)
 class ResetReceipt:
-    """SIG(node, "TEDS1 reset" ‖ 00 ‖ UUID ‖ epoch ‖ challenge): the node says that it is in factory state."""
+    """SIG(node, "TEDS1 reset" ‖ 00 ‖ UUID ‖ epoch ‖ challenge): the node's proof that it is in factory state."""
 
     epoch: int
     challenge: bytes
@@ -460,7 +462,7 @@ def reset_node(station: Station, node: Conversation, who: IdentifiedNode) -> Res
     """Reset in a session; a node that is in factory state already gives the same proof plainly.
 
     The keys held for it are deleted only after the proof was verified. Raises PolicyError without a key,
-    NotAuthenticError where the proof is wrong.
+    NotAuthenticError if the proof is wrong.
     """
     if who.state != NodeState.FACTORY:
         require_session(station, node)
@@ -478,7 +480,7 @@ def reset_node(station: Station, node: Conversation, who: IdentifiedNode) -> Res
 def proof_of_reset(node: Conversation, point: bytes) -> ResetReceipt:
     """Send Reset: in a session it resets, in factory state it changes nothing; either way the node signs its state.
 
-    A node that has a key refuses it plainly (NodeRefusedError). Raises NotAuthenticError where the signature is wrong.
+    A node that has a key refuses it plainly (NodeRefusedError). Raises NotAuthenticError if the signature is wrong.
     """
     epoch = read_identity(node).epoch
     challenge = os.urandom(CHALLENGE_OCTETS)

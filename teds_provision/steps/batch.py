@@ -78,10 +78,10 @@ _SHOWN: Final = 5
 
 @dataclass(frozen=True)
 class ProvisionRequest:
-    """What ``provision`` is asked for: one node (None: the one that is there), or many.
+    """A request to ``provision``: one node (None: the one that is there), or many.
 
     ``watch``: tap after tap. ``everyone``: every node of the bus that is not finished. ``sheet``: what each board gets.
-    ``operator``: who worked, as the report shall say; "" for the user of this account.
+    ``operator``: who worked, for the report; "" for the user of this account.
     """
 
     node: str | None = None
@@ -94,7 +94,7 @@ class ProvisionRequest:
 
     @property
     def several(self) -> bool:
-        """Whether more than one node may be meant."""
+        """True if more than one node may be meant."""
         return self.watch or self.everyone or self.sheet is not None
 
 
@@ -104,11 +104,11 @@ _AFTER: Final = ("build", "sign", "write", "verify", "check")
 
 @dataclass(frozen=True)
 class Questions:
-    """Who is asked: before an unknown node is whitelisted, and before what nobody named is written (None: nobody).
+    """The questions: before an unknown node is whitelisted, and before unnamed changes are written (None: refuse).
 
     ``low``: before a node with a low battery is written. ``take_over``: before a node with another station's key gets
-    one of ours (None: nobody). ``retype``: before a board becomes one of another type. ``adopt``: before a
-    datasheet that it brought is signed.
+    one of ours (None: refuse). ``retype``: before a board becomes one of another type. ``adopt``: before a datasheet
+    that it brought is signed.
     """
 
     accept: Accept
@@ -121,7 +121,7 @@ class Questions:
 
 @dataclass(frozen=True)
 class ProvisionPlan:
-    """What ``provision`` would do (``--dry-run``): its steps, and the changes in physical units, a sentence each."""
+    """Preview of ``provision`` (``--dry-run``): its steps, and the changes in physical units, a sentence each."""
 
     uuid: bytes
     state: NodeState
@@ -168,7 +168,7 @@ class BatchRun:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a person should know of the order, or of the rows of the sheet, before the first board comes."""
+        """Warnings about the order, or the rows of the sheet, before the first board comes."""
         rows = (*self.progress.sheet.warnings, *self.progress.again) if self.progress is not None else ()
         return (*self.prepared.warnings, *rows)
 
@@ -185,7 +185,7 @@ class BatchRun:
             return self._provision(node, questions)
 
     def plan(self) -> ProvisionPlan:
-        """Look at the one node, plainly, and say what would be done; changes nothing anywhere."""
+        """Look at the one node, plainly, and return the preview; changes nothing anywhere."""
         with meet(self._station, self._links, self.node, self._reporter) as node:
             return self._plan_for(node)
 
@@ -229,7 +229,7 @@ class BatchRun:
 
     @property
     def worst(self) -> TedsProvisionError | None:
-        """What a person should hear of first, of the boards of this run."""
+        """The most important error of the boards of this run."""
         found: TedsProvisionError | None = None
         for board in self._boards:
             found = worse(found, board.failure)
@@ -237,7 +237,7 @@ class BatchRun:
 
     @property
     def of_a_job(self) -> bool:
-        """Whether a job counts the boards, and no sheet."""
+        """True if a job counts the boards, and no sheet."""
         return self.line is not None and self.line.total > 0
 
     @property
@@ -246,16 +246,16 @@ class BatchRun:
         return self.progress.next_row if self.progress is not None else None
 
     def board_of(self, row: SheetRow) -> str | None:
-        """UUID of the board that had this row before, None where none had."""
+        """Return the UUID of the board that had this row before, None if none had."""
         return self.progress.board_of(row) if self.progress is not None else None
 
     def row(self, number: int) -> SheetRow:
-        """The row of the sheet with that number, from 1."""
+        """Return the row of the sheet with that number, from 1."""
         assert self.progress is not None
         return self.progress.sheet.rows[number - 1]
 
     def plans(self) -> Iterator[ProvisionPlan | BoardResult]:
-        """The plan of every node of the bus that is meant, one after the other; a board that was refused says why."""
+        """Yield the plan of every selected node of the bus, one after the other; or the reason for a refused board."""
         port = open_port(self._links)
         try:
             for contact in self._on_the_bus(port)[1]:
@@ -292,7 +292,7 @@ class BatchRun:
         return ReportHead(station.name, station.fingerprint, operator, f"teds-provision {__version__}")
 
     def totals(self) -> BatchTotals:
-        """What it came to: the whole sheet over all runs, or the nodes of this run."""
+        """Return the totals: the whole sheet over all runs, or the nodes of this run."""
         if self.progress is not None:
             if self.stop.ran_out:
                 self.progress.ran_out(f"was tapped within {self._links.timeout:.0f} s")
@@ -382,7 +382,7 @@ class BatchRun:
         )
 
     def _is_meant(self, contact: Contact) -> bool:
-        """On the whitelist or in the sheet, and not finished yet; said for those that are neither."""
+        """True if it is on the whitelist or in the sheet, and not finished yet; reports those that are neither."""
         uuid = contact.identity.uuid
         listed = self._station.pins.entry(uuid) is not None
         if self.progress is not None and any(row.uuid in (uuid, None) for row in self.progress.open):
@@ -469,11 +469,11 @@ class BatchRun:
         )
 
     def _for(self, who: IdentifiedNode) -> PreparedOrder:
-        """What this board gets.
+        """Return what this board gets.
 
         Raises PolicyError (the sheet does not know it, its name is another's), KeyMismatchError.
 
-        Whoever is refused here has not taken a row.
+        A board that is refused here has not taken a row.
         """
         if self.line is not None:
             return self.line.order(who)
@@ -510,7 +510,7 @@ class BatchRun:
 
 
 def _progress(station: Station, request: ProvisionRequest, order: BuildOrder) -> Progress | None:
-    """The sheet that was named, with what became of it in earlier runs; None without one."""
+    """Return the sheet with the results of earlier runs; None without one."""
     if request.sheet is None:
         return None
     sheet = read_sheet(station, request.sheet, order)
@@ -522,7 +522,7 @@ def _progress(station: Station, request: ProvisionRequest, order: BuildOrder) ->
 
 
 def _has_it_already(station: Station, row: SheetRow, uuid: bytes) -> bool:
-    """True if the datasheet that this station knows of a board is what its row of the sheet gives."""
+    """True if the board's last known datasheet is what its row of the sheet gives."""
     image = station.nodes.datasheet(uuid)
     if image is None:
         return False

@@ -47,7 +47,7 @@ Result = Literal["passed", "failed", "skipped"]
 
 
 class DeclinedError(PolicyError):
-    """A person said no: nothing was changed."""
+    """The operator declined: nothing was changed."""
 
     code = "declined"
 
@@ -77,7 +77,7 @@ class BoardResult:
 
     @property
     def result(self) -> Result:
-        """``passed``: provisioned and authentic; ``skipped``: somebody said no."""
+        """``passed``: provisioned and authentic; ``skipped``: the operator declined."""
         if isinstance(self.error, DeclinedError):
             return "skipped"
         return "failed" if self.failure is not None else "passed"
@@ -85,7 +85,7 @@ class BoardResult:
 
 @dataclass(frozen=True)
 class BatchTotals:
-    """What a batch came to: boards by result, seconds, and the share that passed at their first try (None: no try).
+    """Totals of a batch: boards by result, seconds, and the share that passed at their first try (None: no try).
 
     ``steps`` are the mean seconds of each step over the boards that passed.
     """
@@ -100,7 +100,7 @@ class BatchTotals:
 
     @property
     def error(self) -> TedsProvisionError | None:
-        """What the command ends with: nothing if all passed, else the worst that happened."""
+        """What the command ends with: None if all passed, else the worst error."""
         if not self.failed and not self.skipped:
             return None
         told = f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped."
@@ -154,19 +154,19 @@ class SheetRow:
 
     @property
     def by_order(self) -> bool:
-        """Whether the next board that nobody else is meant by takes this row."""
+        """True if the row names no board and goes to the next one tapped."""
         return self.uuid is None and self.fingerprint is None
 
     @property
     def lacks_calibration(self) -> bool:
-        """Whether the type asks for a calibration and the row brings none; its board may have one from before."""
+        """True if the type requires a calibration and the row has none; its board may have one from before."""
         profile = self.prepared.profile
         if profile is None or self.prepared.calibrations is not None:
             return False
         return any(channel.calibration.required for channel in profile.channels)
 
     def means(self, uuid: bytes, fingerprint: str) -> bool:
-        """Whether this row names that board; a UUID with another key is for the pin to refuse."""
+        """True if this row names that board; a UUID with another key is for the pin to refuse."""
         if self.uuid is not None:
             return self.uuid == uuid
         return self.fingerprint is not None and fingerprint.startswith(self.fingerprint)
@@ -181,7 +181,7 @@ class BatchSheet:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a person should know before the first board, once for all rows of which it is true."""
+        """Warnings before the first board, one for all rows that share it."""
         found: dict[str, list[int]] = {}
         for row in self.rows:
             for warning in row.prepared.warnings:
@@ -284,7 +284,10 @@ class _SheetReader:
             self.rows.append(SheetRow(number, line, bytes.fromhex(uuid) if uuid else None, pin, prepared, digest))
 
     def _take_label(self, line: int, values: dict[str, str]) -> None:
-        """A label that was scanned into the cell of UUID or fingerprint says both; another cell may not contradict."""
+        """Fill in UUID and fingerprint from a label that was scanned into either cell.
+
+        The other must not contradict.
+        """
         for name in ("uuid", "fingerprint"):
             label = read_label(values.get(name, ""))
             if label is None:
@@ -345,11 +348,11 @@ _MAX_OCTETS: Final = 64 << 20
 
 @dataclass
 class RowOutcome:
-    """What became of one row: the board that took it, its last result, and whether the first try passed.
+    """Outcome of one row: the board that took it, its last result, and whether the first try passed.
 
-    ``digest`` is of the row's cells: other cells are another board, and begin from nothing. ``content`` has the digests
-    of what the cells name (:attr:`SheetRow.content`), None in a file of an older version; ``again`` is why the row is
-    done once more, "" if it is not.
+    ``digest`` is of the row's cells: other cells are another board, and start afresh. ``content`` has the digests of
+    what the cells name (:attr:`SheetRow.content`), None in a file of an older version; ``again`` is why the row is done
+    once more, "" if it is not.
     """
 
     digest: str
@@ -444,7 +447,7 @@ class Progress:
         return any(row.uuid == uuid.hex() and row.result == "passed" for row in self.rows.values())
 
     def save(self, *changed: SheetRow) -> None:
-        """Put these rows (all, where none is named) onto the disk, beside what another run of this sheet put there.
+        """Write these rows (all, if none is named) to the disk, merged with those of another run of this sheet.
 
         Raises StoreError.
         """
@@ -454,7 +457,7 @@ class Progress:
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """What is written is made from what lies there: two runs of one sheet (two desks) lose each other no board."""
+        """Lock the sheet, so that a change starts from the file's present content and two runs lose no board."""
         private_folder(self._path.parent)
         place = self._path.with_suffix(".lock")
         descriptor = open_lock(place)
@@ -485,7 +488,7 @@ class Progress:
 
     @property
     def untried(self) -> list[SheetRow]:
-        """The open rows that nobody tried in this run."""
+        """The open rows without a try in this run."""
         return [row for row in self.open if row.number not in self._tried]
 
     @property
@@ -495,9 +498,9 @@ class Progress:
         return rows[0] if rows else None
 
     def row_for(self, uuid: bytes, fingerprint: str, *, busy: Collection[int] = ()) -> SheetRow | None:
-        """The row of a board: that which names it or had it before, else the next in the order of the taps.
+        """Return the row of a board: that which names it or had it before, else the next in the order of the taps.
 
-        One that had no board goes before one whose board did not pass: that is for a spare, once nothing else is left.
+        A row without a board goes before one whose board did not pass: that is for a spare, once nothing else is left.
         ``busy`` are the numbers of the rows on which another reader is at work.
         """
         for row in self.sheet.rows:
@@ -509,13 +512,13 @@ class Progress:
         )
 
     def board_of(self, row: SheetRow) -> str | None:
-        """The board that has the row, or was turned away from it in this run; None where there was none."""
+        """Return the board that has the row, or was refused for it in this run; None if there was none."""
         return self.rows[row.number].uuid or self._turned_away.get(row.number)
 
     def assign_row(self, row: SheetRow, uuid: bytes) -> None:
-        """Note that this board is the row's, before anything is done with it.
+        """Record that this board has the row, before anything is done with it.
 
-        Raises NodeBusyError where another run of this sheet has given the row to another board meanwhile.
+        Raises NodeBusyError if another run of this sheet has given the row to another board meanwhile.
         """
         before = self.rows[row.number].uuid
         if before == uuid.hex():
@@ -532,7 +535,7 @@ class Progress:
             self._write()
 
     def turn_away(self, row: SheetRow, uuid: bytes) -> None:
-        """Note that this board was not given what the row says; the row stays free, and is tried again with it."""
+        """Record that this board did not get the row; the row stays free, and is tried again with it."""
         self._turned_away[row.number] = uuid.hex()
 
     def not_this_board(self, row: SheetRow, board: BoardResult) -> None:
@@ -568,7 +571,7 @@ class Progress:
             self.worst = worse(self.worst, NoNodeError(f"No board {how} for row {missed}."))
 
     def totals(self) -> BatchTotals:
-        """What the whole sheet came to, over all runs; a row that was not reached is ``skipped``."""
+        """Return the totals of the whole sheet, over all runs; a row that was not reached is ``skipped``."""
         rows = list(self.rows.values())
         results = Counter(row.result for row in rows)
         passed, failed = results["passed"], results["failed"]
@@ -672,7 +675,7 @@ def _csv(rows: Sequence[Sequence[str]], totals: BatchTotals) -> str:
 
 
 def _tame(cell: str) -> str:
-    """A cell that no spreadsheet takes for a formula: names and messages come from outside."""
+    """Return a cell that no spreadsheet takes for a formula: names and messages come from outside."""
     return f"'{cell}" if cell[:1] in ("=", "+", "-", "@") else cell
 
 
@@ -707,7 +710,7 @@ def _sums(totals: BatchTotals) -> list[tuple[str, str]]:
 
 
 def _for_people(row: Sequence[str]) -> list[str]:
-    """The cells of a row with the time of day here; nothing where the board was not reached."""
+    """Return the cells of a row with the local time of day; empty if the board was not reached."""
     cells = dict(zip(_HEAD, row, strict=True))
     tried = bool(cells["time"])
     cells["first_pass"] = ("yes" if cells["first_pass"] == "true" else "no") if tried else ""

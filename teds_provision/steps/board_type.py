@@ -1,9 +1,9 @@
-"""Is this the board that the profile is of: what it says of its own type, and whether its hardware bears the datasheet.
+"""Does the board match the profile: its own claims about its type, and its hardware's acceptance of the datasheet.
 
-Before anything is written, every channel of the wanted datasheet is held against what the board says of it, signed or
-not: kind, form of a value, dimension of the unit. What nobody signed may refuse here, it permits nothing. At the end
-the firmware itself is asked, which no TEDS commands (operation.md section 1): Operate with lease 0 gets 19 where the
-channel bears its datasheet, 6 where it does not, and claims nothing.
+Before anything is written, every channel of the wanted datasheet is compared with what the board claims about it,
+signed or not: kind, form of a value, dimension of the unit. An unsigned claim may refuse here, it permits nothing. At
+the end the firmware itself is asked, which no TEDS commands (operation.md section 1): Operate with lease 0 gets 19 if
+the channel accepts its datasheet, 6 if it does not, and claims nothing.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _ROOM: Final = 180  # octets of data sets in one reply, so that it fits any node
 
 
 class WrongBoardError(PolicyError):
-    """The board is of another type than what it would be given; ``differences`` says in what, a sentence each."""
+    """The board is of another type than what it would be given; ``differences`` has a sentence for each."""
 
     code = "wrong-board"
 
@@ -55,11 +55,11 @@ class WrongBoardError(PolicyError):
 
 
 Retype = Callable[[bytes, tuple[str, ...]], None]
-"""Asked before a board becomes one of another type: its UUID and the differences; raises where the answer is no."""
+"""Asks before a board becomes one of another type: its UUID and the differences; raises if the answer is no."""
 
 
 def require_board_type(uuid: bytes, differences: tuple[str, ...]) -> None:
-    """The answer where nobody can be asked: no. Raises WrongBoardError."""
+    """Refuse, as without a terminal there is no confirmation. Raises WrongBoardError."""
     more = f" (and {len(differences) - 1} more)" if len(differences) > 1 else ""
     raise WrongBoardError(
         f"Board {uuid.hex()} is of a different type: {differences[0].rstrip('.')}{more}. Nothing was written.",
@@ -69,7 +69,7 @@ def require_board_type(uuid: bytes, differences: tuple[str, ...]) -> None:
 
 
 class _ChannelStatement(NamedTuple):
-    """What is said of one channel; None: nothing."""
+    """Known claims about one channel; None: no claim."""
 
     kind: int | None
     form: tuple[int, int] | None
@@ -94,11 +94,11 @@ class _ChannelStatement(NamedTuple):
 def differences(
     has: Mapping[BlockId, bytes], wanted: Image | Profile, calibrated: Collection[int] = ()
 ) -> tuple[str, ...]:
-    """In what the type of a board differs from what it would be given, a sentence for each; empty where it does not.
+    """Return how the type of a board differs from what it would be given, a sentence for each; empty if it does not.
 
-    ``has`` are TEDS of the board. A board without a TransducerChannel TEDS says nothing; more channels than are wanted
-    are no difference. A unit of counts, a ratio, a digital one, V or A says nothing where a calibration is wanted;
-    ``calibrated`` are channels that get one, whatever the type says.
+    ``has`` are TEDS of the board. A board without a TransducerChannel TEDS makes no claim; more channels than are
+    wanted are no difference. A unit of counts, a ratio, a digital one, V or A is no claim if a calibration is wanted;
+    ``calibrated`` are channels that get one, whatever the type.
     """
     if not _describes(has):
         return ()
@@ -141,12 +141,12 @@ def _listed(numbers: Collection[int]) -> str:
 
 
 def _describes(has: Mapping[BlockId, bytes]) -> bool:
-    """Whether these TEDS describe any channel; a new board, of which most are asked, has none."""
+    """True if these TEDS describe any channel; a new board usually has none."""
     return any(code == AccessCode.CHANNEL for _, code in has)
 
 
 def further(has: Mapping[BlockId, bytes], wanted: Image) -> tuple[str, ...]:
-    """A warning for the channels that the board describes and nobody wants, if there are any."""
+    """Return a warning for the channels that the board describes and the datasheet omits, if there are any."""
     if not _describes(has):
         return ()
     channels = {channel.number for channel in Sheet.from_blocks(has).channels} - {
@@ -171,7 +171,7 @@ def _between(number: int, own: _ChannelStatement | None, wanted: _ChannelStateme
 
 
 def _says_nothing(units: Units) -> bool:
-    """Counts, digital, a ratio, V, A: what a raw value may be of anything."""
+    """True for counts, digital, a ratio, V, A: the raw unit of any quantity."""
     bare = replace(units, extension=0)
     return units.interpretation != PRODUCT or bare in (Units(), _VOLT, _AMPERE)
 
@@ -189,11 +189,11 @@ def _form(form: tuple[int, int]) -> str:
 
 
 def is_remembered(station: Station, uuid: bytes, wanted: str | None, *, factory: bool) -> bool:
-    """Whether this station knows the board as one of that profile, or as its own that was reset: that is no retype.
+    """True if this station knows the board as one of that profile, or as its own that was reset: that is no retype.
 
     ``wanted`` None: of the profile that it was given before.
 
-    What was merely built for it counts for nothing; what was written, or came in a bundle, does.
+    What was merely built for it does not count; what was written, or came in a bundle, does.
     """
     history = station.nodes.history(uuid)
     if factory and history:
@@ -207,7 +207,7 @@ def is_remembered(station: Station, uuid: bytes, wanted: str | None, *, factory:
 
 
 def shown_by(node: Conversation, channels: Collection[int]) -> dict[BlockId, bytes]:
-    """The TransducerChannel TEDS that a board shows for these channels; in a session, or plainly."""
+    """Return the TransducerChannel TEDS that a board shows for these channels; in a session, or plainly."""
     wanted = [block for block in list_blocks(node) if block[1] == AccessCode.CHANNEL and block[0] in channels]
     return {block: read_block(node, block) for block in wanted}
 
@@ -218,7 +218,7 @@ def shown_by(node: Conversation, channels: Collection[int]) -> dict[BlockId, byt
 def operate(node: Conversation, channel: int, digest: bytes, *, lease: int, dead_man: int | None = None) -> None:
     """Claim a channel (0: every sensor); ``digest`` is that of the Security TEDS, ``lease`` in s, ``dead_man`` in ms.
 
-    Raises NodeRefusedError; what 6 and 23 mean here is said in words of their own.
+    Raises NodeRefusedError with specific messages for 6 and 23.
     """
     named = f"channel {channel}" if channel else "any sensor"
     try:
@@ -249,7 +249,7 @@ _OF_OPERATE: Final = {
 
 @dataclass(frozen=True)
 class HardwareCheck:
-    """What the firmware said of each channel: True bears its datasheet, None does not measure; and one reading."""
+    """The firmware's answer for each channel: True accepts its datasheet, None does not measure; and one reading."""
 
     channels: dict[int, bool | None]
     samples: tuple[dict[str, Any], ...] = ()
@@ -257,17 +257,17 @@ class HardwareCheck:
 
     @property
     def asked(self) -> bool:
-        """Whether the node measures at all."""
+        """True if the node measures."""
         return any(self.channels.values())
 
 
 def check_hardware(node: Conversation, image: Image, shown: Mapping[int, str] | None = None) -> HardwareCheck:
-    """Ask a node, in its session, whether each channel bears the datasheet ``image``, and its sensors for one reading.
+    """Ask a node, in its session, for each channel's acceptance of ``image``, and its sensors for one reading.
 
-    ``shown`` are the units in which people see the values of channels, where the profile names one. Nothing stays
-    claimed. Sensors that another session claims are left alone. A session that the node lost meanwhile (who measures
-    it opened another one, its bus was cut) is opened anew, once. Raises WrongBoardError with the channel that does not
-    bear it, NodeRefusedError, LinkError.
+    ``shown`` are the display units of channels, if the profile names them. Nothing stays claimed. Sensors that another
+    session claims are left alone. A session that was lost meanwhile (a measuring station opened another one, its bus
+    was cut) is opened again, once. Raises WrongBoardError with the channel that refuses it, NodeRefusedError,
+    LinkError.
     """
     try:
         return _borne(node, image, shown)

@@ -56,7 +56,7 @@ _NOBODY: Final = bytes(10)
 
 @dataclass(frozen=True)
 class BuildOrder:
-    """What the user asks for: profile (None: the one that the node had), calibration file, name, and overrides.
+    """What the user ordered: profile (None: the one that the node had), calibration file, name, and overrides.
 
     ``name`` may hold ``{uuid}`` (20 hex digits) or ``{n}`` (the first free number from 1). ``accept_calibration`` is
     the reason given for a calibration that the guard would refuse.
@@ -72,20 +72,20 @@ class BuildOrder:
 
     @property
     def names_nothing(self) -> bool:
-        """Whether no value of the datasheet is named."""
+        """True if no value of the datasheet is named."""
         return self.profile is None and self.calibration is None and self.name is None and not self.drop_calibration
 
     @property
     def has_pattern(self) -> bool:
-        """Whether each node gets a name of its own."""
+        """True if each node gets a different name."""
         return self.name is not None and (_UUID in self.name or _COUNT in self.name)
 
 
 @dataclass(frozen=True)
 class PreparedOrder:
-    """An order that was read and found good: its profile, and the calibrations of its file, fitted; None where unnamed.
+    """A validated order: its profile, and the calibrations of its file, fitted; None if unnamed.
 
-    ``warnings`` are those of the guard, and what a person should know of the order.
+    ``warnings`` are those of the guard and about the order.
     """
 
     order: BuildOrder
@@ -93,7 +93,7 @@ class PreparedOrder:
     calibrations: Mapping[int, Calibration] | None = None
     warnings: tuple[str, ...] = ()
     passed: tuple[str, ...] = ()
-    """What a person should know of where the profile was found."""
+    """A notice about the place of the profile."""
 
 
 @dataclass(frozen=True)
@@ -108,11 +108,11 @@ class ComposedTeds:
     warnings: tuple[str, ...]
     digest: str = ""
     changed: bool = False
-    """Whether the profile that the node had says something else than when its datasheet was made."""
+    """True if the profile that the node had has changed since its datasheet was made."""
 
 
 def for_several(order: BuildOrder) -> BuildOrder:
-    """The order, if it can be meant for more than one node; raises UsageError where all would be made equal."""
+    """Return the order, if it can be meant for more than one node; raises UsageError if all would become equal."""
     if order.name is not None and not order.has_pattern:
         raise UsageError(
             f"Every node would get the name {order.name!r}.",
@@ -127,7 +127,7 @@ def for_several(order: BuildOrder) -> BuildOrder:
 
 
 def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> PreparedOrder:
-    """Read, fit and guard what an order names; ``uuid`` is the node that is meant, None where any may come.
+    """Read, fit and guard what an order names; ``uuid`` is the node that is meant, None if any may come.
 
     Changes nothing. Raises UsageError (no profile known), NotFoundError, BadDataError, PolicyError (the guard).
     """
@@ -157,9 +157,9 @@ def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> P
 
 
 def named_for(station: Station, uuid: bytes, prepared: PreparedOrder, *, keep: bool = False) -> PreparedOrder:
-    """The order with the name that this node gets; raises PolicyError where another node has it.
+    """Return the order with the name that this node gets; raises PolicyError if another node has it.
 
-    ``keep``: a numbered name is kept for this node at once, as others may ask for theirs at the same time.
+    ``keep``: a numbered name is kept for this node at once, as others may need theirs at the same time.
     """
     if prepared.order.name is None or _COUNT not in prepared.order.name or not keep:
         return _named_for(station, uuid, prepared)
@@ -182,7 +182,7 @@ def _named_for(station: Station, uuid: bytes, prepared: PreparedOrder) -> Prepar
 
 
 def require_free_name(station: Station, uuid: bytes, name: str) -> None:
-    """Raise PolicyError where another node has this name."""
+    """Raise PolicyError if another node has this name."""
     others = [other for other in station.nodes.all_named(name) if other != uuid]
     if others:
         raise PolicyError(
@@ -192,7 +192,7 @@ def require_free_name(station: Station, uuid: bytes, name: str) -> None:
 
 
 def _numbered(station: Station, uuid: bytes, pattern: str) -> str:
-    """The pattern with the first number that no other node has; a node that has one keeps it."""
+    """Return the pattern with the first number that no other node has; a node that has one keeps it."""
     record = station.nodes.get(uuid)
     mine = record.name if record is not None else None
     number = 1
@@ -220,10 +220,10 @@ def compose(
     as_known: bool = True,
     edition: int = 2007,
 ) -> ComposedTeds:
-    """Compose a node's TEDS; ``has`` is where calibrations come from that the order does not bring or drop.
+    """Compose a node's TEDS; ``has`` provides calibrations that the order neither brings nor drops.
 
-    ``name`` is the one to keep where the order names none; ``as_known``: else the one that this station knows.
-    Raises UsageError (no profile known), BadDataError.
+    ``name`` is the one to keep if the order names none; ``as_known``: else the one that this station knows. Raises
+    UsageError (no profile known), BadDataError.
     """
     order = prepared.order
     wanted = _absolute_profile(order.profile) or _known_profile(station, uuid)
@@ -247,7 +247,7 @@ def compose(
 
 
 def digest_of(profile: Profile) -> str:
-    """SHA-256 (hex) of what a profile says, with all that it extends: of the TEDS that it gives, and its demands."""
+    """Return the SHA-256 (hex) of a profile with all that it extends: the TEDS that it gives, and its demands."""
     place = ("digest",)
     if place not in profile.composed:  # for the first node of this type
         profile.composed[place] = _digest(profile)
@@ -274,16 +274,16 @@ def _digest(profile: Profile) -> bytes:
 
 
 def _absolute_profile(profile: str | None) -> str | None:
-    """A name as it is, a path from the root on: the next command may stand in another folder."""
+    """Return a name unchanged, a path as absolute, since the next command may run in another folder."""
     return profile if profile is None or is_profile_name(profile) else str(Path(profile).absolute())
 
 
 def _kept_calibrations(
     order: BuildOrder, has: Image | None, profile: Profile
 ) -> tuple[dict[int, Calibration], tuple[str, ...]]:
-    """The calibrations that the node has and the order does not drop, and a warning where there are any.
+    """Return the calibrations that the node has and the order does not drop, and a warning if there are any.
 
-    Raises CalibrationMisfitError where one was made for another channel than the profile's.
+    Raises CalibrationMisfitError if one was made for another channel than the profile's.
     """
     if order.drop_calibration or has is None:
         return {}, ()
@@ -314,14 +314,14 @@ def require_fit(kept: Mapping[int, Calibration], has: Image, new: Image, profile
 
 
 def teds_calibrations(image: Image) -> dict[int, Calibration]:
-    """The calibrations that an image holds, by channel."""
+    """Return the calibrations that an image holds, by channel."""
     if not _is_calibrated(image):
         return {}
     return dict(Sheet.from_image(image).calibrations)
 
 
 def own_name(station: Station, image: Image, before: str | None) -> str | None:
-    """The name that a node's datasheet gives it, None where it is the one that its profile ``before`` gives to all."""
+    """Return the node's individual name in its datasheet, None if its profile ``before`` gives it to all."""
     octets = image.blocks.get((0, AccessCode.NAME))
     found = teds.decode(octets).get("TCName") if octets is not None else None
     if not isinstance(found, str) or not found:
@@ -344,10 +344,10 @@ def guard(
     record: bool = True,
     expected: Collection[str] = (),
 ) -> tuple[str, ...]:
-    """Refuse a calibration that would hurt (exit 6), unless someone said why it is right; returns warnings.
+    """Refuse a calibration that would hurt (exit 6), unless a reason was given to accept it; return warnings.
 
-    That reason goes into the audit log, unless ``record`` is False (dry run). ``expected`` are codes of warnings that
-    say what was asked for, and so are not given.
+    That reason goes into the audit log, unless ``record`` is False (dry run). ``expected`` are codes of warnings about
+    what was ordered, which are suppressed.
     """
     if not _is_calibrated(image, has):
         return ()
@@ -376,7 +376,7 @@ def _is_calibrated(*images: Image | None) -> bool:
 
 
 def merged(warnings: Sequence[str]) -> tuple[str, ...]:
-    """Warnings, those that say the same of several channels in one line: ``Channels 1 to 12: …``."""
+    """Return warnings, with the same one for several channels in one line: ``Channels 1 to 12: …``."""
     order: list[tuple[str, str]] = []
     channels: dict[tuple[str, str], list[int]] = {}
     for text in warnings:
@@ -442,7 +442,7 @@ def _known_profile(station: Station, uuid: bytes) -> str | None:
 
 
 def no_profile(uuid: bytes) -> UsageError:
-    """The error for a node of which nobody said what it is."""
+    """Return the error for a node without a known profile."""
     return UsageError(f"No profile is known for node {uuid.hex()}.", hint="Add --profile; see: profile list")
 
 
@@ -471,7 +471,7 @@ __all__ = ["BuildOrder", "BuildResult", "Proposal", "UnrequestedChangeError", "b
 
 @dataclass(frozen=True)
 class BuildResult:
-    """A built image (Security TEDS unsigned, or absent where the node's key is not known yet) and its warnings."""
+    """A built image (Security TEDS unsigned, or absent if the node's key is not known yet) and its warnings."""
 
     image: Image
     profile: str
@@ -480,7 +480,10 @@ class BuildResult:
 
 
 class UnrequestedChangeError(PolicyError):
-    """A node's datasheet would change in what this command did not name, and nobody said yes; ``changes`` says what."""
+    """A node's datasheet would change in values that this command did not name, without a confirmation.
+
+    ``changes`` lists them.
+    """
 
     code = "not-named"
 
@@ -490,11 +493,11 @@ class UnrequestedChangeError(PolicyError):
 
 
 Confirm = Callable[[bytes, tuple[Change, ...]], None]
-"""Asked before a datasheet changes in what was not named: UUID and changes; raises where the answer is no."""
+"""Asks before a datasheet changes in what was not named: UUID and changes; raises if the answer is no."""
 
 
 def no_confirmation(uuid: bytes, changes: tuple[Change, ...]) -> None:
-    """The answer where nobody can be asked: no. Raises UnrequestedChangeError with the changes."""
+    """Refuse, as without a terminal there is no confirmation. Raises UnrequestedChangeError with the changes."""
     shown = " ".join(change.text for change in changes[:3])
     more = f" And {len(changes) - 3} more." if len(changes) > 3 else ""
     raise UnrequestedChangeError(
@@ -514,12 +517,12 @@ def build(
     keep_draft: bool = True,
     retype: Retype | None = None,
 ) -> BuildResult:
-    """Build a node's datasheet as a draft: a trial, which only ``sign``, ``write`` or a "yes" bring onto the node.
+    """Build a node's datasheet as a draft, which only ``sign``, ``write`` or a confirmation bring onto the node.
 
-    Where the order brings no calibration, that of an earlier run that never came to write is taken, else the one that
-    the node was last read to have (``has``: another one's). ``keep_draft`` False changes nothing (dry run).
+    If the order brings no calibration, that of an earlier run that never came to write is taken, else the one of the
+    node's last reading (``has``: another one's). ``keep_draft`` False changes nothing (dry run).
 
-    ``retype`` is asked where the board, as it was last read, is of another type. Raises NotFoundError (profile, file),
+    ``retype`` is asked if the board, as it was last read, is of another type. Raises NotFoundError (profile, file),
     BadDataError (profile or calibration with errors), WrongBoardError, PolicyError (a calibration that the guard
     refuses).
     """
@@ -554,10 +557,10 @@ def build(
 
 @dataclass(frozen=True)
 class Proposal:
-    """What a node is to have: TEDS without the Security TEDS, and whether all of it was asked for.
+    """The wanted content of a node: TEDS without the Security TEDS, and whether all of it was ordered.
 
-    ``changes`` are against what it has now; ``profile`` and ``name`` what is remembered once it is written, None where
-    nothing is to be remembered anew.
+    ``changes`` are against what it has now; ``profile`` and ``name`` are recorded once it is written, None if
+    unchanged.
     """
 
     image: Image
@@ -570,13 +573,13 @@ class Proposal:
     profile_digest: str | None = None
 
     def require_a_yes(self, confirm: Confirm) -> None:
-        """Ask where something changes that was not named."""
+        """Ask for a confirmation if something changes that was not named."""
         if self.changes and not self.named:
             confirm(self.image.uuid, self.changes)
 
 
 def propose(station: Station, prepared: PreparedOrder, present: NodeSnapshot, *, record: bool = True) -> Proposal:
-    """Say what a node that was just read is to have. ``record`` False: for a dry run, without a trace in the log.
+    """Return the wanted content of a node that was just read. ``record`` False: for a dry run, without an audit entry.
 
     Raises UsageError (no profile known), NotFoundError, BadDataError, PolicyError (a calibration that the guard
     refuses).
@@ -607,7 +610,7 @@ def propose(station: Station, prepared: PreparedOrder, present: NodeSnapshot, *,
 
 
 def _proposal(station: Station, prepared: PreparedOrder, present: NodeSnapshot) -> Proposal:
-    """What the node is to have, by what it has now and what was ordered; not guarded yet."""
+    """Return the wanted content, by what the node has now and what was ordered; not guarded yet."""
     has, order = present.image, prepared.order
     keep = {block: has.blocks[block] for block in present.read_only}
     if not has.unsigned_blocks().keys() - keep.keys():
@@ -629,13 +632,13 @@ def _proposal(station: Station, prepared: PreparedOrder, present: NodeSnapshot) 
 
 
 def _intact(station: Station, present: NodeSnapshot) -> bool:
-    """Whether the node has a datasheet that this station would call authentic: what it says may be kept."""
+    """True if the node's datasheet is authentic for this station, so that its values may be kept."""
     checks = verify_image(station, present.image, known=FreshnessFloor(present.identity))
     return Verification(present.image.uuid, tuple(checks)).verdict == "authentic"
 
 
 def _mended(station: Station, prepared: PreparedOrder, present: NodeSnapshot) -> Proposal | None:
-    """The very datasheet that the node was signed for, where it holds something else and nothing else is asked for."""
+    """Return the datasheet that the node was signed for, if it holds something else and nothing else is ordered."""
     octets, uuid = present.image.security, present.image.uuid
     try:
         shown = security.decode(octets) if octets is not None else None
@@ -676,7 +679,7 @@ def _composed(
 
 
 def _as_it_is(station: Station, present: NodeSnapshot, keep: Mapping[BlockId, bytes]) -> Proposal:
-    """What the node has, unless something else was built or signed for it and never written."""
+    """Return the node's present content, unless something else was built or signed for it and never written."""
     uuid, has = present.image.uuid, present.image
     pending = pending_image(station, uuid, has)
     if pending is None or pending.unsigned_blocks() == has.unsigned_blocks():
@@ -690,7 +693,7 @@ def _as_it_is(station: Station, present: NodeSnapshot, keep: Mapping[BlockId, by
 def _only_what_is_named(
     station: Station, prepared: PreparedOrder, present: NodeSnapshot, keep: Mapping[BlockId, bytes]
 ) -> Proposal:
-    """What the node has, with those TEDS exchanged that differ by the named values alone."""
+    """Return the node's present content, with only those TEDS replaced that differ by the named values."""
     uuid, has = present.image.uuid, present.image
     record = station.nodes.get(uuid)
     name = own_name(station, has, record.profile if record is not None else None)
@@ -712,7 +715,7 @@ def _only_what_is_named(
 
 
 def pending_image(station: Station, uuid: bytes, has: Image | None) -> Image | None:
-    """What an earlier run built or signed and never wrote: it says which calibration was meant, not the node."""
+    """Return an unwritten image of an earlier run: it determines the intended calibration, not the node."""
     draft = station.nodes.draft(uuid)
     if draft is None:
         return None

@@ -1,6 +1,6 @@
-"""What each command does at a node, as one call: unlock, wait for the node, take its turn, identify, then the steps.
+"""Each command at a node as one call: unlock, wait for the node, take its lock, identify, then the steps.
 
-Whoever calls one of these (the command line, the API) brings words alone: no session, lock or link is its own.
+The callers (command line, API) pass plain texts: no session, lock or link is theirs.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class NodeVisit:
     released: bool = False  # the running `ncap` measured the node and let it go
 
     def session(self) -> None:
-        """Open a session under the key that is held; raises PolicyError where there is none."""
+        """Open a session under the key that is held; raises PolicyError if there is none."""
         require_session(self.station, self.node)
 
 
@@ -87,10 +87,10 @@ def at_node(
 ) -> Iterator[NodeVisit]:
     """Meet node ``uuid`` on the chosen link and have it prove its key.
 
-    The vault is opened before anyone is waited for: always, where a key of this node is held, or never. Another
-    command of this station that works on the same node is waited for. ``writes`` is the command that writes to the
-    node: a running `ncap` of this home that measures it lets it go meanwhile. Raises NoReaderError, NoNodeError after
-    ``links.timeout`` seconds, KeyMismatchError, NotAuthenticError, LinkError; PolicyError where the node is not let go.
+    The vault is opened before any wait: always, if a key of this node is held, or never. Another command of this
+    station that works on the same node is waited for. ``writes`` is the command that writes to the node: a running
+    `ncap` of this home that measures it releases it meanwhile. Raises NoReaderError, NoNodeError after
+    ``links.timeout`` seconds, KeyMismatchError, NotAuthenticError, LinkError; PolicyError if the node is not released.
     """
 
     def before() -> None:
@@ -106,9 +106,9 @@ def at_node(
 
 
 def node_or_image(station: Station, text: str, *, node: bool = False) -> bytes | Image:
-    """The image of a file, or the UUID that ``text`` names; raises NotFoundError which says what of the two it is not.
+    """Return the image of a file, or the UUID that ``text`` names; raises NotFoundError if it is neither.
 
-    Of both the file, but with ``node`` the node.
+    If both match, the file wins unless ``node`` is true.
     """
     path = Path(text)
     if node:
@@ -164,9 +164,9 @@ def identify_at(
     watch: bool = False,
     stop: threading.Event | None = None,
 ) -> Iterator[Arrival[ProvenNode]]:
-    """Identify who is there, or (``watch``) whoever comes until ``stop``; ``add`` whitelists what proves its key.
+    """Identify the present node, or (``watch``) each that comes until ``stop``; ``add`` whitelists proven ones.
 
-    With ``watch`` an error ends one node only. Without it that is so where another node was identified, and it is told
+    With ``watch`` an error ends one node only. Without it that is so if another node was identified, and it is reported
     as a notice; else the first error is raised.
     """
     if add:
@@ -193,7 +193,7 @@ def identify_at(
 def _side_by_side(
     nodes: list[Conversation], work: Callable[[Conversation], ProvenNode]
 ) -> Iterator[tuple[Conversation, ProvenNode | TedsProvisionError]]:
-    """What became of each node, in their order: as many at a time as the link bears, as a mute one takes 40 s."""
+    """Yield the result of each node, in their order: as many at a time as the link allows, as a mute one takes 40 s."""
 
     def one(node: Conversation) -> ProvenNode | TedsProvisionError:
         try:
@@ -239,7 +239,7 @@ def _identified(station: Station, node: Conversation, add: bool) -> ProvenNode:
 
 @dataclass(frozen=True)
 class AgreeReport:
-    """What ``agree`` did; for a dry run ``agreed`` is None, and ``plan`` says what it would do."""
+    """Result of ``agree``; for a dry run ``agreed`` is None, and ``plan`` describes it."""
 
     uuid: bytes
     agreed: AgreeResult | None
@@ -259,8 +259,8 @@ def agree_at(
 ) -> AgreeReport:
     """Agree on a key with the node that ``node`` names (UUID, prefix, name), or rotate it; see :func:`agree`.
 
-    ``confirm`` is asked where the key came back from a backup and nobody taps the node, and before a node is taken
-    over from another station; it raises for a no.
+    ``confirm`` is asked if the key came back from a backup and the node is not tapped, and before a node is taken over
+    from another station; it raises for a no.
     """
     uuid = station.nodes.resolve(node)
     station.policy.require_whitelisted(uuid)
@@ -294,12 +294,12 @@ def set_address_at(
 
 
 def set_address(station: Station, node: Conversation, address: int) -> bool:
-    """Give the node another CAN address, 1 to 239, durably; False where it has it already.
+    """Give the node another CAN address, 1 to 239, durably; False if it has it already.
 
     Its reply still leaves from the old address; the node is met at the new one from then on. A board that moves at once
-    loses that reply: where none comes over the bus, who is at the new address is asked before wiring is spoken of.
-    Raises NodeRefusedError (3: neither tapped nor in a session; 17: written less than 10 s ago), KeyMismatchError,
-    LinkError, UsageError for a node without CAN.
+    loses that reply: if none comes over the bus, the new address is asked before the error blames the wiring. Raises
+    NodeRefusedError (3: neither tapped nor in a session; 17: written less than 10 s ago), KeyMismatchError, LinkError,
+    UsageError for a node without CAN.
     """
     if not node.identity.can_address:
         raise UsageError("This node has no CAN, so it has no CAN address.", hint="Nothing needs to be set.")
@@ -324,7 +324,7 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
 
 
 def _is_at(node: Conversation, address: int) -> bool:
-    """Whether this node answers at the new address; what it says there is a hint, as every address is."""
+    """True if this node answers at the new address; its answer is a hint, as every address is."""
     link = node.contact.link
     there = link.there(address) if isinstance(link, MultiStationLink) else None
     return there is not None and there.uuid == node.uuid
@@ -333,14 +333,14 @@ def _is_at(node: Conversation, address: int) -> bool:
 # -- read, reset, verify, write ----------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class ReadReport:
-    """Every TEDS of a node; ``error`` is UnprovenError where a key is held here and nothing shows who said it."""
+    """Every TEDS of a node; ``error`` is UnprovenError if a key is held here and their origin is unproven."""
 
     image: Image
     error: UnprovenError | None
 
 
 def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter) -> ReadReport:
-    """Read every TEDS of the node that ``node`` names, in a session where this station holds its key."""
+    """Read every TEDS of the node that ``node`` names, in a session if this station holds its key."""
     uuid = station.nodes.resolve(node)
     with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
         why = open_or_say_why(station, visit.node)
@@ -409,14 +409,14 @@ def verify_at(
 
 @dataclass(frozen=True)
 class WriteReport:
-    """What ``write`` did; for a dry run ``written`` is None and ``image`` what would be written."""
+    """Result of ``write``; for a dry run ``written`` is None and ``image`` what would be written."""
 
     image: Image
     written: WriteResult | None
 
 
 def _wanted(station: Station, uuid: bytes, file: Path | None) -> tuple[Image, dict[str, object]]:
-    """The signed image to write to a node, and what is remembered of the node once it is written."""
+    """Return the signed image to write to a node, and the facts to record once it is written."""
     draft = station.nodes.draft(uuid)
     profile = draft.profile if draft is not None else None
     facts: dict[str, object] = {}
@@ -457,13 +457,12 @@ def write_at(
     retype: Retype | None = None,
     retyped: bool = False,
 ) -> WriteReport:
-    """Write a signed image to the node that ``node`` names: of a file, else the draft, else what it was read to have.
+    """Write a signed image to the node that ``node`` names: of a file, else the draft, else its last reading.
 
     ``jump`` is asked before a sequence far ahead of the node's is written, and raises for a no; None: it is refused;
     ``low`` before a node with a low battery is written; ``retype`` before a board becomes one of another type than it
-    says it is (None: that is refused), unless it was ``retyped`` by a word.
-    Raises NotFoundError (nothing built), BadDataError (not signed), PolicyError (another node's image), as ``write``
-    does.
+    claims (None: that is refused), unless it was ``retyped`` by an option. Raises NotFoundError (nothing built),
+    BadDataError (not signed), PolicyError (another node's image), as ``write`` does.
     """
     uuid = station.nodes.resolve(node)
     station.policy.require_whitelisted(uuid)
@@ -541,11 +540,11 @@ def sign_at(
 def sign_image(station: Station, order: SignOrder, node: Conversation | None) -> SignReport:
     """Sign the draft or image of one node; with ``node`` against what it has, in a session, else as last known.
 
-    An image file that was built at another station brings the node's epoch and sequence in its Security TEDS, as that
-    station knew them; what this one knows counts where it is newer.
+    An image file that was built at another station has the node's epoch and sequence in its Security TEDS, as that
+    station knew them; this station's values count if they are newer.
 
-    Where nothing lies ready, what the node was last read to have is signed: nothing to do, if it still holds. Raises
-    NotFoundError (nothing built, key unknown), BadDataError, PolicyError (guard), NotWhitelistedError.
+    Without a draft the node's last reading is signed: nothing to do, if it is still valid. Raises NotFoundError
+    (nothing built, key unknown), BadDataError, PolicyError (guard), NotWhitelistedError.
     """
     uuid = order.uuid
     station.policy.require_whitelisted(uuid)
@@ -588,17 +587,17 @@ class _PresentTeds:
     read: bool = False
 
     def completing(self, image: Image) -> Image:
-        """The image with the read-only blocks of the node that it leaves out: they stay on the node and are signed."""
+        """Return the image with the read-only blocks of the node that it leaves out, which stay and are signed."""
         if self.image is None:
             return image
         keep = {block: self.image.blocks[block] for block in self.read_only if block not in image.blocks}
         return Image(self.image.uuid, {**image.blocks, **keep})
 
     def security_for(self, image: Image) -> bytes | None:
-        """The node's Security TEDS, where its signature may be used again for ``image``.
+        """Return the node's Security TEDS, if its signature may be used again for ``image``.
 
-        Not where the node was read to hold something else than it was signed for: it takes ``image`` only under a
-        newer sequence.
+        Not if the node was read to hold something else than it was signed for: it takes ``image`` only under a newer
+        sequence.
         """
         if self.image is None or (self.read and self.image.unsigned_blocks() != image.unsigned_blocks()):
             return None
@@ -606,10 +605,10 @@ class _PresentTeds:
 
 
 def _last_known(station: Station, uuid: bytes, known: Image | None, file: Image | None) -> _PresentTeds:
-    """What the store knows of the node, or the image file that came, where it says more.
+    """Return the store's facts about the node, or the image file's if they are newer.
 
-    A file is hearsay, so it does not use up the sequence of a node that this station knows: more than a node would take
-    at once, it has to be read (``--read-node``).
+    A file is unverified, so it does not use up the sequence of a known node: for a step larger than a node accepts at
+    once, it has to be read (``--read-node``).
     """
     record = station.nodes.get(uuid)
     epoch, sequence = station.keys.active_epoch(uuid) or (record.epoch if record else 0), _sequence_of(known)
@@ -636,7 +635,7 @@ def _read_now(station: Station, node: Conversation, order: SignOrder) -> _Presen
 
 
 def _keep(station: Station, order: SignOrder, signed: SignResult, draft: Draft | None) -> None:
-    """Keep what was built here, or signed anew, until it is written; with the profile that it was built from.
+    """Keep what was built here, or signed again, until it is written; with the profile that it was built from.
 
     An image file that was not built here stays the caller's.
     """
@@ -657,7 +656,7 @@ def _sequence_of(has: Image | None) -> int:
 
 
 def _signed_before(image: Image, draft: Draft | None) -> list[bytes]:
-    """Security TEDS of the image at hand and of the draft: either may hold the signature that still says the same."""
+    """Return the Security TEDS of the image at hand and of the draft: either signature may still be valid."""
     images = [image] if draft is None else [image, draft.image]
     return [found.blocks[SECURITY] for found in images if SECURITY in found.blocks]
 
@@ -667,7 +666,7 @@ def _signed_before(image: Image, draft: Draft | None) -> list[bytes]:
 
 @dataclass(frozen=True)
 class DroppedDraft:
-    """A draft that was dropped, or would be; None where there was none."""
+    """A draft that was dropped, or would be; None if there was none."""
 
     uuid: bytes
     draft: Draft | None
@@ -685,14 +684,14 @@ def drop_draft(station: Station, node: str, *, dry_run: bool = False) -> Dropped
 
 
 def history_of(station: Station, node: str) -> tuple[bytes, list[DatasheetRecord]]:
-    """The datasheets of the node that ``node`` names, newest first."""
+    """Return the datasheets of the node that ``node`` names, newest first."""
     uuid = station.nodes.resolve(node)
     return uuid, station.nodes.history(uuid)
 
 
 @dataclass(frozen=True)
 class RestoredDatasheet:
-    """An older datasheet, signed anew and written; for a dry run ``written`` is None."""
+    """An older datasheet, signed again and written; for a dry run ``written`` is None."""
 
     uuid: bytes
     sequence: int
@@ -714,7 +713,7 @@ def _record_of(station: Station, uuid: bytes, sequence: int) -> DatasheetRecord:
 def restore_datasheet(
     station: Station, links: LinkSettings, node: str, sequence: int, reporter: Reporter, *, dry_run: bool = False
 ) -> RestoredDatasheet:
-    """Write a datasheet that the node had under ``sequence``, signed anew; its content counts, not its number.
+    """Write a datasheet that the node had under ``sequence``, signed again; its content counts, not its number.
 
     Raises NotFoundError (no such datasheet), PolicyError, and what ``write`` raises.
     """

@@ -1,7 +1,6 @@
-"""A datasheet out of an XML or JSON document onto a node that is being talked to: planned, guarded, signed, written.
+"""A datasheet out of an XML or JSON document onto a connected node: planned, guarded, signed, written.
 
-The document says all of the datasheet. What the node has beside it and calls read-only stays; what else it has and the
-document does not name goes.
+The document is the whole datasheet. Other TEDS of the node that are read-only stay; other writable ones are removed.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from teds_provision.teds.image import BlockId, Image
 
 @dataclass(frozen=True)
 class SheetPlan:
-    """What a document would change on a node: ``image`` is what it is to have, without its Security TEDS."""
+    """Changes of a document on a node: ``image`` is the wanted content, without its Security TEDS."""
 
     image: Image
     changes: tuple[Change, ...]
@@ -40,7 +39,7 @@ class SheetPlan:
 
 @dataclass(frozen=True)
 class SheetEditResult:
-    """What was done, step by step, and what the node is worth now."""
+    """What was done, step by step, and the node's verdict now."""
 
     plan: SheetPlan
     steps: tuple[StepResult, ...]
@@ -57,12 +56,11 @@ def plan_sheet(
     record: bool = False,
     expected: Collection[str] | None = None,
 ) -> SheetPlan:
-    """What writing these TEDS would change, in a session of the node; changes nothing.
+    """Plan the writing of these TEDS, in a session of the node; changes nothing.
 
     Raises NotWhitelistedError, PolicyError (no key, the guard), BadDataError (damaged TEDS, another node's),
-    WrongBoardError where the board says that it is of another type, unless ``retype``: no document names the type that
-    it was given before. DatasheetChangedError if ``expected`` is given and names no digest of the datasheet that the
-    node has.
+    WrongBoardError if the board claims another type, unless ``retype``: no document names the type that it was given
+    before. DatasheetChangedError if ``expected`` is given and names no digest of the datasheet that the node has.
     """
     station.policy.require_whitelisted(node.uuid)
     for (channel, code), teds in blocks.items():

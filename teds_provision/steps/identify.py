@@ -45,7 +45,7 @@ class IdentifiedNode:
 
 
 def prove(node: Conversation, point: bytes) -> None:
-    """Have the node sign a fresh challenge (128.8); raises NotAuthenticError where it cannot."""
+    """Have the node sign a fresh challenge (128.8); raises NotAuthenticError if it cannot."""
     challenge = os.urandom(CHALLENGE_OCTETS)
     proof = node.request_idempotent(security_command(Function.PROVE, challenge), "to prove its key")
     if not verify(point, prove_message(node.uuid, challenge), proof):
@@ -58,12 +58,12 @@ def prove(node: Conversation, point: bytes) -> None:
 def identify(
     station: Station, node: Conversation, *, expect: Callable[[IdentifiedNode], object] = lambda who: None
 ) -> IdentifiedNode:
-    """Read UUID and key, demand the proof, and hold both against what this station knows.
+    """Read UUID and key, require the proof, and check both against this station's store.
 
     Raises KeyMismatchError (a known UUID with another key), NotAuthenticError, BadDataError, LinkError. A tap pins the
-    key that it brought; over a bus, where anyone can call itself by any UUID, only a whitelisted key is kept, and
-    ``last_seen`` moves only where the key that signed is known. State, epoch and address of a plain Identify are hints:
-    they change nothing in the store, a session does. ``expect`` is asked before anything is recorded, and raises where
+    key that it brought; over a bus, where any device can use any UUID, only a whitelisted key is kept, and
+    ``last_seen`` changes only if the key that signed is known. State, epoch and address of a plain Identify are hints:
+    they change nothing in the store, a session does. ``expect`` is called before anything is recorded, and raises if
     another node was meant.
     """
     who = examine(station, node)
@@ -86,7 +86,7 @@ def identify(
 
 
 def _facts(station: Station, who: IdentifiedNode, *, counts: bool) -> dict[str, object]:
-    """What is remembered of a node that proved its key; ``counts``: by tap, or under a key that is whitelisted."""
+    """Return the facts to record of a node that proved its key; ``counts``: by tap, or under a whitelisted key."""
     facts: dict[str, object] = {"point": who.point} if counts else {}
     known = station.nodes.get(who.uuid)
     if counts or (known is not None and known.point == who.point):
@@ -95,16 +95,16 @@ def _facts(station: Station, who: IdentifiedNode, *, counts: bool) -> dict[str, 
 
 
 def _charge(node: Conversation) -> dict[str, object]:
-    """What the node's initial message says of its charge, with the time; a hint that is only shown."""
+    """Return the charge from the node's initial message, with the time; a hint that is only shown."""
     charging = node.contact.charging
     return {} if charging is None else {"charging": json.dumps({**charging.to_json(), "at": utc_now()})}
 
 
 def _pinned_now(station: Station, who: IdentifiedNode) -> WhitelistEntry | None:
-    """The node's entry with its whole fingerprint, None where it has that already, or nobody opens the vault.
+    """Return the entry with its whole fingerprint, None if it has that already, or the vault stays closed.
 
-    An entry that was made without one is pinned by its first tap (profile.md, "Keys and trust"); one that was made with
-    the first digits gets the others by the first contact, whatever the link.
+    An entry without a fingerprint is pinned by its first tap (profile.md, "Keys and trust"); one with the first digits
+    gets the others by the first contact, whatever the link.
     """
     entry = who.whitelisted
     if entry is None or is_whole(entry.fingerprint) or not _opened(station):
@@ -113,7 +113,7 @@ def _pinned_now(station: Station, who: IdentifiedNode) -> WhitelistEntry | None:
 
 
 def _opened(station: Station) -> bool:
-    """Whether the vault is open, which seals a pin; where nobody gives the passphrase, the first agreement will pin."""
+    """True if the vault is open, which makes a pin's MAC; without the passphrase, the first agreement will pin."""
     with suppress(WrongPassphraseError, KeyringUnavailableError):
         station.unlock()
         return True
@@ -121,7 +121,7 @@ def _opened(station: Station) -> bool:
 
 
 def examine(station: Station, node: Conversation) -> IdentifiedNode:
-    """What :func:`identify` finds out, without a trace in the store (but of a wrong key in the audit log)."""
+    """Return what :func:`identify` finds out, without a change of the store (but for a wrong key in the audit log)."""
     octets = read_block(node, SECURITY)
     shown = security.decode(octets)
     point = shown.node_key
@@ -145,21 +145,21 @@ def examine(station: Station, node: Conversation) -> IdentifiedNode:
 
 
 def known_key(station: Station, uuid: bytes) -> bytes | None:
-    """P(node) of the Security TEDS that was last read from this UUID, None where there is none of this profile."""
+    """Return P(node) of the Security TEDS last read from this UUID, None if there is none of this profile."""
     row = station.nodes.reading(uuid)
     return row.node_key if row is not None else None
 
 
 @dataclass(frozen=True)
 class Description:
-    """What a node's own, so far unverified, datasheet says it is."""
+    """A node's own, unverified description."""
 
     name: str | None
     channels: int
 
 
 def describe(node: Conversation) -> Description:
-    """Read name and number of channels from Meta-TEDS and XdcrName, where the node has them; nothing is verified."""
+    """Read name and number of channels from Meta-TEDS and XdcrName, if the node has them; nothing is verified."""
     name: str | None = None
     channels = 0
     for block in ((0, AccessCode.META), (0, AccessCode.NAME)):

@@ -1,4 +1,4 @@
-"""What the store knows of its nodes, put together from all of its tables; no secret is among it."""
+"""Inventory of the store's nodes, from all of its tables; without secrets."""
 
 from __future__ import annotations
 
@@ -28,16 +28,15 @@ PAGE = 256
 """Nodes that are judged together."""
 
 STATES = ("factory", "keyed", "provisioned", "moved", "revoked", "retired", "unseen")
-"""What a node can be searched by: the states of Identify, and what the station has noted."""
+"""States by which nodes can be searched: those of Identify, and the station's own."""
 
 _UUID_DIGITS = 20
 
 
 def search(station: Station, text: str | None = None, *, state: str | None = None, **more: str | None) -> list[bytes]:
-    """The UUIDs of the nodes that are meant; ``more``: the other fields of :class:`Search`.
+    """Return the UUIDs of the selected nodes; ``more``: the other fields of :class:`Search`.
 
-    ``text``: a whole UUID, an exact name, or any part of UUID, name or profile. Raises NotFoundError where nothing fits
-    it.
+    ``text``: a whole UUID, an exact name, or any part of UUID, name or profile. Raises NotFoundError if none fits it.
     """
     number: str | int | None = NodeState[state.upper()].value if state in STATES[:3] else state
     if text is None:
@@ -62,7 +61,7 @@ def inventory(station: Station, uuids: Sequence[bytes]) -> Iterator[dict[str, An
 
 
 def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[dict[str, Any], NodeVerdict | None]]:
-    """As :func:`inventory`, each with the whole verdict; None where no datasheet of the node was read."""
+    """Yield the rows of :func:`inventory`, each with the whole verdict; None if no datasheet of the node was read."""
     known = station.nodes.overview(uuids)
     while page := list(islice(known, PAGE)):
         listed = [overview.uuid for overview in page]
@@ -120,7 +119,7 @@ def _state(node: dict[str, Any]) -> str | None:
 
 @dataclass(frozen=True)
 class NodeFit:
-    """How one channel of one node (None: the node as a whole) stands to one requirement."""
+    """How one channel of one node (None: the node as a whole) meets one requirement."""
 
     uuid: bytes
     requirement: Requirement
@@ -140,7 +139,7 @@ class NodeFit:
 def fits_of(
     station: Station, requirements: Iterable[Requirement], uuids: Iterable[bytes], now: datetime
 ) -> Iterator[NodeFit]:
-    """Judge the datasheet that each node has, as far as this station knows it; ``skipped`` where it knows none."""
+    """Judge the last known datasheet of each node; ``skipped`` if there is none."""
     asked = tuple(requirements)
     for uuid in uuids:
         image = station.nodes.datasheet(uuid)

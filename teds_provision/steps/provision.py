@@ -54,16 +54,16 @@ from teds_provision.teds.calibration.formula import sentence
 from teds_provision.teds.image import SECURITY, Image
 
 Order = BuildOrder | PreparedOrder | Callable[["IdentifiedNode"], PreparedOrder]
-"""What a node gets: as it was asked for, read already, or by who it is (which raises where it gets nothing)."""
+"""What a node gets: as it was ordered, read already, or by its identity (which raises if it gets nothing)."""
 Onward = Callable[[Conversation], None]
 """Takes the conversation to another link; see ``talk/meeting.py``."""
 Accept = Callable[[IdentifiedNode], None]
-"""Asked before an unknown node is whitelisted; raises where the answer is no."""
+"""Asks before an unknown node is whitelisted; raises if the answer is no."""
 
 
 @dataclass(frozen=True)
 class ProvisionResult:
-    """The end of a run: its steps, what stands on the node, and the verdict."""
+    """End of a run: its steps, the node's content, and the verdict."""
 
     who: IdentifiedNode
     steps: tuple[StepResult, ...]
@@ -75,9 +75,9 @@ class ProvisionResult:
 
 
 def verify_only(station: Station, node: Conversation, line: ProductionLine, reporter: Reporter) -> ProvisionResult:
-    """Test one board that another station made: identify, verify, check; nothing is written, proof is left.
+    """Test one board that another station made: identify, verify, check; writes nothing, records evidence.
 
-    Raises what :func:`provision` raises; a board that is not authentic is told by its verdict.
+    Raises what :func:`provision` raises; the verdict reports a board that is not authentic.
     """
     steps, unit = Steps(reporter), None
     try:
@@ -120,12 +120,12 @@ class Unit(Protocol):
     """One board of a line, from before its key is agreed on until it is done."""
 
     prepared: PreparedOrder
-    """What it gets, its name included."""
+    """What it gets, including its name."""
 
     def sign(
         self, node: Conversation, keys: SignedNodeKey, proposal: Proposal, present: NodeSnapshot
     ) -> SignResult | None:
-        """The datasheet signed elsewhere; None where this station signs."""
+        """Return the datasheet signed elsewhere; None if this station signs."""
 
     def ended(self, node: Conversation, done: ProvisionResult) -> None:
         """Leave proof, in the session that is open."""
@@ -137,11 +137,11 @@ class Unit(Protocol):
 
 
 class ProductionLine(Protocol):
-    """What every board of a run belongs to."""
+    """What all boards of a run share."""
 
     @property
     def total(self) -> int:
-        """How many boards it is for, 0 where nobody says."""
+        """The number of boards, 0 if it is unknown."""
 
     @property
     def passed(self) -> int:
@@ -152,20 +152,20 @@ class ProductionLine(Protocol):
         """What all boards get."""
 
     def order(self, who: IdentifiedNode) -> PreparedOrder:
-        """What this board gets; raises PolicyError where it gets nothing."""
+        """Return what this board gets; raises PolicyError if it gets nothing."""
 
     @property
     def only_verify(self) -> bool:
-        """Whether boards are tested alone, and nothing is written."""
+        """True if boards are only tested, and nothing is written."""
 
     def unit_to_json(self, uuid: bytes) -> dict[str, Any]:
-        """What is told of a board beside its steps."""
+        """Return the members about a board beside its steps."""
 
     def lists(self, who: IdentifiedNode) -> bool:
-        """Whether the job names this very board, by UUID and key."""
+        """True if the job names this very board, by UUID and key."""
 
     def is_listed(self, uuid: bytes) -> bool:
-        """Whether the job names this UUID."""
+        """True if the job names this UUID."""
 
     def allot_unit(
         self, node: Conversation, who: IdentifiedNode, prepared: PreparedOrder, entry: WhitelistEntry | None
@@ -191,14 +191,14 @@ def provision(
     line: ProductionLine | None = None,
     adopt: Adopt = refuse_adoption,
 ) -> ProvisionResult:
-    """Bring one node from wherever it stands to a verified datasheet; raises at the first step that fails.
+    """Bring one node from any state to a verified datasheet; raises at the first step that fails.
 
     ``accept`` is asked before an unknown node is whitelisted, ``confirm`` before a datasheet changes in what the order
     does not name, ``low`` before a node with a low battery is written, ``take_over`` before a node with another
     station's key gets one of ours (None: that is refused), ``retype`` before a board becomes one of another type than
-    it says it is, ``adopt`` before a datasheet that the board brought itself is signed. ``onward`` takes the
-    conversation to another link once the key is agreed on. ``line`` gives the board a unit before its key is agreed on,
-    and has it leave proof. A failure stands in the audit log with the step that it happened in.
+    it claims, ``adopt`` before a datasheet that the board brought itself is signed. ``onward`` moves the conversation
+    to another link after the agreement. ``line`` gives the board a unit before the agreement, and records its evidence.
+    A failure is in the audit log with its step.
     """
     run = _Run(station, node, order, accept, confirm, reporter, onward, low, take_over, retype, line, adopt)
     try:
@@ -236,7 +236,10 @@ class _Run:
         self.released = False  # the running `ncap` measured the node and let it go
 
     def proven(self) -> ProvisionResult:
-        """The run; what ends a board that has a unit leaves proof too, while the board may still be there."""
+        """Return the run.
+
+        An error of a board that has a unit is recorded as evidence too, while the board may be there.
+        """
         who = self._identify()
         try:
             done = self.run(who)
@@ -273,7 +276,7 @@ class _Run:
         return ProvisionResult(who, tuple(self.steps.done), written.on_node, verified, warnings, borne.samples)
 
     def _require_its_board(self, who: IdentifiedNode, prepared: PreparedOrder, told: tuple[str, ...]) -> None:
-        """Ask, or refuse, where the board says that it is of another type; once, whoever of the two looks first."""
+        """Ask, or refuse, if the board claims another type; only the first of the two checks asks."""
         wanted = prepared.order.profile
         if not told or prepared.order.retype or self._retyped:
             return
@@ -293,7 +296,7 @@ class _Run:
             self.order = self.order(who)
 
     def _prepared(self, who: IdentifiedNode) -> PreparedOrder:
-        """The order for this very node; what was read before the tap is not read again."""
+        """Return the order for this very node; what was read before the tap is not read again."""
         order = self.order
         prepared = prepare(self.station, order, who.uuid) if isinstance(order, BuildOrder) else order
         assert isinstance(prepared, PreparedOrder), "_choose() has asked"
@@ -339,7 +342,7 @@ class _Run:
         return proposal
 
     def _adopted(self, prepared: PreparedOrder, present: NodeSnapshot) -> Proposal:
-        """What the board brought, judged and asked about; nothing of it changes but its name, where one is given."""
+        """Return the board's own datasheet, judged and confirmed; unchanged but for its name, if one is given."""
         brought = read_factory_datasheet(self.station, present.image, name=prepared.order.name)
         reason = prepared.order.accept_calibration
         if brought.errors and reason is None:
@@ -395,7 +398,7 @@ class _Run:
         return written
 
     def _check(self, prepared: PreparedOrder, written: WriteResult, verified: Verification) -> HardwareCheck:
-        """Ask the hardware whether it bears the datasheet, and for one reading; nothing where it is not authentic."""
+        """Check that the hardware accepts the datasheet, and take one reading; skipped if it is not authentic."""
         with self.steps.step("check") as step:
             if verified.verdict != "authentic":
                 step.result = SKIPPED
@@ -418,10 +421,10 @@ class _Run:
 
 
 def new_whitelist_entry(station: Station, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
-    """The whitelist entry of a node that was just identified, pinned to its key by tap, or by the bus of a new node.
+    """Return the whitelist entry of an identified node, pinned to its key by tap, or by the bus of a new node.
 
-    A node that already has a key is not pinned over a bus, where anyone may show any UUID; its first tap does. Over the
-    air nothing is pinned. Changes nothing. Raises PolicyError (revoked), KeyMismatchError.
+    A node that already has a key is not pinned over a bus, where any device may show any UUID; its first tap does. Over
+    the air nothing is pinned. Changes nothing. Raises PolicyError (revoked), KeyMismatchError.
     """
     new = who.state == NodeState.FACTORY and node.wired
     assurance: Assurance = "tap" if node.tapped else "bus" if new else "uuid"
@@ -434,7 +437,7 @@ def new_whitelist_entry(station: Station, node: Conversation, who: IdentifiedNod
 
 
 def add_to_whitelist(station: Station, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
-    """Whitelist a node as :func:`new_whitelist_entry` says; an entry that another process made meanwhile stays."""
+    """Whitelist a node by :func:`new_whitelist_entry`; an entry that another process made meanwhile stays."""
     entry = new_whitelist_entry(station, node, who)
     with station.durable("whitelist"):
         present = station.pins.entry(who.uuid)

@@ -1,9 +1,9 @@
-"""The one row of reading that each node has in the store, and the one verdict that is judged from it.
+"""The reading that each node has in the store, and the verdict that is derived from it.
 
-Whoever reads a node's TEDS keeps what was read here: the digest of each, when, by which command, in which session.
-Whoever shows a verdict judges that row, by today's pins, bans and trust (:func:`verdict_of`): no screen can say another
-one. Only a reading in a session replaces one made in a session; what came without one, where a key is held, is shown
-beside it and changes nothing: a stranger on the bus could have said it.
+Every command that reads a node's TEDS keeps the reading here: the digest of each, when, by which command, in which
+session. Every verdict is derived from that row, by today's pins, bans and trust (:func:`verdict_of`), so that all
+screens agree. Only a reading in a session replaces one made in a session; one without a session, if a key is held, is
+shown beside it and changes nothing: a stranger on the bus could have sent it.
 """
 
 from __future__ import annotations
@@ -70,10 +70,10 @@ def keep(
     more: Sequence[Check] = (),
     profile: str | None = None,
 ) -> NodeVerdict:
-    """Keep what was read of a node, all of it; the datasheet too, where it was read in a session and is worth it.
+    """Keep a whole reading of a node; the datasheet too, if it was read in a session and is worth it.
 
-    ``c`` is that of the session in which the reading began, where the one that is open now may be a later one. ``more``
-    are checks that were made at the node. Gives the verdict on this very reading, whether it was kept or not.
+    ``c`` is that of the session in which the reading began, if the one that is open now may be a later one. ``more``
+    are checks that were made at the node. Returns the verdict on this very reading, whether it was kept or not.
     """
     c = (c or node.open_counter) if node.sealed else None
     return keep_read(station, image, c, by=by, known=known, more=more, profile=profile)
@@ -104,7 +104,7 @@ def judge_reading(
     known: FreshnessFloor | None,
     more: Sequence[Check] = (),
 ) -> tuple[NodeReading, NodeVerdict]:
-    """The row of a reading and the verdict on it; nothing is kept yet. See :func:`keep_read`."""
+    """Return the row of a reading and the verdict on it; nothing is kept yet. See :func:`keep_read`."""
     said, signers = static_checks(image, known)
     octets = [*said, *more]
     row = NodeReading(image.uuid, utc_now(), by, c, True, _packed(image), *signers, _written(octets))
@@ -127,7 +127,7 @@ def keep_shown(station: Station, uuid: bytes, security_teds: bytes, *, by: str) 
 
 
 def is_known(station: Station, node: Conversation, image: Image) -> bool:
-    """Whether the row says this of the node already: the same TEDS, all of them read since it last started."""
+    """True if the row has this already: the same TEDS, all of them read since the node last started."""
     row = station.nodes.reading(image.uuid)
     return (
         row is not None
@@ -141,10 +141,10 @@ def is_known(station: Station, node: Conversation, image: Image) -> bool:
 def cached_image_if_current(
     station: Station, node: Conversation, security_teds: bytes, known: FreshnessFloor
 ) -> Image | None:
-    """The datasheet that was read of this node before, if its Security TEDS is the same and nothing spoke against it.
+    """Return the datasheet that was read before, if its Security TEDS is the same and it had no fault.
 
-    Every TEDS of field 108 is in it, with the digest that was read last. Where the session's c tells a restart since,
-    that is noted: what is judged then is ``kept``. None: all of it has to be read.
+    Every TEDS of field 108 is in it, with the digest that was read last. If the session's c shows a restart since, that
+    is recorded: the verdict is ``kept`` then. None: all of it has to be read.
     """
     row, image = station.nodes.reading(node.uuid), station.nodes.datasheet(node.uuid)
     if row is None or image is None or not row.in_session or node.open_counter is None:
@@ -160,7 +160,7 @@ def cached_image_if_current(
 
 
 def verdict_of(station: Station, uuid: bytes) -> NodeVerdict | None:
-    """The verdict on a node today: from its row of reading; None where no datasheet of it was read."""
+    """Return today's verdict on a node from its reading; None if no datasheet of it was read."""
     row = station.nodes.reading(uuid)
     if row is None or not row.is_datasheet:
         return None
@@ -168,7 +168,7 @@ def verdict_of(station: Station, uuid: bytes) -> NodeVerdict | None:
 
 
 def is_keyed(station: Station, uuid: bytes) -> bool:
-    """Whether a session is what proves a node here: a key of it is held, and was not given away."""
+    """True if a session proves a node here: a key of it is held, and was not given away."""
     return bool(station.keys.held(uuid)) and station.policy.tombstone(uuid) is None
 
 
@@ -213,7 +213,7 @@ def _judged(station: TrustSource, row: NodeReading, *, keyed: bool) -> NodeVerdi
 
 
 def digests_of(row: NodeReading) -> dict[tuple[int, int], bytes]:
-    """The digest of each TEDS that was read, by channel and access code."""
+    """Return the digest of each TEDS that was read, by channel and access code."""
     places = range(0, len(row.digests), _DIGEST)
     parts = [row.digests[place : place + _DIGEST] for place in places]
     return {(int.from_bytes(part[:2], "big"), part[2]): part[3:] for part in parts}
@@ -232,5 +232,5 @@ def _written(checks: Iterable[Check]) -> str:
 
 @lru_cache(maxsize=1024)
 def _read(text: str) -> tuple[Check, ...]:
-    """The checks of a row; most nodes of a plant have the same."""
+    """Parse the checks of a row; cached, as most nodes of a plant have the same."""
     return tuple(Check(name, result, why) for name, result, why in json.loads(text))

@@ -1,4 +1,4 @@
-"""Step 5: sign a datasheet, or find that the signature still says the same (profile.md, "The Security TEDS")."""
+"""Step 5: sign a datasheet, or find that the signature is still valid (profile.md, "The Security TEDS")."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class SignResult:
 
 
 def node_keys_of(uuid: bytes, security_teds: bytes) -> SignedNodeKey:
-    """Take fields 101 and 102 from a Security TEDS of the node; raises BadDataError where 102 is not over this UUID."""
+    """Return fields 101 and 102 of a Security TEDS; raises BadDataError if 102 is not over this UUID."""
     shown = security.decode(security_teds)
     if not node_key_good(uuid, shown.node_key, shown.node_key_signature):
         raise BadDataError(f"The Security TEDS of {uuid.hex()} belongs to another node (field 102).")
@@ -52,7 +52,7 @@ def node_keys_of(uuid: bytes, security_teds: bytes) -> SignedNodeKey:
 
 
 def known_node_keys(station: Station, uuid: bytes, image: Image | None = None) -> SignedNodeKey:
-    """The node's key and its signature, from the image at hand or from what was last read; raises NotFoundError."""
+    """Return the node's key and its signature, from the image at hand or the last reading; raises NotFoundError."""
     for source in (image, known_image(station, uuid)):
         if source is not None and source.security is not None:
             keys = node_keys_of(uuid, source.security)
@@ -71,12 +71,12 @@ def known_node_keys(station: Station, uuid: bytes, image: Image | None = None) -
 
 
 def known_image(station: Station, uuid: bytes) -> Image | None:
-    """What the node had when it was last read, None if it never was."""
+    """Return the image of a node when it was last read, None if it never was."""
     return station.nodes.datasheet(uuid)
 
 
 def unsigned_security(station: Station, keys: SignedNodeKey, image: Image) -> bytes:
-    """The Security TEDS of a built image: everything but the signature, sequence and epoch as they are now."""
+    """Return the Security TEDS of a built image: everything but the signature, with present sequence and epoch."""
     node = station.nodes.get(keys.uuid)
     return unsigned_datasheet(
         keys,
@@ -174,7 +174,7 @@ def require_not_measured(station: Station, node: Conversation, *, released: bool
 
 
 def _sequence_if_the_same(station: Station, keys: SignedNodeKey, image: Image, octets: bytes, epoch: int) -> int | None:
-    """The sequence of a Security TEDS that says the same of this image: content, epoch and signer unchanged."""
+    """Return the sequence of a Security TEDS that matches this image: content, epoch and signer unchanged."""
     try:
         found = security.decode(octets)
     except BadDataError:
@@ -193,7 +193,7 @@ def _sequence_if_the_same(station: Station, keys: SignedNodeKey, image: Image, o
 
 
 def _now() -> bytes:
-    """TimeInstance of now: u32 s, u32 ns, UTC; raises TedsProvisionError where no u32 holds it."""
+    """Return the TimeInstance of now: u32 s, u32 ns, UTC; raises TedsProvisionError if no u32 holds it."""
     seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
     if not 0 <= seconds < 1 << 32:
         raise TedsProvisionError("This machine's clock is wrong.", hint="Set it; see: teds-provision doctor")

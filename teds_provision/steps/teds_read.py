@@ -36,10 +36,10 @@ READING_SECONDS = 300.0
 
 
 def read_block(node: Conversation, block: BlockId, *, until: float | None = None) -> bytes:
-    """Read one TEDS, segment by segment, as long as its Length says (or as the node has octets).
+    """Read one TEDS, segment by segment, up to its Length (or as the node has octets).
 
-    Outside a session, where no tag tells noise from a bad TEDS, one whose checksum is wrong is read again: what comes
-    twice alike is what the node has. ``until`` is a monotonic time. Raises NodeRefusedError (18: no such TEDS) and,
+    Outside a session, where no tag distinguishes noise from a bad TEDS, one with a wrong checksum is read again: two
+    equal readings are what the node has. ``until`` is a monotonic time. Raises NodeRefusedError (18: no such TEDS) and,
     for a Length beyond 1 MiB (of a Security TEDS, 65535 octets), BadDataError in a session, GarbledError outside one.
     """
     octets = _read_once(node, block, until)
@@ -83,7 +83,7 @@ def _read_once(node: Conversation, block: BlockId, until: float | None) -> bytes
 
 
 def _read_segment(node: Conversation, block: BlockId, offset: int) -> bytes:
-    """What stands there; outside a session an answer to another question is asked for again, as a refusal is."""
+    """Read one segment; outside a session an answer to another question is repeated, as a refusal is."""
     channel, access_code = block
     command, what = read_teds(channel, access_code, offset), f"to read TEDS {access_code} of channel {channel}"
     for _ in range(1 if node.sealed else 1 + _REFUSED_READS):
@@ -110,7 +110,7 @@ def list_blocks(node: Conversation) -> list[BlockId]:
 
 
 def read_image(node: Conversation, *, initial: bytes | None = None) -> Image:
-    """Read every TEDS of a node; ``initial`` stands for its Security TEDS where that is not worth reading again."""
+    """Read every TEDS of a node; ``initial`` replaces its Security TEDS if that is not worth reading again."""
     blocks: dict[BlockId, bytes] = {}
     total = 0
     until = time.monotonic() + READING_SECONDS
@@ -131,11 +131,11 @@ def read_image(node: Conversation, *, initial: bytes | None = None) -> Image:
 
 
 def read_in_between(node: Conversation, *, gap: int) -> Generator[None, None, Image]:
-    """As :func:`read_image`, in the session that is open, one exchange for each ``next``; its value is the image.
+    """Read as :func:`read_image`, in the open session, one exchange for each ``next``; its value is the image.
 
-    For a node that measures meanwhile: who steps through it chooses when the bus is free, and frames of a reply are
-    asked for with ``gap`` ms between them. No new session is opened where the old one is gone: it carries the streams.
-    Raises SessionLostError, LinkError, NodeRefusedError, BadDataError.
+    For a node that measures meanwhile: the caller chooses when the bus is free, and requests frames of a reply with
+    ``gap`` ms between them. No new session replaces a lost one: it carries the streams. Raises SessionLostError,
+    LinkError, NodeRefusedError, BadDataError.
     """
 
     def sent(command: Command, what: str) -> bytes:
@@ -174,7 +174,7 @@ def read_in_between(node: Conversation, *, gap: int) -> Generator[None, None, Im
 
 
 def read_identity(node: Conversation) -> Identity:
-    """Ask Identify again, inside the session where one is open (then it is authentic)."""
+    """Send Identify again, inside the session if one is open (then it is authentic)."""
     identity = Identity.decode(node.request_idempotent(IDENTIFY, "to identify itself"))
     if identity.uuid != node.uuid:
         raise GarbledError(f"The node gave its UUID as {node.uuid.hex()} before and gives {identity.uuid.hex()} now.")
@@ -185,7 +185,7 @@ def read_identity(node: Conversation) -> Identity:
 
 @dataclass(frozen=True)
 class NodeSnapshot:
-    """What a node has now, read in its session: all TEDS, and which of those that are not ours are read-only."""
+    """Content of a node, read in its session: all TEDS, and which of those that are not ours are read-only."""
 
     image: Image
     read_only: frozenset[BlockId]
@@ -195,8 +195,8 @@ class NodeSnapshot:
 def take_snapshot(node: Conversation, *, initial: bytes | None = None) -> NodeSnapshot:
     """Read all TEDS and, for those that the Security TEDS does not account for, whether they are read-only.
 
-    ``initial`` is the Security TEDS that was read before the session: of a node that nobody wrote to since its last
-    reset it is unsigned and says nothing that the session does not, so it is not read twice.
+    ``initial`` is the Security TEDS that was read before the session: of a node that was not written since its last
+    reset it is unsigned and adds nothing to the session, so it is not read twice.
     """
     identity = node.proven or read_identity(node)
     image = read_image(node, initial=None if identity.state == NodeState.PROVISIONED else initial)

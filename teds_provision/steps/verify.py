@@ -31,10 +31,10 @@ class PinLookup(Protocol):
     """Which key a UUID is pinned to."""
 
     def check(self, uuid: bytes, point: bytes) -> None:
-        """Raise KeyMismatchError where this UUID is known with another key."""
+        """Raise KeyMismatchError if this UUID is known with another key."""
 
     def entry(self, uuid: bytes) -> WhitelistEntry | None:
-        """The whitelist entry of a node."""
+        """Return the whitelist entry of a node."""
 
 
 class TrustLookup(Protocol):
@@ -50,7 +50,7 @@ class TrustLookup(Protocol):
         """Station keys that count."""
 
     def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> SignerVerdict | None:
-        """What the plant says of who signed the datasheet of this digest; None where it has no say."""
+        """Return the plant's verdict on the signer of this digest; None if it does not apply."""
 
 
 class TrustSource(Protocol):
@@ -107,7 +107,7 @@ class _TrustSnapshot:
 
 @dataclass(frozen=True)
 class StationSnapshot:
-    """What a station said at one moment: plain data, so that other processes can judge by it too."""
+    """Snapshot of a station's trust: plain data, so that other processes can judge by it too."""
 
     point: bytes
     pins: _PinSnapshot
@@ -155,7 +155,7 @@ Outcome = Literal["passed", "failed", "skipped"]
 Verdict = Literal["authentic", "unsigned", "not authentic", "unproven"]
 Scope = Literal["node", "image"]
 MERELY_UNSIGNED: Final = frozenset({"signed", "every TEDS is signed"})
-"""Checks that fail where nothing is wrong but that nobody signed (all of) it."""
+"""Checks that fail if the only fault is a missing signature."""
 _FRESHNESS = {"sequence", "key epoch"}
 _DIGEST_OCTETS: Final = 32  # a TEDS is longer
 _SESSION = "session"
@@ -163,10 +163,10 @@ _PAGES = "pages"
 
 
 class Check(NamedTuple):  # a tuple: thirteen of them for each of ten thousand files
-    """One check of the datasheet; ``why`` says what was found.
+    """One check of the datasheet; ``why`` is the finding.
 
-    ``kept``: the TEDS that it is about were not read again since the node last started; those of the last reading are
-    judged in their place.
+    ``kept``: the TEDS concerned were not read again since the node last started; those of the last reading are judged
+    in their place.
     """
 
     name: str
@@ -181,10 +181,10 @@ class Check(NamedTuple):  # a tuple: thirteen of them for each of ten thousand f
 
 @dataclass(frozen=True)
 class Verification:
-    """All checks and the one verdict. ``scope`` says what was judged: a node, or an image file alone.
+    """All checks and the one verdict. ``scope``: a node, or an image file alone.
 
-    ``unsigned``: nothing is wrong but that nobody signed (all of) it. ``unproven``: a key of the node is held and no
-    session came about, so that whoever answered may have recorded what it served.
+    ``unsigned``: the only fault is that (part of) it has no signature. ``unproven``: a key of the node is held and no
+    session was opened, so that the answers may be a replay of recorded ones.
     """
 
     uuid: bytes
@@ -206,10 +206,10 @@ class Verification:
 
 @dataclass(frozen=True)
 class FreshnessFloor:
-    """What a node's datasheet must not be older than: the node's own values, and those of the last one checked here.
+    """Lower bounds of a node's datasheet: the node's own values, and those of the last one checked here.
 
-    ``identity`` was read in a session, None where there was none; ``sequence`` and ``key_epoch`` are fields 106 and
-    107 of the newest datasheet with a good signature that this station saw on the node, 0 for none.
+    ``identity`` was read in a session, None if there was none; ``sequence`` and ``key_epoch`` are fields 106 and 107 of
+    the newest datasheet with a good signature that this station saw on the node, 0 for none.
     """
 
     identity: Identity | None = None
@@ -218,7 +218,10 @@ class FreshnessFloor:
 
 
 def freshness_floor_of(station: Station, uuid: bytes, identity: Identity | None) -> FreshnessFloor:
-    """What this station knows of a node's datasheet. Signed values alone count: anyone could serve the others."""
+    """Return this station's bounds for a node's datasheet.
+
+    Only signed values count: any device could serve the others.
+    """
     image = known_image(station, uuid)
     octets = image.security if image is not None else None
     try:
@@ -242,17 +245,17 @@ def verify_image(station: TrustSource, image: Image, *, known: FreshnessFloor | 
 
 
 def verify_images(station: TrustSource, images: Iterable[Image]) -> list[list[Check]]:
-    """The checks of many files, as :func:`verify_image` makes them of each.
+    """Return the checks of many files, as :func:`verify_image` makes them of each.
 
     All signatures are checked in a row. Between the other checks of its image, each one took half as long again: the
-    tables of OpenSSL and the Python around them pushed each other out of the processor's cache.
+    tables of OpenSSL and the Python around them evicted each other from the processor's cache.
     """
     proven = [(image, _proofs(image)) for image in images]
     return [_checks(station, image, proofs, None) for image, proofs in proven]
 
 
 class _SecurityFields(NamedTuple):
-    """What the Security TEDS of an image says, or why it cannot be read (None: there is none), and its signatures."""
+    """Fields of an image's Security TEDS, or why it cannot be parsed (None: there is none), and its signatures."""
 
     shown: SecurityTeds | NotCanonicalError | None
     node_key: bool = False
@@ -260,7 +263,7 @@ class _SecurityFields(NamedTuple):
 
 
 def _proofs(image: Image) -> _SecurityFields:
-    """Read the Security TEDS of an image, and check what needs nobody's trust: fields 102 and 100."""
+    """Read the Security TEDS of an image, and check what needs no trust: fields 102 and 100."""
     octets = image.security
     if octets is None:
         return _SecurityFields(None)
@@ -279,7 +282,7 @@ def _checks(station: TrustSource, image: Image, proofs: _SecurityFields, known: 
 
 
 class Signers(NamedTuple):
-    """Fields 101 to 104 of a Security TEDS, which today's pins and trust are held against; None where there is none."""
+    """Fields 101 to 104 of a Security TEDS, to be checked by today's pins and trust; None if absent."""
 
     node_key: bytes | None = None
     node_key_signature: bytes | None = None
@@ -296,9 +299,9 @@ class Signers(NamedTuple):
 
 
 def static_checks(image: Image, known: FreshnessFloor | None) -> tuple[list[Check], Signers]:
-    """The checks that no later change of trust alters, and what :func:`judge` needs for the others.
+    """Return the checks that no later change of trust alters, and the input of :func:`judge` for the others.
 
-    What an image says by itself is remembered for a moment: it is asked when a write is recorded, and at the verdict.
+    The image's own checks are cached for a moment: both the record of a write and the verdict need them.
     """
     said = next((said for asked, said in tuple(_SAID) if asked is image), None)
     if said is None:
@@ -347,12 +350,12 @@ def _octets(image: Image, proofs: _SecurityFields, known: FreshnessFloor | None)
 
 
 def _not_older(shown: _Shown, known: FreshnessFloor | None) -> list[Check]:
-    """Whether a datasheet is not older than what is known of its node."""
+    """Check that a datasheet is not older than what is known of its node."""
     return [_epoch(shown, known), _sequence(shown, known)] if isinstance(shown, SecurityTeds) else []
 
 
 def _by_itself(image: Image, proofs: _SecurityFields) -> tuple[Check, ...]:
-    """The checks of an image for which nothing else has to be known."""
+    """Return the checks of an image that need no other knowledge."""
     checks, shown = [_form(image)], proofs.shown
     if shown is None:
         return (*checks, Check("signed", "failed", "the image has no Security TEDS"))
@@ -376,7 +379,7 @@ def _by_itself(image: Image, proofs: _SecurityFields) -> tuple[Check, ...]:
 
 
 def possession_check(prove: Callable[[], None]) -> Check:
-    """Run the challenge and tell it as a check; a link that fails is raised, not judged."""
+    """Run the challenge and return it as a check; a link that fails is raised, not judged."""
     try:
         prove()
     except NotAuthenticError as error:
@@ -385,7 +388,7 @@ def possession_check(prove: Callable[[], None]) -> Check:
 
 
 def session_check(opened: str, why: str) -> Check:
-    """Tell whether what was read is known to come from the node: ``opened`` says how, ``why`` why it is not.
+    """Return the check that the TEDS came from the node: ``opened`` is the evidence, ``why`` the reason of a failure.
 
     Both empty: no key of the node is held here, and signatures alone count.
     """
@@ -397,7 +400,10 @@ def session_check(opened: str, why: str) -> Check:
 
 
 def unproven(uuid: bytes, why: str) -> UnprovenError:
-    """The error (exit 5) where a key of the node is held and neither a session nor its signature vouches for it."""
+    """Return the error (exit 5) if a key of the node is held and the origin is unproven.
+
+    Neither a session nor the node's signature proves it.
+    """
     return UnprovenError(
         f"Nothing could be proven about node {uuid.hex()}: {why}.",
         hint="Data received outside a session may be a replay. Try it on the reader; to take a node over: agree"
@@ -485,7 +491,7 @@ def _not_revoked(station: TrustSource, uuid: bytes) -> Check:
 
 
 def _certifier(station: TrustSource, uuid: bytes, signers: Signers) -> bytes | None:
-    """The CA of those that count here which signed field 104, None where none did."""
+    """Return the trusted CA that signed field 104, None if none did."""
     for ca in station.policy.trusted_cas(uuid):
         if datasheet.is_certified(ca, signers.station_key, signers.station_key_signature):
             return ca
@@ -506,7 +512,7 @@ def _station(station: TrustSource, signers: Signers, certifier: bytes | None) ->
 def _signer(
     station: TrustSource, signers: Signers, certifier: bytes | None, security_teds: bytes | None
 ) -> tuple[Check, ...]:
-    """Whether the station that signed counts; in a plant by its roster and pages, which may not be here yet."""
+    """Check that the station that signed counts; in a plant by its roster and pages, which may not be here yet."""
     octets, key = security_teds or b"", signers.station_key or b""
     digest = octets if len(octets) == _DIGEST_OCTETS else hashlib.sha256(octets).digest()
     said = station.policy.signing(certifier, key, digest)

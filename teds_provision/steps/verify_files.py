@@ -36,7 +36,7 @@ _TOGETHER: Final = 1 << 20
 
 @dataclass(frozen=True)
 class FileVerdict:
-    """What became of one file: its checks, or why it could not be read; ``exit_code`` as the command would end."""
+    """Result of one file: its checks, or why it could not be read; ``exit_code`` of a command for it alone."""
 
     path: Path
     uuid: str | None = None
@@ -81,7 +81,7 @@ class VerdictTotals:
         self.exit_code = max(self.exit_code, others.exit_code, key=_WORST.index)
 
     def to_json(self) -> dict[str, object]:
-        """The last line."""
+        """Return the last line."""
         return {"totals": {"files": self.files, **dict(sorted(self.verdicts.items()))}}
 
 
@@ -95,10 +95,10 @@ _WORST: Final = (0, 6, 7, 3, 8, 1, 4)
 def verify_files(
     station: Station, files: Sequence[str], tell: Tell, *, processes: int | None = None
 ) -> Iterator[tuple[list[str], VerdictTotals]]:
-    """Judge every file, in order, some at a time: what ``tell`` says of each, and their totals.
+    """Judge every file, in order, some at a time: yield the lines of ``tell`` for each, and their totals.
 
     A fault of one is its verdict and stops no other. More than a few files are shared among ``processes`` (as many as
-    there are cores), which tell of them too: sentences are quicker sent than verdicts with all their checks.
+    there are cores), which format them too: lines are quicker to send than verdicts with all their checks.
     """
     workers = min(processes or len(os.sched_getaffinity(0)), (len(files) + _CHUNK - 1) // _CHUNK)
     work = _Work(snapshot_trust(station), tell, files)
@@ -114,7 +114,7 @@ def verify_files(
 
 @dataclass(frozen=True)
 class _Work:
-    """What a process needs to judge files and to tell of them."""
+    """What a process needs to judge files and to report them."""
 
     judging: TrustSource
     tell: Tell
@@ -166,7 +166,7 @@ def _some(paths: Sequence[Path]) -> Iterator[list[_Read]]:
 
 
 def _judged(judging: TrustSource, some: Sequence[_Read]) -> Iterator[FileVerdict]:
-    """The verdicts of files that were read, in their order."""
+    """Yield the verdicts of files that were read, in their order."""
     checks = iter(verify_images(judging, (image for _, image in some if isinstance(image, Image))))
     for path, image in some:
         if isinstance(image, Image):

@@ -41,14 +41,14 @@ class NodeVerification:
 
     @property
     def kept(self) -> bool:
-        """Whether all but the Security TEDS is as it was read before the node's last start."""
+        """True if all but the Security TEDS is as it was read before the node's last start."""
         return self.judged.origin == "kept"
 
 
 def verify_at_node(station: Station, node: Conversation, who: IdentifiedNode) -> NodeVerification:
-    """Open a session where a key is held, read every TEDS and judge them; raises LinkError and what a read raises.
+    """Open a session if a key is held, read every TEDS and judge them; raises LinkError and what a read raises.
 
-    One in which the node answers nothing but that it is busy is as good as none: then all is read without it.
+    A session in which the node answers only that it is busy counts as none: then all is read without it.
     """
     why = open_or_say_why(station, node)
     c = node.open_counter
@@ -65,10 +65,10 @@ def verify_at_node(station: Station, node: Conversation, who: IdentifiedNode) ->
 def verify_in_session(station: Station, node: Conversation, *, by: str) -> NodeVerification:
     """Judge the TEDS of a node in the session that is open. Raises LinkError, NodeRefusedError.
 
-    Where its Security TEDS is octet for octet the one that was read before, and nothing spoke against the rest then,
-    the rest is not read again here: it names the digest of every other TEDS. c of the session tells whether the node
-    has started since; then what is said of the rest is ``kept``, until somebody reads it (:mod:`.readings`). Everything
-    is judged anew all the same: trust, bans and pins may have changed.
+    If its Security TEDS is octet for octet the one that was read before, and the rest had no fault then, the rest is
+    not read again here: the Security TEDS contains the digest of every other TEDS. c of the session shows whether the
+    node has started since; then the rest's verdict is ``kept``, until it is read (:mod:`.readings`). Everything is
+    judged again all the same: trust, bans and pins may have changed.
     """
     identity, c = read_identity(node), node.open_counter
     octets = read_block(node, SECURITY)
@@ -83,7 +83,7 @@ def verify_in_session(station: Station, node: Conversation, *, by: str) -> NodeV
 
 
 def open_or_say_why(station: Station, node: Conversation) -> str:
-    """Open a session where a key is held; why there is none although one is held, else an empty text.
+    """Open a session if a key is held; return why there is none although one is held, else an empty text.
 
     Raises LinkError, and NodeRefusedError for a refusal in the session.
     """
@@ -115,8 +115,8 @@ def verify_node(
 ) -> NodeVerdict:
     """Check what was read off a node, have it prove its key, and keep the reading. Raises only for the link.
 
-    ``why`` says why there is no session although a key is held: then nothing of what was read is kept. ``by`` is the
-    command that asks, ``c`` that of the session in which the reading began.
+    ``why``: why there is no session although a key is held; then nothing of the reading is kept. ``by`` is the command,
+    ``c`` that of the session in which the reading began.
     """
     identity = (node.proven or read_identity(node)) if node.sealed else None
     possessed, vouch = possession_check(lambda: prove(node, point)), provenance_check(node, point, why)
@@ -144,7 +144,10 @@ def verify_node(
 
 
 def _facts(image: Image, identity: Identity | None) -> dict[str, object]:
-    """What is remembered of a node that was read; ``identity`` is what it said in a session, None outside one."""
+    """Return the facts to record of a node that was read.
+
+    ``identity`` is its Identify in a session, None outside one.
+    """
     facts: dict[str, object] = {"channels": len({c for c, code in image if code == AccessCode.CHANNEL})}
     if image.security is not None:
         facts["teds_sha256"] = sha256(image.security).hexdigest()
@@ -161,9 +164,9 @@ def _facts(image: Image, identity: Identity | None) -> dict[str, object]:
 
 
 def provenance_check(node: Conversation, point: bytes, why: str) -> Check:
-    """Whether the node itself is known to have said this: in a session, or by its signature that it was reset.
+    """Check that the node itself sent this: in a session, or by its signature that it was reset.
 
-    ``why`` is what :func:`open_or_say_why` said; the check has failed where a key is held and neither came about.
+    ``why`` comes from :func:`open_or_say_why`; the check fails if a key is held and neither succeeded.
     """
     if node.sealed:
         return session_check("opened with the key held here", "")

@@ -1,11 +1,10 @@
 """The whitelist: which nodes may be keyed and written, each by UUID and by the fingerprint of its key.
 
-A pinned key is never replaced by a command that adds; the entry has to be removed first (profile.md,
-"Keys and trust").
+A pinned key is never replaced by a command that adds; the entry has to be removed first (profile.md, "Keys and trust").
 
 Whitelist files that other tools write are XML in the style of the NCAP, CSV or JSON, and are taken whole or not at all.
 XML is read with defusedxml, without a DTD: neither entity bombs nor external entities. It is read liberally: an element
-is an entry where it has an attribute ``uuid``, a child ``uuid`` beside its other fields, or a UUID as its text.
+is an entry if it has an attribute ``uuid``, a child ``uuid`` beside its other fields, or a UUID as its text.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ _ALIASES = {"id": "uuid", "uid": "uuid"}
 
 @dataclass(frozen=True)
 class ListedNode:
-    """One entry of a file: the UUID, and the key and name that it gives where it gives them."""
+    """One entry of a file: the UUID, and key and name if it has them."""
 
     line: int
     uuid: bytes
@@ -109,9 +108,9 @@ class _WhitelistReader:
 
 
 def uuid_of_eui64(text: str) -> str:
-    """The UUID of a node whose maker gave it an EUI-64 (16 hex digits): FF FE before its octets; other text as it is.
+    """Return the UUID for an EUI-64 (16 hex digits): FF FE before its octets; other text unchanged.
 
-    A UUID of IEEE 1451.0-2007 that begins so would lie 291 degrees north, so none is made twice.
+    A UUID of IEEE 1451.0-2007 that begins so would be at 291 degrees north, so the two cannot collide.
     """
     digits = re.sub(r"[\s:-]", "", text).lower().removeprefix("0x")
     return f"{EUI64_PREFIX}{digits}" if re.fullmatch("[0-9a-f]{16}", digits) else text
@@ -166,7 +165,7 @@ def _form_of(path: Path, text: str) -> str:
 
 @dataclass
 class _Element:
-    """An element that is still open: its own fields, and the UUIDs that stand in it as children."""
+    """An element that is still open: its own fields, and the UUIDs among its children."""
 
     tag: str
     line: int
@@ -181,7 +180,7 @@ class _Element:
         return {key: value for key, value in self.fields.items() if key in FIELDS}
 
     def take_field(self, line: int, tag: str, text: str) -> None:
-        """A child that is one field of this element."""
+        """Take a child that is one field of this element."""
         if tag == "uuid":
             self.uuids.append((line, text))
         else:
@@ -233,7 +232,7 @@ def _read_xml(text: str, reading: _WhitelistReader) -> None:
 
 
 def _refuse_long(text: str, separator: str, file: str, what: str) -> None:
-    """Raise BadDataError where two separators are too far apart; linear in the text, which no regex of a count is."""
+    """Raise BadDataError if two separators are too far apart; linear in the text, unlike a regex with a count."""
     at = 0
     while at < len(text):
         end = text.find(separator, at, at + _MAX_TAG)
@@ -290,7 +289,7 @@ def _add_several(element: _Element, own: dict[str, str], reading: _WhitelistRead
 
 
 def _is_entry_text(element: _Element, text: str, root: bool) -> bool:
-    """Whether the text of an element is a UUID by where it stands, or by how it looks."""
+    """True if the text of an element is a UUID by its position or its form."""
     if element.tag in _ENTRY_ELEMENTS:
         return True
     return bool(text) and (root or text[:2].lower() == "0x")
@@ -391,7 +390,7 @@ def _with_lines(text: str, *, inside: bool) -> Iterator[tuple[int, Any]]:
 
 @dataclass(frozen=True)
 class WhitelistPlan:
-    """What adding some entries would do: the ones to write, how many of them are new, and how many stay."""
+    """Preview of an addition: the entries to write, how many of them are new, and how many stay."""
 
     write: tuple[WhitelistEntry, ...]
     new: int
@@ -399,10 +398,9 @@ class WhitelistPlan:
 
 
 def plan_addition(station: Station, listed: Sequence[ListedNode]) -> WhitelistPlan:
-    """Hold entries against what is known; changes nothing.
+    """Check entries against the store; changes nothing.
 
-    Raises KeyMismatchError where a UUID is pinned to another key, PolicyError for a revoked node: then none may be
-    added.
+    Raises KeyMismatchError if a UUID is pinned to another key, PolicyError for a revoked node: then none may be added.
     """
     revoked = {revocation.uuid: revocation.why for revocation in station.policy.revocations()}
     uuids = [entry.uuid for entry in listed if entry.uuid in revoked]
@@ -474,10 +472,10 @@ def add(station: Station, plan: WhitelistPlan, *, source: str | None = None) -> 
 
 
 def remove(station: Station, uuid: bytes) -> bool:
-    """Take a node off the whitelist and forget its pinned key; False where there was neither.
+    """Take a node off the whitelist and forget its pinned key; False if there was neither.
 
     Epoch, sequence and link keys stay: they still count when the node comes back. A replaced board under the same UUID
-    can be pinned anew from here on.
+    can then be pinned again.
     """
     with station.transaction():
         pinned = is_pinned(station, uuid)
@@ -489,7 +487,7 @@ def remove(station: Station, uuid: bytes) -> bool:
 
 
 def is_pinned(station: Station, uuid: bytes) -> bool:
-    """Whether a key of this UUID is known, be it whitelisted or not."""
+    """True if a key of this UUID is known, whitelisted or not."""
     return station.pins.pinned(uuid) is not None
 
 
@@ -515,7 +513,10 @@ def form_of(path: Path, form: str | None) -> str:
 
 
 def render(entries: Iterable[WhitelistEntry], form: str) -> Iterator[str]:
-    """The whitelist as text, a line or more at a time: XML of the NCAP with our attributes, CSV with a header, JSON."""
+    """Yield the whitelist as text, a line or more at a time.
+
+    XML of the NCAP with our attributes, CSV with a header, or JSON.
+    """
     rows = map(as_dict, entries)
     if form == "json":
         yield json.dumps({"whitelist": list(rows)}, indent=1, ensure_ascii=False) + "\n"
@@ -545,12 +546,12 @@ def _xml_line(row: Mapping[str, Any]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """An attribute's value with its quotes (XML 1.0 section 2.3)."""
+    """Return an attribute's value with its quotes (XML 1.0 section 2.3)."""
     for character, entity in (("&", "&amp;"), ("<", "&lt;"), (">", "&gt;"), ('"', "&quot;")):
         text = text.replace(character, entity)
     return f'"{text}"'
 
 
 def _legal(text: str) -> str:
-    """What XML 1.0 can hold; a name that a node or an older version brought may have control characters."""
+    """Return text that XML 1.0 can hold; a node's or an older version's name may have control characters."""
     return "".join(character if character.isprintable() else "\ufffd" for character in text)

@@ -1,8 +1,8 @@
 """Step 6: stage every TEDS, commit, read back, compare (profile.md, "Writing to flash").
 
-Before that the charge of the node is asked: power that fails in the middle helps nobody (operation.md section 7). The
-initial NFC message says it to anyone; over the air the session asks for it (Power, 128.18). On a wired bus nodes are
-fed by the bus, and nobody asks. It is a hint: it delays a write, and decides nothing else.
+First the charge of the node is checked, as power that fails in the middle helps neither side (operation.md section 7).
+The initial NFC message contains it in plain; over the air the session asks for it (Power, 128.18). On a wired bus nodes
+are fed by the bus, and there is no check. It is a hint: it delays a write, and decides nothing else.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ _SMALLEST_PIECE = 48
 Progress = Callable[[int, int], None]
 """``progress(octets written, octets to write)``."""
 Low = Callable[[str], object]
-"""Asked, with a whole sentence, before a node with a low battery is written; raises where the answer is no."""
+"""Asks, with a whole sentence, before a node with a low battery is written; raises if the answer is no."""
 
 
 def wait_for_charge(question: str) -> None:
-    """The answer where nobody was asked: no. Raises PolicyError."""
+    """Refuse, as without a question there is no answer. Raises PolicyError."""
     raise PolicyError(
         question.removesuffix(" Write it?"), hint="Charge it first (leave it on the reader), or add --yes."
     )
@@ -59,7 +59,7 @@ def wait_for_charge(question: str) -> None:
 
 @dataclass(frozen=True)
 class WriteResult:
-    """What a write did: octets staged (0 where the node had it all), seconds, and what was read back."""
+    """Result of a write: octets staged (0 if the node had it all), seconds, and what was read back."""
 
     octets: int
     seconds: float
@@ -79,11 +79,11 @@ def write(
 ) -> WriteResult:
     """Bring a signed image onto the node, inside the open session, and prove by reading that it is there.
 
-    ``present`` is what the node was read to hold in this session: blocks that are the same are not sent again.
-    ``facts`` are remembered of the node once it is written. Raises NodeRefusedError with the node's reason, PolicyError
-    where the image is older than what the node has, or so far ahead that more than one step of 65,536 would be needed
-    and no person said so (``jump``): that uses up the sequence of the node for good; where ``low`` is not content with
-    the node's charge. NotAuthenticError where the read-back differs.
+    ``present`` is the node's content as read in this session: equal blocks are not sent again. ``facts`` are recorded
+    of the node once it is written. Raises NodeRefusedError with the node's reason, PolicyError if the image is older
+    than what the node has, or so far ahead that more than one step of 65,536 would be needed without a confirmation
+    (``jump``): that irreversibly uses up the sequence of the node; if ``low`` rejects the node's charge.
+    NotAuthenticError if the read-back differs.
     """
     started = time.monotonic()
     signed = security.decode(image.blocks[SECURITY])
@@ -116,7 +116,7 @@ def write(
 
 
 def _tell_written(station: Station, image: Image, known: NodeRecord, sequence: int) -> None:
-    """Tell the plant which datasheet the node has now, and what it was made of."""
+    """Report to the plant which datasheet the node has now, and its origin."""
     octets = image.security
     if station.plant.joined is not None and octets is not None:
         station.plant.record_event(
@@ -142,7 +142,7 @@ def _conclude(
     octets: int,
     sequence: int,
 ) -> None:
-    """Record what was read back, and whether it is what was written; raises NotAuthenticError where it is not."""
+    """Record what was read back; raises NotAuthenticError if it is not what was written."""
     differing = [block for block in image if back.blocks.get(block) != image.blocks[block]]
 
     identity, profile = node.proven, facts.get("profile")
@@ -184,7 +184,7 @@ def _require_charge(node: Conversation, low: Low) -> None:
 
 
 def _percent(node: Conversation) -> int | None:
-    """Per cent, None where nobody knows, or where the node is fed."""
+    """Return per cent, None if it is unknown, or if the node is fed."""
     if node.charging is not None and node.charging.battery_percent is not None:
         return node.charging.battery_percent
     if node.tapped or node.wired or not node.sealed:
@@ -224,7 +224,7 @@ def _require_newer(station: Station, uuid: bytes, signed: SecurityTeds, identity
 
 
 def _commit(station: Station, node: Conversation, image: Image, has: Image | None, progress: Progress | None) -> int:
-    """Stage what is not there yet and commit; starts over where the session (and the staging with it) is lost."""
+    """Stage what is not there yet and commit; starts over if the session (and the staging with it) is lost."""
     skip = _blocks_there(station, image, has)
     for _ in range(_STARTS - 1):
         try:
@@ -270,11 +270,11 @@ def _is_there(node: Conversation, image: Image) -> bool:
 
 
 def _stage(station: Station, node: Conversation, image: Image, skip: set[BlockId], progress: Progress | None) -> int:
-    """Write every block but those of ``skip`` into the node's staging; returns the octets written.
+    """Write every block but those of ``skip`` into the node's staging; return the octets written.
 
     The Security TEDS is the last (profile.md, "Writing to flash"): a node that cannot rewind may count on it, and the
-    others go while the sequence is on its way to the disk, which the signature waits for. Where frames are lost the
-    pieces shrink: a short one comes through where a long one never would.
+    others go while the sequence is on its way to the disk, which the signature waits for. If frames are lost the pieces
+    shrink: a short one comes through where a long one never would.
     """
     piece = node.identity.max_message - WRITE_OVERHEAD
     blocks = [block for block in sorted(image, key=lambda block: block == SECURITY) if block not in skip]
