@@ -176,7 +176,7 @@ class Daemon:
             self.virtuals.start()
 
     def _observe(self) -> None:
-        """What the command line does beside us is seen within a second."""
+        """Notice changes by the command line within a second."""
         while not self._stop.wait(_LOOK):
             self._look_at_vault()
             version = self.station.version()
@@ -216,12 +216,12 @@ class Daemon:
                 watch.on_sighting(sighting)
 
     def _free_again(self, uuid: str) -> None:
-        """A node was looked at, or provisioned: now it may be one that is measured."""
+        """Report a node that was inspected, or provisioned: now it may be measured."""
         if self.directory.seen(uuid).present:
             self.measurements.on_sighting(uuid)
 
     def serve_node(self, node: Conversation) -> bool:
-        """Whether somebody asked for this node, or it is to be taken up; then that was done."""
+        """Do what was requested for this node, or take it up; False if there was nothing to do."""
         before = node.identity.state
         served = self.node_jobs.serve(node) or self.adopting.serve(node)
         if served or node.identity.state != before:  # what a measurement refused it for may be gone
@@ -278,7 +278,7 @@ class Daemon:
         }
 
     def hello(self) -> dict[str, Any]:
-        """The first message of /live."""
+        """Return the first message of /live."""
         return {"type": "hello", "version": __version__, "station": self.station.name, "time": time.time()}
 
     @property
@@ -287,9 +287,9 @@ class Daemon:
         return self.station.measurements.detection
 
     def set_detection(self, mode: str) -> None:
-        """Change the mode, and look at all links anew; raises UsageError.
+        """Change the mode, and inspect all links again; raises UsageError.
 
-        What was found in another mode is forgotten until it is found again; in the same one it stays.
+        Nodes found in another mode are forgotten until they are found again; in the same one they stay.
         """
         if mode not in get_args(Detection):
             raise UsageError(f"{mode!r} is not a detection mode.", hint="Use transparent or whitelist.")
@@ -312,14 +312,14 @@ class Daemon:
         return self.directory.nodes()
 
     def known(self, text: str) -> str:
-        """The UUID that a path names, of a node that something is known of; raises NotFoundError, UsageError."""
+        """Return the UUID that a path names, of a known node; raises NotFoundError, UsageError."""
         uuid = self.resolve(text)
         if not self.directory.known(uuid) and not self.station.nodes.is_known(bytes.fromhex(uuid)):
             raise NotFoundError(f"No node matches {uuid!r}.", hint="See /nodes.")
         return uuid
 
     def resolve(self, text: str) -> str:
-        """The UUID that a word names: whole, or a prefix or name as everywhere; raises NotFoundError, UsageError."""
+        """Return the UUID that a text names: whole, a prefix, or a name; raises NotFoundError, UsageError."""
         digits = text.lower().removeprefix("0x")
         if self.directory.known(digits):
             return digits
@@ -332,7 +332,7 @@ class Daemon:
             raise
 
     def login_url(self, *, read_only: bool = False) -> str:
-        """The page's address with a token that works once; raises UsageError where no page is served."""
+        """Return the page's address with a token that works once; raises UsageError if no page is served."""
         if self.url is None:
             raise UsageError(
                 "The station is not serving its page.", hint="Restart it with --http: ncap run --http 127.0.0.1:8351"
@@ -353,7 +353,7 @@ class Daemon:
         ]
 
     def make_group(self, name: str, uuids: list[str]) -> None:
-        """A new group; raises UsageError."""
+        """Make a new group; raises UsageError."""
         with self.station.lock("group create"):
             self.station.groups.create(name, [bytes.fromhex(uuid) for uuid in uuids])
         self._group_changed(name)

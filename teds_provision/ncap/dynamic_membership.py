@@ -1,9 +1,11 @@
-"""The nodes of one measurement that takes in whoever comes (``ncap run --measure``; ncap.md, "Measure what comes").
+"""The nodes of one measurement that takes in nodes as they come (``ncap run --measure``.
 
-A node that answers on a bus and is meant joins: its turn is taken at once, before anybody else looks at it, its room on
-the bus is known from the datasheet that is kept, and its keeper is started. One that is lost leaves, gives its turn and
-its room back, and joins again when it answers, on whichever bus. Nobody else notices: nothing that runs is slowed, and
-a node that is looked for is asked at its own address.
+Ncap.md, "Measure what comes").
+
+A selected node that answers on a bus joins: its lock is taken at once, before any other part works on it, its room on
+the bus is known from the stored datasheet, and its supervisor is started. A lost one leaves, gives its lock and its
+room back, and joins again when it answers, on whichever bus. Others are not affected: no running stream is slowed, and
+a lost node is asked at its own address.
 """
 
 from __future__ import annotations
@@ -64,7 +66,7 @@ class _WaitingNode:
 
 @dataclass
 class _LostNode:
-    """A node that was lost: where it is asked, when next, and since when."""
+    """A lost node: where it is asked, when next, and since when."""
 
     sighting: Sighting
     since: float
@@ -80,12 +82,12 @@ class _Member:
 
 
 class DynamicMembership:
-    """Who is in, who waits, and why; :meth:`work` is called again and again by the measurement's thread.
+    """Who is in, who waits, and why; the measurement's thread calls :meth:`work` repeatedly.
 
-    ``joined`` and ``left`` are told each node (UUID in hex), ``waiting`` each that cannot join, and why; ``past`` each
-    that is meant no more, or waited and has gone: what was told of it is of no use to anybody.
-    ``elsewhere``: whether another measurement has a node.
-    ``budget`` is how many messages a second may go to topics, None where none do; ``rows``: arrays go to them too.
+    ``joined`` and ``left`` receive each node (UUID in hex), ``waiting`` each that cannot join, and why; ``past`` each
+    that is no longer selected, or waited and has gone: earlier notices about it are obsolete. ``elsewhere`` returns
+    True if another measurement has a node. ``budget`` is how many messages a second may go to topics, None if none do;
+    ``rows``: arrays go to them too.
     """
 
     def __init__(
@@ -129,7 +131,7 @@ class DynamicMembership:
     # -- from the threads of the look-outs ---------------------------------------------------------------------------
 
     def on_sighting(self, uuid: str) -> None:
-        """A node answered on a bus: its turn is taken where it is meant and free."""
+        """Handle a node that answered on a bus: take its lock if it is selected and free."""
         with self._guard:
             known = uuid in self._members or uuid in self._arrived
             waits = self._waits.get(uuid)
@@ -149,9 +151,9 @@ class DynamicMembership:
         return sum(self._directory.seen(uuid).present and self._elsewhere(uuid) for uuid in list(self._others))
 
     def _says_factory(self, uuid: str) -> bool:
-        """Whether it says that it has no key: one that was refused here a moment ago is left to whoever adopts it.
+        """True if its Identify reports no key: a node that was refused here a moment ago is left to the adopter.
 
-        That is a hint, as anyone may send it: it costs the half minute until a refused node is tried again anyway.
+        That is a hint, as any device may send it: it costs the half minute until a refused node is tried again anyway.
         """
         sighting = self._buses.presence.seen_at(bytes.fromhex(uuid))
         return sighting is not None and sighting.identity.state == NodeState.FACTORY
@@ -173,11 +175,11 @@ class DynamicMembership:
         self.news.set()
 
     def look_who_is_meant(self) -> None:
-        """See anew who is meant, as after a change by another process; from any thread."""
+        """Re-evaluate the selection, as after a change by another process; from any thread."""
         self._anew.set()
 
     def part(self, uuid: str, why: str) -> None:
-        """Let a node go for good; it may come again."""
+        """Remove a node; it may come again."""
         with self._guard:
             member = self._members.get(uuid)
         if member is not None and member.supervisor is not None:
@@ -213,7 +215,7 @@ class DynamicMembership:
             self._join(uuid, measurement)
 
     def end(self) -> None:
-        """Everybody's turn is given back; the measurement has ended, or ends."""
+        """Release all locks; the measurement has ended, or ends."""
         for uuid in list(self._members):
             self._release(uuid)
         with self._guard:
@@ -235,7 +237,7 @@ class DynamicMembership:
         self.news.clear()
 
     def _follow_the_store(self, now: float) -> None:
-        """What another process changed (a name, a group, a ban, a key) changes who is meant."""
+        """Re-evaluate the selection after a change by another process (a name, a group, a ban, a key)."""
         version = self._station.version()
         if now - self._welcomed >= WELCOMING:
             self._welcomed = now
@@ -263,7 +265,7 @@ class DynamicMembership:
                 self.on_sighting(uuid)
 
     def _reserve(self, uuid: str) -> None:
-        """Say what it wants of its bus before the first of those that come together is given its part."""
+        """Report a node's share of its bus before the first of those that come together gets its part."""
         sighting = self._buses.presence.seen_at(bytes.fromhex(uuid))
         if sighting is None:
             return
@@ -380,7 +382,7 @@ class DynamicMembership:
         return self._buses.bus_of(sighting).share.room if sighting is not None else 0.0
 
     def _ask(self, sighting: Sighting) -> None:
-        """Ask a lost node where it was; where it answers, it is seen, and so joins."""
+        """Ask a lost node at its last place; an answer is a sighting, and so it joins."""
         with suppress(LinkError, KeyError):
             lookout = self._buses.bus_of(sighting).discovery
             if isinstance(sighting.port, CanPort) and isinstance(lookout, CanDiscovery):

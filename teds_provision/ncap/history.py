@@ -131,7 +131,7 @@ class _Bins:
         self._high[slots] = ((apart.view(np.uint32).astype(np.uint64) + 0xFFFF) >> 16).astype(np.uint16)
 
     def between(self, first: int, last: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """Number, least, greatest and counts of the bins from ``first`` to ``last`` in which something happened."""
+        """Return number, least, greatest and counts of the non-empty bins from ``first`` to ``last``."""
         numbers = np.arange(max(first, self.newest - self.size + 1, 0), min(last, self.newest) + 1)
         slots = numbers % self.size
         nothing = np.zeros(len(slots), np.int64)
@@ -186,7 +186,7 @@ class _Channel:
 
 @dataclass
 class _Stream:
-    """Where the samples of a stream go on: a gap before them was lost."""
+    """Expected continuation of a stream: samples in a gap before it were lost."""
 
     run: tuple[int, int | None]
     expected: int
@@ -205,7 +205,7 @@ class History:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Take in what comes, in a thread of its own, until :meth:`close`."""
+        """Take in blocks, in a thread, until :meth:`close`."""
         self._thread = threading.Thread(target=self._run, name="past", daemon=True)
         self._thread.start()
 
@@ -220,7 +220,7 @@ class History:
         self._waiting.append(tuple(facts))
 
     def block(self, block: Block) -> None:
-        """Samples of a stream; a test pattern is no measurement."""
+        """Queue samples of a stream; a test pattern is no measurement."""
         if block.test_pattern or not len(block.time):
             return
         self._waiting.append(block)
@@ -337,7 +337,7 @@ class History:
 
 
 def _rate(hour: _Bins) -> float | None:
-    """Samples a second of the last ten whole seconds in which there were some; None where they are long past."""
+    """Return samples a second of the last ten whole seconds that have any; None if they are long past."""
     newest = hour.newest
     numbers, _, _, counts = hour.between(newest - 10, newest - 1)
     if not len(numbers) or newest < time.time() - 60:
@@ -346,7 +346,7 @@ def _rate(hour: _Bins) -> float | None:
 
 
 def _bins_of(times: NDArray[Any], width: float) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Numbers of the bins of ascending times, each once, and where each begins among them."""
+    """Return numbers of the bins of ascending times, each once, and where each begins among them."""
     numbers = np.floor(np.maximum.accumulate(times) / width + _EDGE).astype(np.int64)
     starts = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 1))
     return numbers[starts], starts

@@ -1,8 +1,8 @@
-"""What happens now, to many clients: values thinned to what a page can draw, and events.
+"""Live values and events to many clients: values thinned to what a page can draw.
 
-Blocks come from the hearing threads and are only put aside. Every BEAT they become one message, which is encoded once
-for all clients. A client has one slot for values: the newest wins, what it missed is counted and told to it. Events are
-never thinned; a client that leaves too many unread is told to ask anew (``resync``).
+Blocks come from the receiver threads and are only queued. Every BEAT they become one message, which is encoded once for
+all clients. A client has one slot for values: the newest wins, what it missed is counted and reported to it. Events are
+never thinned; a client that leaves too many unread is sent ``resync``.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Key = tuple[str, int]
 
 @dataclass(frozen=True)
 class LastValue:
-    """The newest value of a channel: SI unit of the datasheet, None where it is not valid; unix seconds."""
+    """The newest value of a channel: SI unit of the datasheet, None if it is not valid; unix seconds."""
 
     value: float | None
     raw: Any
@@ -54,7 +54,7 @@ class LastValue:
 class LiveClient:
     """One client. ``wait`` gives the next messages for it, each a JSON text.
 
-    ``reader``: it may only read, so it is told no files and users of this machine.
+    ``reader``: it may only read, so it receives no files and users of this machine.
     """
 
     def __init__(self, *, reader: bool = False) -> None:
@@ -74,7 +74,7 @@ class LiveClient:
         self._news.set()
 
     def event(self, text: str) -> None:
-        """Kept in order; of too many none is kept, and the client is told to ask anew."""
+        """Queue an event, in order; if there are too many none is kept, and the client is sent ``resync``."""
         if len(self._events) >= _EVENTS:
             self._events.clear()
             text = json.dumps({"type": "resync"})
@@ -82,7 +82,7 @@ class LiveClient:
         self._news.set()
 
     async def wait(self) -> list[str]:
-        """The messages that are due, at least one."""
+        """Return the messages that are due, at least one."""
         await self._news.wait()
         self._news.clear()
         found = list(self._events)
@@ -127,7 +127,7 @@ class Live:
     # -- from any thread ---------------------------------------------------------------------------------------------
 
     def block(self, block: Block) -> None:
-        """Samples of a stream."""
+        """Queue samples of a stream."""
         self.history.block(block)
         with self._lock:
             if len(self._waiting) >= _WAITING:
@@ -136,14 +136,14 @@ class Live:
             self._waiting.append(block)
 
     def learn(self, facts: Iterable[ChannelFacts]) -> None:
-        """What is known of channels: no line is drawn from one end of a full turn to the other."""
+        """Record facts of channels: no line is drawn from one end of a full turn to the other."""
         every = list(facts)
         self.history.learn(every)
         turning = {facts.key for facts in every if facts.full_turn}
         self._turning = (self._turning - {facts.key for facts in every}) | turning
 
     def event(self, event: str, **facts: Any) -> None:
-        """Something happened: a node, a measurement, a link, a step; told to every client in order."""
+        """Send an event about a node, a measurement, a link or a step to every client, in order."""
         line = {"event": event, "time": time.time(), **facts}
         self.told(line)
         text = json.dumps({"type": "event", **line})
@@ -152,19 +152,19 @@ class Live:
             loop.call_soon_threadsafe(self._broadcast, text, json.dumps({"type": "event", **for_readers(line)}))
 
     def last(self, uuid: str, channel: int) -> LastValue | None:
-        """The newest value of a channel."""
+        """Return the newest value of a channel."""
         return self._last.get((uuid, channel))
 
     # -- in the loop -------------------------------------------------------------------------------------------------
 
     def join(self, *, reader: bool = False) -> LiveClient:
-        """A new client."""
+        """Add a client."""
         listener = LiveClient(reader=reader)
         self._listeners.add(listener)
         return listener
 
     def leave(self, listener: LiveClient) -> None:
-        """A client that has gone."""
+        """Remove a client."""
         self._listeners.discard(listener)
 
     @property
@@ -195,7 +195,7 @@ class Live:
             listener.event(for_reader if listener.reader else text)
 
     def _gather(self, seconds: float) -> dict[str, list[list[float | None]]]:
-        """What came since the last beat, by ``uuid/channel``: times and values."""
+        """Return what came since the last beat, by ``uuid/channel``: times and values."""
         with self._lock:
             blocks, self._waiting = self._waiting, deque()
         if not blocks and not self._channels:
@@ -241,11 +241,11 @@ class Live:
 def thinned(
     times: NDArray[Any], values: NDArray[Any], most: int, *, before: float | None = None
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """At most ``most`` of these points, among them the least and the greatest of each of ``most // 2`` parts.
+    """Return at most ``most`` of these points, among them the least and the greatest of each of ``most // 2`` parts.
 
-    Points stay in order and are points that were measured; of a part without a value its first is kept, as a gap.
-    ``before`` is given for angles (rad) that wrap at a full turn, and is the one that came last: where they go on at
-    the other end of the turn, a gap is put in, and there are fewer parts if need be.
+    Points stay in order and are measured ones; of a part without a value its first is kept, as a gap. ``before`` is the
+    last point before, for angles (rad) that wrap at a full turn: where they continue at the other end of the turn, a
+    gap is inserted, and there are fewer parts if necessary.
     """
     if before is None:
         return _extremes(times, values, most)

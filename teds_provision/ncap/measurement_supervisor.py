@@ -52,7 +52,7 @@ LETTING_GO: Final = 4.0  # seconds for a node's session to end in order; whoever
 ANSWERING: Final = 1.0  # seconds for a node that has another address now
 LONGEST_LOAN: Final = 900.0  # seconds after which a node is measured again, whatever its writer does
 SCALAR_RATE: Final = 10.0
-"""Values a second on a topic of one value, where a measurement does not say."""
+"""Values a second on a topic of one value, if a measurement does not set it."""
 
 
 @dataclass
@@ -81,9 +81,9 @@ class NodeLoan:
 
 
 class MeasurementSupervisor:
-    """All of them. ``admits`` says of a set point that came by a topic whether it may pass.
+    """All measurements of the service. ``admits`` decides whether a set point from a topic may pass.
 
-    ``dead_man`` in ms holds for a measurement that is begun without one.
+    ``dead_man`` in ms is for a measurement that is begun without one.
     """
 
     def __init__(
@@ -118,9 +118,9 @@ class MeasurementSupervisor:
             self._begin(kept)
 
     def match(self, expression: str, *, rate: float | None = None, frozen: bool = False) -> None:
-        """Measure whoever comes and is meant, for the life of this process (``ncap run --measure``).
+        """Measure selected nodes as they come, for the life of this process (``ncap run --measure``).
 
-        Raises UsageError, NotFoundError for an expression that says nothing, or names a group that is not there.
+        Raises UsageError, NotFoundError for an invalid expression, or a group that does not exist.
         """
         NodeMatch.parse(expression).require_groups(self._station)
         same = (expression, rate, frozen)
@@ -132,9 +132,9 @@ class MeasurementSupervisor:
         self._begin(KeptMeasurement("run", match=expression, rate=rate, frozen=frozen, dead_man=self._dead_man))
 
     def unverified(self, *, rate: float | None = None) -> None:
-        """Measure every node that describes itself by what nobody has signed, marked so (``--adopt --unverified``).
+        """Measure every self-describing node by its unsigned datasheet, marked so (``--adopt --unverified``).
 
-        One that is signed meanwhile is measured on as what it is then, where no other measurement takes it.
+        One that is signed meanwhile is measured on as signed, if no other measurement takes it.
         """
         self._unverified = UnsignedNodes()
         for name in (self._unverified.text, _ADOPTED):
@@ -142,7 +142,7 @@ class MeasurementSupervisor:
 
     @contextmanager
     def unmeasured(self, uuid: str, why: str) -> Iterator[None]:
-        """A node that is measured unverified is nobody's for the length of the block, in which it may be signed."""
+        """Release a node that is measured unverified for the block, in which it may be signed."""
         loan = NodeLoan(uuid, why)
         with self._guard:
             every = [
@@ -168,7 +168,7 @@ class MeasurementSupervisor:
             self.return_node(loan)
 
     def on_sighting(self, uuid: str) -> None:
-        """A node answered on a bus; called before anybody else looks at it."""
+        """Handle a node that answered on a bus; called before any other part works on it."""
         with self._guard:
             every = [running.membership for running in self._running.values() if running.membership is not None]
         for newcomers in every:
@@ -322,17 +322,17 @@ class MeasurementSupervisor:
         return found
 
     def measurement_of(self, uuid: str) -> str | None:
-        """The measurement that has a node."""
+        """Return the measurement that has a node."""
         with self._guard:
             return next((key for key, running in self._running.items() if uuid in running.uuids), None)
 
     def is_measured(self, uuid: str) -> bool:
-        """Whether a node is in a session of a measurement now."""
+        """True if a node is in a session of a measurement now."""
         job = self._job_of(uuid)
         return job is not None and job.measurement is not None and self._node_locks.holder(uuid) is not None
 
     def facts_of(self, uuid: str) -> StationFacts | None:
-        """What the sinks of the running measurement of a node were told of the station's names; None: none runs."""
+        """Return the station facts that the sinks of a node's running measurement have; None if none runs."""
         job = self._job_of(uuid)
         measurement = job.measurement if job is not None else None
         return measurement.facts if measurement is not None else None
@@ -348,7 +348,7 @@ class MeasurementSupervisor:
 
     @contextmanager
     def session(self, uuid: str) -> Iterator[VerifiedSession | None]:
-        """The session in which a node is measured, for one more command; None where there is none now."""
+        """Give the session in which a node is measured, for one more command; None if there is none now."""
         job = self._job_of(uuid)
         measurement = job.measurement if job is not None else None
         if measurement is None:
@@ -360,10 +360,10 @@ class MeasurementSupervisor:
     # -- nodes that a command of this home writes to -----------------------------------------------------------------
 
     def lend_node(self, loan: NodeLoan) -> bool:
-        """Let a node go until :meth:`return_node`, so that somebody can write to it; False where nobody measures it.
+        """Release a node until :meth:`return_node`, so that a writer can use it; False if it is not measured.
 
-        It may be let go to several at once, who take turns at the node. Raises NodeBusyError where its session did not
-        end in order within :data:`LETTING_GO` seconds; then it is measured on.
+        It may be lent to several at once, who take turns at the node. Raises NodeBusyError if its session did not end
+        in order within :data:`LETTING_GO` seconds; then it is measured on.
         """
         with self._lending:
             if loan.ended:
@@ -385,7 +385,7 @@ class MeasurementSupervisor:
         )
 
     def return_node(self, loan: NodeLoan) -> None:
-        """Measure it again, unless somebody else still has it."""
+        """Measure it again, unless another borrower still has it."""
         self._ask_where_it_is(bytes.fromhex(loan.uuid))
         with self._lending:
             loan.ended = True
@@ -404,7 +404,7 @@ class MeasurementSupervisor:
             self.on_sighting(loan.uuid)
 
     def _ask_where_it_is(self, uuid: bytes) -> None:
-        """A node that was given another address does not announce it: it is asked there, as the store knows it."""
+        """Ask a node that was given another address, which it does not announce, at the store's address."""
         seen, record = self._buses.presence.seen_at(uuid), self._station.nodes.get(uuid)
         if seen is None or record is None or record.can_address in (None, seen.address):
             return
@@ -414,7 +414,7 @@ class MeasurementSupervisor:
                 lookout.identify_at(record.can_address, ANSWERING)
 
     def sheet(self, uuid: str) -> Image | None:
-        """The datasheet of a node that is measured: the one that its session verified, and that nobody may change."""
+        """Return the datasheet of a measured node: the one that its session verified, and that cannot change."""
         with self.session(uuid) as trusted:
             if trusted is None:
                 return None
@@ -436,7 +436,7 @@ class MeasurementSupervisor:
         return {"used": round(self._rate, 1), "limit": BUDGET}
 
     def clock_error(self) -> float | None:
-        """The worst bound of a node's clock, seconds; None where nothing is measured."""
+        """Return the worst bound of a node's clock, seconds; None if nothing is measured."""
         with self._guard:
             reports = [report for running in self._running.values() for report in running.reports.values()]
         found = [report.get("clock_error") for report in reports if report["state"] == "running"]
@@ -558,7 +558,7 @@ class MeasurementSupervisor:
         return NodeMatch.parse(kept.match or "")
 
     def _is_for(self, uuid: str, running: RunningMeasurement) -> bool:
-        """Whether a node is another measurement's: what nobody has signed is that of what is unverified."""
+        """True if a node is another measurement's: unsigned nodes belong to the unverified one."""
         if self._unverified is None or running.kept.id == UnsignedNodes.text:
             return False
         return not self._unverified.why_not(self._station, bytes.fromhex(uuid))
@@ -574,7 +574,7 @@ class MeasurementSupervisor:
         )
 
     def _wait_for_members(self, running: RunningMeasurement) -> None:
-        """Who is meant by a frozen expression, as soon as somebody is: then they stay."""
+        """Wait until a frozen expression selects any node; then its members stay."""
         if running.kept.match is None:
             return
         match = NodeMatch.parse(running.kept.match)
@@ -596,10 +596,10 @@ class MeasurementSupervisor:
             running.stop.wait(1.0)
 
     def _run_open(self, running: RunningMeasurement) -> None:
-        """Measure whoever comes until it is stopped.
+        """Measure nodes as they come until it is stopped.
 
-        One measurement whose nodes come and go, so that its recordings and topics go on: one for each node would make
-        a file each, and have no budget in common.
+        One measurement whose nodes come and go, so that its recordings and topics go on: one for each node would make a
+        file each, and have no budget in common.
         """
         assert running.kept.match is not None
 
@@ -733,11 +733,11 @@ class MeasurementSupervisor:
             self._publish_state(running, *_state_of(running, running.job))
 
     def _is_of(self, uuid: str, running: RunningMeasurement) -> bool:
-        """Whether a node is this measurement's, or nobody's: what one that it has left says of it is past."""
+        """True if a node is this measurement's, or free: reports from one that it has left are obsolete."""
         return self.measurement_of(uuid) in (None, running.kept.id)
 
     def _tell_who_comes(self, running: RunningMeasurement, said: NodeReport, before: str | None) -> None:
-        """An event for each node that begins to be measured, is not any more, or waits, and why."""
+        """Send an event for each node that starts or stops being measured, or waits, and why."""
         if said.state == "running" and before != "running":
             state = "joined"
         elif said.state != "running" and before == "running":

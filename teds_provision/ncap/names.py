@@ -18,8 +18,8 @@ from teds_provision.station.station import Station
 class Names:
     """The names of one station, as sinks make them; ``is_measured`` freezes those of a node.
 
-    ``in_use`` gives what the sinks of its running measurement were told of the station: a node of the same name that
-    came since changes what is made for the next one, not what is published.
+    ``in_use`` returns the station facts of its running measurement: a node of the same name that came since changes the
+    names for the next one, not what is published.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class Names:
         self._made_of = -1  # the roster's count of changes
 
     def forget(self) -> None:
-        """A chosen name has changed: make them anew when somebody asks. Nodes and datasheets are followed anyway."""
+        """Drop cached names after a chosen name changed. Changes of nodes and datasheets are noticed anyway."""
         with self._guard:
             self._topics = None
         self._directory.touch()

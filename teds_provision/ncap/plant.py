@@ -1,6 +1,6 @@
-"""The plant beside the service: syncs at its start, when the registry says that something is new, and each minute.
+"""The plant beside the service: syncs at its start, on the registry's notification, and each minute.
 
-A registry that fails stops nothing: that it does is told once, and once that it is back.
+A registry that fails stops nothing: the failure is reported once, and once its end.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from teds_provision.protocol.plant.job import Job
 from teds_provision.station.station import Station
 
 EVERY: Final = 60.0
-"""Seconds between two syncs where nobody wakes us."""
+"""Seconds between two syncs without a notification."""
 MOST_SHOWN: Final = 20
 """Nodes in one answer to who holds a node."""
 _SOON: Final = 1.0
@@ -41,7 +41,7 @@ _EMPTY_PAGE: Final = 24 * 3600.0
 
 
 class PlantWatch:
-    """Follows the registry that this station joined; does nothing where it joined none."""
+    """Follows the registry that this station joined; does nothing if it joined none."""
 
     def __init__(self, station: Station, live: Live, changed: Callable[[], object]) -> None:
         self._station, self._live, self._changed = station, live, changed
@@ -53,7 +53,7 @@ class PlantWatch:
         self._look_again = 0.0
 
     def start(self) -> None:
-        """Begin; raises PolicyError where no registry was joined."""
+        """Begin; raises PolicyError if no registry was joined."""
         plant.apply_pages.require_roster(self._station)
         for run, name in ((self._run, "registry"), (self._listen, "registry listener")):
             self._threads.append(threading.Thread(target=run, name=name, daemon=True))
@@ -70,7 +70,7 @@ class PlantWatch:
             thread.join(_SOON)
 
     def status(self) -> dict[str, Any] | None:
-        """api.md, `/plant`; None where this station joined no registry. Reads the store alone."""
+        """Return the body of `/plant` (api.md); None if this station joined no registry. Reads the store alone."""
         record, roster = self._station.plant.joined, self._station.plant.roster
         if record is None or roster is None:
             return None
@@ -110,7 +110,7 @@ class PlantWatch:
         }  # fmt: skip
 
     def nodes(self, text: str) -> dict[str, Any]:
-        """api.md, `/plant/nodes`; raises PolicyError where no registry was joined."""
+        """Return the body of `/plant/nodes` (api.md); raises PolicyError if no registry was joined."""
         found = plant.status.nodes(self._station, plant.apply_pages.require_roster(self._station), text)
         first = list(islice(found, MOST_SHOWN + 1))
         return {"nodes": first[:MOST_SHOWN], "more": len(first) > MOST_SHOWN}
@@ -124,7 +124,10 @@ class PlantWatch:
         return found
 
     def job(self, text: str) -> dict[str, Any]:
-        """api.md, `/jobs/{id}`; raises NotFoundError. What a sync brought, and nobody took, is no job yet."""
+        """Return the body of `/jobs/{id}` (api.md); raises NotFoundError.
+
+        A synced job that was not taken yet is none.
+        """
         rows = [row for row in self._station.plant.line.jobs() if len(text) >= 4 and row.id.startswith(text.lower())]
         if len(rows) != 1:
             raise NotFoundError(f"{len(rows) or 'No'} jobs begin with {text[:64]}.", hint="GET /jobs lists them.")
@@ -157,7 +160,7 @@ class PlantWatch:
             self._wake.wait(_BUSY if busy else EVERY)
 
     def _sync(self) -> bool:
-        """One sync; True where another command of this home is at it."""
+        """Run one sync; True if another command of this home runs one."""
         station = self._station
         try:
             if self._transport is None:
@@ -200,7 +203,7 @@ class PlantWatch:
             self._changed()
 
     def _say_daily(self) -> None:
-        """An empty page each day: a station that says nothing for seven days counts as silent."""
+        """Write an empty page each day: a station without a page for seven days counts as silent."""
         station, roster = self._station, self._station.plant.roster
         chain = station.plant.tables.chains().get(station.fingerprint)
         if roster is None or chain is None or not chain.counted[0]:
@@ -213,7 +216,7 @@ class PlantWatch:
             plant.sync.close_page(station, roster, empty=True)
 
     def _listen(self) -> None:
-        """Wake the sync when the registry says that somebody did something."""
+        """Start a sync when the registry notifies of a change."""
         while not self._stop.is_set():
             try:
                 if self._listener is None:

@@ -61,7 +61,7 @@ class DaemonLock:
         os.close(self._descriptor)
 
     def listen(self) -> socket.socket:
-        """The listening Unix socket, for this user alone; what a killed daemon left is replaced."""
+        """Return the listening Unix socket, for this user alone; that of a killed daemon is replaced."""
         return listen_alone(self._home / SOCKET, 128)
 
 
@@ -69,9 +69,9 @@ Tell = Callable[[dict[str, Any]], None]
 
 
 def run(station: Station, settings: Settings, tell: Tell) -> None:
-    """Run until SIGTERM or Ctrl-C; ``tell`` gets the line that it is ready, then a line for each event.
+    """Run until SIGTERM or Ctrl-C; ``tell`` gets the ready line, then a line for each event.
 
-    Raises StoreLockedError where this home has a daemon, LinkError where the address is taken, UsageError.
+    Raises StoreLockedError if this home has a daemon, LinkError if the address is taken, UsageError.
     """
     require_safe(settings)
     station.released = lambda _uuid, _command: nullcontext()  # in this process the turns of each node see to that
@@ -130,7 +130,7 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
 
 
 def _ending(stop: asyncio.Event) -> Callable[[], None]:
-    """The first signal ends in order, a second one at once."""
+    """Return a handler: the first signal ends in order, a second one at once."""
 
     def end() -> None:
         if stop.is_set():
@@ -141,7 +141,7 @@ def _ending(stop: asyncio.Event) -> Callable[[], None]:
 
 
 async def _watchdog() -> None:
-    """Tell systemd that the loop lives, twice in the time that WATCHDOG_USEC allows."""
+    """Notify systemd that the loop lives, twice in the time that WATCHDOG_USEC allows."""
     allowed = os.environ.get("WATCHDOG_USEC", "")
     while allowed.isdecimal() and int(allowed) > 0:
         notify("WATCHDOG=1")
@@ -149,7 +149,7 @@ async def _watchdog() -> None:
 
 
 def notify(state: str) -> None:
-    """Tell systemd (sd_notify): one datagram to the socket that NOTIFY_SOCKET names; without one nothing."""
+    """Notify systemd (sd_notify): one datagram to the socket that NOTIFY_SOCKET names; without one nothing."""
     where = os.environ.get("NOTIFY_SOCKET", "")
     if not where.startswith(("/", "@")):
         return

@@ -1,4 +1,4 @@
-"""What `ncap run` was started with."""
+"""The settings with which `ncap run` was started."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from teds_provision.measure.verified_session import DEAD_MAN
 
 Detection = Literal["transparent", "whitelist"]
 _FIRST, _SOURCES = 0xF2, 6
-"""Addresses of daemons on a bus, 0xF2 to 0xF7: the command line, which has 0xF1 unless told otherwise, works beside."""
+"""Addresses of daemons on a bus, 0xF2 to 0xF7: the command line, with 0xF1 by default, works beside."""
 _LOCAL_NAMES: Final = ("localhost",)
 _MOST_PEM: Final = 1 << 20
 
@@ -29,14 +29,14 @@ _MOST_PEM: Final = 1 << 20
 class Settings:
     """``places`` are links as ``can:…`` and ``nfc:…``; ``detection`` None: as it was last set, else ``whitelist``.
 
-    ``adopt``: factory nodes of a wired bus get a key; ``yes``: what such a node says of itself is signed at once.
-    ``unverified``: they are measured by what they say of themselves, marked so.
-    ``http`` is (host, port) or None: then only the Unix socket of the home is served. ``sinks`` take what is measured,
-    beside those of each measurement; ``brokers`` are URLs by the names under which a measurement may name them;
-    ``record`` is a folder for a recording of each measurement. ``actuators``: whether set points may come by topics of
-    ROS. ``measure`` says whom to measure as they come, at ``rate`` in Hz at most; ``frozen``: only those who are meant
-    at the start. ``dead_man`` in ms holds for whatever is moved, where a measurement says no other. ``registry``:
-    whether the registry that was joined is followed. ``trace`` is an open one: every frame of every link is written.
+    ``adopt``: factory nodes of a wired bus get a key; ``yes``: such a node's own datasheet is signed at once.
+    ``unverified``: they are measured by their own datasheet, marked so. ``http`` is (host, port) or None: then only the
+    Unix socket of the home is served. ``sinks`` take what is measured, beside those of each measurement; ``brokers``
+    are URLs by the names under which a measurement may name them; ``record`` is a folder for a recording of each
+    measurement. ``actuators``: set points may come by topics of ROS. ``measure`` selects nodes to measure as they come,
+    at ``rate`` in Hz at most; ``frozen``: only those selected at the start. ``dead_man`` in ms is for all actuators
+    whose measurement has no other. ``registry``: the registry that was joined is followed. ``trace`` is an open one:
+    every frame of every link is written.
     """
 
     places: tuple[str, ...] = ()
@@ -63,12 +63,12 @@ class Settings:
 
 
 def own_source(station_id: str) -> int:
-    """A daemon's address on a bus, by the identity of its store: two stations on one bus seldom have the same."""
+    """Return a daemon's address on a bus, by the identity of its store: two stations on one bus seldom collide."""
     return _FIRST + zlib.crc32(station_id.encode()) % _SOURCES
 
 
 def with_source(place: str, source: int) -> str:
-    """A CAN place with a source address, unless it names one."""
+    """Return a CAN place with a source address, unless it names one."""
     link, _, where = place.partition(":")
     if link != "can" or "source=" in where.partition("?")[2]:
         return place
@@ -85,7 +85,7 @@ def parse_http(text: str) -> tuple[str, int]:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a server on this address; False for names that would have to be looked up."""
+    """True if only this machine reaches a server on this address; False for names that would have to be looked up."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -93,7 +93,7 @@ def is_loopback(host: str) -> bool:
 
 
 def _require_pair(certificate: Path, key: Path) -> None:
-    """Raise BadDataError where OpenSSL cannot serve with these two files; an encrypted key is not asked for."""
+    """Raise BadDataError if OpenSSL cannot serve with these two files; there is no prompt for an encrypted key."""
 
     def no_passphrase() -> str:
         raise BadDataError(
@@ -123,7 +123,7 @@ def require_places(settings: Settings) -> None:
 
 
 def require_safe(settings: Settings) -> None:
-    """Raise UsageError where the page would go to other machines without TLS, or with half of it."""
+    """Raise UsageError if the page would go to other machines without TLS, or with half of it."""
     if (settings.certificate is None) != (settings.key is None):
         raise UsageError("--tls-cert and --tls-key must be used together.", hint="Give both, or neither.")
     if settings.certificate is not None and settings.key is not None:

@@ -1,8 +1,8 @@
-"""Where the daemon's measurements go: the sinks it was started with, and those that a measurement names itself.
+"""Sinks of the daemon's measurements: those it was started with, and those that a measurement names itself.
 
-A request names a sink and never says where that is: ``ros1``, ``ros2``, a broker by its name (``mqtt``: the one that
-the daemon was started with; the others stand in config.toml), or a file by its bare name. So a token makes the daemon
-talk to no host, and read no file, that its owner did not name.
+A request names a sink but never its destination: ``ros1``, ``ros2``, a broker by its name (``mqtt``: the one that the
+daemon was started with; the others are in config.toml), or a file by its bare name. So a token makes the daemon contact
+no host, and read no file, that its owner did not name.
 """
 
 from __future__ import annotations
@@ -56,7 +56,10 @@ class DaemonSinks:
             self._brokers[name] = url
 
     def whole(self, spec: str) -> str:
-        """The words for a sink that a request names; a file lies in the folder of recordings. Raises UsageError."""
+        """Return the string of a sink that a request names; a file is in the folder of recordings.
+
+        Raises UsageError.
+        """
         if spec in _ROS or spec in self._brokers:
             return spec
         if not _NAME.match(spec) or Path(spec).suffix.lower() not in FILES:
@@ -68,7 +71,7 @@ class DaemonSinks:
         return str(self._folder() / spec)
 
     def open(self, spec: str, take: CommandTaker | None = None) -> Sink:
-        """The sink of a kept measurement, not yet opened; raises UsageError, also for a name that is gone."""
+        """Return the sink of a kept measurement, not yet opened; raises UsageError, also for a name that is gone."""
         if spec not in self._brokers and _BROKER.match(spec) and spec not in _ROS:
             raise UsageError(
                 f"Broker {spec!r} is no longer configured.",
@@ -77,9 +80,9 @@ class DaemonSinks:
         return open_sink(self._brokers.get(spec, spec), take)
 
     def more(self, kept: KeptMeasurement, take: CommandTaker | None) -> list[Sink]:
-        """The daemon's own sinks for one run of a measurement, without those that it names itself.
+        """Return the daemon's own sinks for one run of a measurement, without those that it names itself.
 
-        ``take`` takes set points of topics.
+        ``take`` receives set points of topics.
         """
         own = {self._brokers.get(spec, spec) for spec in kept.sinks}
         specs = [spec for spec in self._specs if spec not in own]
@@ -90,12 +93,12 @@ class DaemonSinks:
         return [open_sink(spec, take) for spec in specs]
 
     def moves(self, kept: KeptMeasurement) -> bool:
-        """Whether set points may come for this measurement: it allows it, so does the daemon, and a ROS carries it."""
+        """True if set points may come for this measurement: it and the daemon allow it, and it has a ROS sink."""
         return self.actuators and kept.actuators and bool(_ROS & {*self._specs, *kept.sinks})
 
     @property
     def take_set_points(self) -> bool:
-        """Whether set points come by topics for a measurement that allows it and names no sink of its own."""
+        """True if set points come by topics for a measurement that allows it and names no sink."""
         return self.actuators and bool(_ROS & set(self._specs))
 
     def _folder(self) -> Path:
@@ -116,7 +119,7 @@ def _require_broker(name: str, url: str) -> None:
 
 
 def sink_json(measurement: str, sink: Sink) -> dict[str, Any]:
-    """A sink as the API shows it, with what became of what it was given."""
+    """Return a sink as the API shows it, with its counters."""
     stats = sink.stats
     return {
         "measurement": measurement,
@@ -135,7 +138,7 @@ def sink_json(measurement: str, sink: Sink) -> dict[str, Any]:
 
 
 def for_readers(told: Any) -> Any:
-    """What a token that may only read is shown: files by their names, brokers without user and query."""
+    """Return the form for a read-only token: files by their names, brokers without user and query."""
     if isinstance(told, str):
         return _FOLDERS.sub("", _QUERY.sub(r"\1", _USER.sub(r"\1", told))) if "/" in told else told
     if isinstance(told, dict):

@@ -1,8 +1,8 @@
-"""Actuators: a set point is held for as long as it was asked for, then let go, and the node says that it is safe.
+"""Actuator leases: a set point is held for the requested time, then released, and the node confirms its safe state.
 
-What keeps an actuator moving is that somebody asks again. Each request holds it for some tenths of a second or some
-seconds; when the next one does not come (the page is closed, the browser died, the network is gone) the daemon lets go,
-and when the daemon dies the node's dead-man does (operation.md section 2). One thread for each actuator that is held.
+An actuator keeps moving only while requests keep coming. Each request holds it for some tenths of a second or some
+seconds; when the next one does not come (the page is closed, the browser died, the network is gone) the daemon releases
+it, and when the daemon dies the node's dead-man does (operation.md section 2). One thread for each held actuator.
 """
 
 from __future__ import annotations
@@ -106,11 +106,11 @@ class ActuatorLeases:
         self._guard = threading.Lock()
 
     def state(self, uuid: str, channel: int) -> dict[str, Any] | None:
-        """What an actuator was told last, and whether it is known to be safe."""
+        """Return an actuator's last set point, and whether it is known to be safe."""
         return self._last.get((uuid, channel))
 
     def admits(self, command: SetPointCommand) -> bool:
-        """Whether a set point that came by a topic may pass: not while a request holds its actuator. Told once."""
+        """Return False for a set point from a topic while a request holds its actuator. Reported once."""
         with self._guard:
             held = self._held.get((command.uuid, command.channel))
         if held is None or held.ended:
@@ -143,7 +143,7 @@ class ActuatorLeases:
     def _ordered(
         self, uuid: str, channel: int, value: float, unit: str | None, seconds: float
     ) -> tuple[_HeldActuator, int]:
-        """Give the order to the thread of this actuator, a new one where there is none; and its number there."""
+        """Give the order to this actuator's thread, a new one if there is none; return both thread and order number."""
         while True:
             held, fresh = self._held_for(uuid, channel, value, unit)
             with held.news:
@@ -159,7 +159,7 @@ class ActuatorLeases:
                 return held, held.order.number
 
     def _held_for(self, uuid: str, channel: int, value: float, unit: str | None) -> tuple[_HeldActuator, bool]:
-        """The actuator as it is held now, or a new one; and whether it is new."""
+        """Return the actuator as it is held now, or a new one; and whether it is new."""
         key = (uuid, channel)
         with self._guard:
             held = self._held.get(key)
@@ -180,7 +180,7 @@ class ActuatorLeases:
         return {"applied": held.applied, "until": time.time() + seconds, "safe": False}
 
     def release_actuator(self, uuid: str, channel: int) -> dict[str, Any]:
-        """Let go now; ``safe`` is what the node itself said, None where it did not say."""
+        """Release it now; ``safe`` is the node's own report, None without one."""
         with self._guard:
             held = self._held.get((uuid, channel))
         if held is None:
@@ -256,7 +256,7 @@ class ActuatorLeases:
             yield open_trusted(self._station, node, by="ncap")
 
     def _hold(self, held: _HeldActuator, session: Measured) -> None:
-        """Claim, feed until it is let go or nobody asks again, let go."""
+        """Claim, feed until it is released or no request follows, release."""
         actuator: HeldActuator | None = None
         unit: str | None = None
         answered = 0
@@ -292,7 +292,10 @@ class ActuatorLeases:
 
     @staticmethod
     def _wait_for_the_one_before(held: _HeldActuator) -> None:
-        """Its claim ends first: two of one session cannot have an actuator, and it says that it is safe."""
+        """Wait for the end of an earlier claim: two of one session cannot have an actuator.
+
+        That end reports the safe state.
+        """
         before, held.before = held.before, None
         if before is not None:
             with before.news:
@@ -300,7 +303,7 @@ class ActuatorLeases:
 
     @staticmethod
     def _until_there(held: _HeldActuator, session: Measured) -> None:
-        """A measurement that was begun just now is opening its session."""
+        """Wait for a measurement that has just begun to open its session."""
         end = time.monotonic() + _OPENING
         while time.monotonic() < end and not held.let_go:
             with session(held.uuid) as trusted:
@@ -312,7 +315,7 @@ class ActuatorLeases:
     def _claimed(
         self, trusted: VerifiedSession, held: _HeldActuator, order: _SetPointOrder, *, again: bool
     ) -> HeldActuator:
-        """The actuator, claimed; the limits are looked at before anything is claimed."""
+        """Return the claimed actuator; the limits are checked before anything is claimed."""
         actuator = HeldActuator(trusted, held.channel, unit=order.unit, dead_man=self._dead_man)
         actuator.octets_of(order.value)
         if not again:
@@ -344,4 +347,4 @@ class ActuatorLeases:
 
 
 def _quiet(_notice: Notice) -> None:
-    """The request answers."""
+    """Ignore notices: the request has the answer."""

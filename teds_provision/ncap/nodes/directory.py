@@ -1,6 +1,6 @@
-"""What is known of every node, as the API shows it. Written by the threads of links and measurements, read by all.
+"""Everything known of each node, as the API shows it. Written by the threads of links and measurements, read by all.
 
-The rows of the store and the datasheets are read when something changed, not when somebody asks.
+The rows of the store and the datasheets are read after a change, not for each request.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from teds_provision.teds.sheet import Channel, Sheet
 
 _READ_NOW: Final = "read now"
 MOST_GONE: Final = 200
-"""Nodes that left and that the store does not know, kept to be shown: in transparent mode anybody can make up more."""
+"""Number of nodes that left and are not in the store, kept to be shown: in transparent mode they can be invented."""
 
 
 @dataclass
 class NodePresence:
-    """What the links say of one node now."""
+    """State of one node on the links now."""
 
     place: str = ""
     address: int | None = None
@@ -71,7 +71,7 @@ class NodeDirectory:
     # -- the store ---------------------------------------------------------------------------------------------------
 
     def refresh(self, uuids: Iterable[str] | None = None) -> None:
-        """Read the rows of these nodes anew, or of all that the store knows; datasheets when somebody asks for them."""
+        """Read the rows of these nodes again, or of all in the store; datasheets when they are requested."""
         with self._reading:  # what was read earlier never takes the place of what was read later
             every = self._station.nodes.find(Search()) if uuids is None else map(bytes.fromhex, dict.fromkeys(uuids))
             wanted = list(every)
@@ -87,7 +87,7 @@ class NodeDirectory:
                     self._judged |= judged
 
     def _sheet(self, uuid: str) -> list[dict[str, Any]]:
-        """The channels of the datasheet that a node had last; decoded once for each datasheet."""
+        """Return the channels of a node's last datasheet; decoded once for each datasheet."""
         with self._lock:
             digest = self._rows.get(uuid, {}).get("teds_sha256") or ""
             known = self._channels.get(uuid)
@@ -117,7 +117,10 @@ class NodeDirectory:
     # -- what links and measurements say -----------------------------------------------------------------------------
 
     def note(self, uuid: str, state: str | None = None, **facts: Any) -> None:
-        """Change what is known of a node; with ``state`` every client is told (``came``, ``left``, ``verified`` …)."""
+        """Change the facts of a node.
+
+        With ``state`` every client gets an event (``came``, ``left``, ``verified`` …).
+        """
         verdict = facts.pop("verdict", None)  # for the event: what is shown is judged from the row of reading
         with self._lock:
             seen = self._seen.setdefault(uuid, NodePresence())
@@ -139,12 +142,12 @@ class NodeDirectory:
             self._live.event("node", uuid=uuid, state=state, **told)
 
     def seen(self, uuid: str) -> NodePresence:
-        """What the links say of a node."""
+        """Return a node's state on the links."""
         with self._lock:
             return self._seen.get(uuid) or NodePresence()
 
     def stranger(self, place: str, uuid: str, *, there: bool) -> bool:
-        """Count a node that whitelist mode does not look at; True where that is news."""
+        """Count a node that whitelist mode ignores; True if it is new."""
         with self._lock:
             known = self._strangers.setdefault(place, set())
             news = (uuid in known) != there
@@ -157,7 +160,7 @@ class NodeDirectory:
             return len(self._strangers.get(place, ()))
 
     def forget_place(self, place: str) -> None:
-        """A link was lost, or its mode changed: nobody is seen there any more."""
+        """Forget all sightings at a place: a link was lost, or its mode changed."""
         with self._lock:
             self._strangers.pop(place, None)
             gone = [uuid for uuid, seen in self._seen.items() if seen.place == place and seen.present]
@@ -178,12 +181,12 @@ class NodeDirectory:
             return sorted(known, key=lambda uuid: (not self.seen(uuid).present, uuid))
 
     def name(self, uuid: str) -> str:
-        """The name of a node in the store, "" where it has none."""
+        """Return the name of a node in the store, "" if it has none."""
         with self._lock:
             return self._rows.get(uuid, {}).get("name") or ""
 
     def called(self, uuid: str) -> tuple[str, bool]:
-        """The name under which a node is published, and whether it is only what the node says itself (unverified)."""
+        """Return the name under which a node is published, and whether it is the node's own, unverified claim."""
         channels = self._sheet(uuid)
         with self._lock:
             judged = self._verdicts(uuid, self._seen.get(uuid) or NodePresence())["verdict"]
@@ -192,22 +195,22 @@ class NodeDirectory:
         return self.name(uuid), False
 
     def channel_names(self, uuid: str) -> list[tuple[int, str]]:
-        """Number and name of every channel."""
+        """Return number and name of every channel."""
         return [(channel["number"], channel["name"]) for channel in self._sheet(uuid)]
 
     def known(self, uuid: str) -> bool:
-        """Whether there is anything to show of a node."""
+        """True if there is anything to show of a node."""
         with self._lock:
             return uuid in self._rows or uuid in self._seen
 
     def nodes(self, most: int = MOST_NODES) -> list[dict[str, Any]]:
-        """The first ``most`` of them; those that are there come first."""
+        """Return the first ``most`` of them; present ones come first."""
         return [self.node(uuid) for uuid in self.uuids()[:most]]
 
     def nodes_text(self, most: int = MOST_NODES, offset: int = 0, *, reader: bool = False) -> str:
-        """The answer of GET /nodes as JSON; what did not change since is not put together again.
+        """Return the answer of GET /nodes as JSON; unchanged parts are cached.
 
-        ``reader``: who asks may only read.
+        ``reader``: the client may only read.
         """
         uuids = self.uuids()
         shown = ",".join(self._text(uuid, reader) for uuid in uuids[offset : offset + most])
@@ -275,9 +278,9 @@ class NodeDirectory:
         return out
 
     def _verdicts(self, uuid: str, seen: NodePresence) -> dict[str, Any]:
-        """The one verdict on a node, from its row of reading; and beside it what it said in no session.
+        """Return the verdict on a node, from its reading; and beside it what it sent outside a session.
 
-        Of a node that was never read in a session, nor kept, the latter is all that is known.
+        Of a node that was never read in a session, nor stored, the latter is all that is known.
         """
         judged = self._judged.get(uuid)
         if judged is None or (judged.origin == "plain" and seen.heard is not None):
@@ -285,7 +288,7 @@ class NodeDirectory:
         return {"verdict": judged.to_json(), "heard": seen.heard}
 
     def _now(self, uuid: str, channel: int) -> dict[str, Any]:
-        """What changes of a channel."""
+        """Return the changing facts of a channel."""
         return {
             "topic": self.topic(uuid, channel),
             "last": self._value(uuid, channel),
@@ -302,14 +305,14 @@ class NodeDirectory:
 
 
 def for_reader(node: dict[str, Any]) -> dict[str, Any]:
-    """A node as a token that may only read is shown it: what went wrong names no file of this machine."""
+    """Return a node for a read-only token: its errors name no file of this machine."""
     return node | {name: for_readers(node[name]) for name in ("problem", "measuring")}
 
 
 def channel_facts(channel: Channel) -> dict[str, Any]:
-    """What the datasheet says of a channel: limits and uncertainty in its SI unit; ``rate`` in Hz.
+    """Return the datasheet's facts of a channel: limits and uncertainty in its SI unit; ``rate`` in Hz.
 
-    ``shown`` is the unit for people: its number is the SI value × ``factor`` + ``offset``.
+    ``shown`` is the display unit: its number is the SI value × ``factor`` + ``offset``.
     """
     unit = channel.shown
     zero = unit.from_si(0.0)

@@ -1,7 +1,7 @@
-"""One node that came to a link: who it is, what its datasheet is worth, what it has to say of its power.
+"""Inspection of one node that came to a link: its identity, its datasheet's verdict, its power.
 
-What detection allows (operation.md section 7) is decided here: in whitelist mode a session is opened only with a node
-that is on the list under its key; transparent mode also reads strangers, within limits.
+Detection is applied here (operation.md section 7): in whitelist mode a session is opened only with a node that is on
+the list under its key; transparent mode also reads strangers, within limits.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ STRANGERS_SECONDS: Final = 60.0
 
 @dataclass(frozen=True)
 class NodeInspection:
-    """What was found out. ``sheet`` is that of a node whose datasheet is not kept here, None otherwise.
+    """Result of an inspection. ``sheet`` is that of a node whose datasheet is not stored here, else None.
 
-    A ``judged`` that came in no session is shown beside the node's row of reading, and changes no row.
+    A ``judged`` that came in no session is shown beside the node's reading, and changes no row.
     """
 
     judged: NodeVerdict
@@ -43,7 +43,7 @@ class NodeInspection:
 
 
 def look(station: Station, node: Conversation) -> NodeInspection:
-    """Verify a node: in a session where its key is held here, else what it shows; raises TedsProvisionError."""
+    """Verify a node: in a session if its key is held here, else its plain answers; raises TedsProvisionError."""
     if station.keys.held(node.uuid) and node.identity.state != NodeState.FACTORY:
         found = _in_session(station, node)
         if found is not None:
@@ -62,7 +62,7 @@ def _in_session(station: Station, node: Conversation) -> NodeInspection | None:
 
 
 def read_anew(station: Station, node: Conversation) -> tuple[Image, NodeVerdict] | None:
-    """Read every TEDS of a node in a session, and keep that reading; None where no session comes about."""
+    """Read every TEDS of a node in a session, and keep that reading; None if no session can be opened."""
     if session_if_keyed(station, node) is None:
         return None
     c, identity = node.open_counter, read_identity(node)
@@ -73,7 +73,7 @@ def read_anew(station: Station, node: Conversation) -> tuple[Image, NodeVerdict]
 
 
 def _stranger(station: Station, node: Conversation, who: IdentifiedNode) -> NodeInspection:
-    """A node of which no key is held: its TEDS are read to be shown, and nothing of it is kept."""
+    """Inspect a node without a held key: its TEDS are read to be shown, and not stored."""
     until = time.monotonic() + STRANGERS_SECONDS
     blocks = {SECURITY: who.security_teds}
     for block in list_blocks(node)[:STRANGERS_TEDS]:
@@ -94,7 +94,7 @@ def _stranger(station: Station, node: Conversation, who: IdentifiedNode) -> Node
 
 
 def power_of(node: Conversation) -> dict[str, Any] | None:
-    """128.18 in an open session, None where the node does not tell."""
+    """Return the reply to 128.18 in an open session, None if the node has none."""
     try:
         return PowerReply.decode(node.request(POWER, "to tell its power")).as_json()
     except (NodeRefusedError, BadDataError):
@@ -102,5 +102,5 @@ def power_of(node: Conversation) -> dict[str, Any] | None:
 
 
 def as_problem(error: TedsProvisionError) -> dict[str, str]:
-    """An error as the API tells it."""
+    """Return an error as in the API."""
     return {"code": error.code, "message": error.message, "hint": error.hint}

@@ -45,7 +45,7 @@ PATIENCE: Final = (1.0, 3.0)  # seconds for the answer to the first question, an
 
 
 class PresenceCheck:
-    """Asks the nodes of one bus. ``held`` says of whom others hear meanwhile: who is measured, or worked with."""
+    """Asks the nodes of one bus. ``held`` returns nodes that other parts hear meanwhile: measured, or worked with."""
 
     def __init__(self, port: CanPort, held: Callable[[str], bool]) -> None:
         self._port, self._held = port, held
@@ -53,7 +53,7 @@ class PresenceCheck:
         self._last = 0.0
 
     def look(self, known: Mapping[str, Sighting]) -> Iterator[tuple[str, Sighting | None]]:
-        """Ask those whose turn has come: each with what it says now, None where it no longer answers."""
+        """Ask those whose turn has come: yield each with its present Identify, None if it no longer answers."""
         now = time.monotonic()
         if now - self._last < 1.0:
             return
@@ -87,7 +87,7 @@ WORKERS: Final = 4
 STRANGERS: Final = 2
 """Threads that look at nodes which are not on the whitelist: those that are on it never wait for a stranger."""
 MOST_KNOWN: Final = 512
-"""Nodes that are taken to be on a bus: it has 239 addresses, but anybody may say another UUID each time."""
+"""Limit of nodes assumed on a bus: it has 239 addresses, but a device may send another UUID each time."""
 TELL_STRANGERS: Final = 10.0  # seconds between two words about how many strangers there are
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 LOOK_AGAIN: Final = 30.0  # seconds until a node that could not be looked at is looked at again
@@ -98,10 +98,10 @@ LOOK: Final = 0.5
 
 
 class NodeObserver(Protocol):
-    """Who wants to know of a node that lies on a reader, or answers on a bus."""
+    """Receiver of nodes that are on a reader, or answer on a bus."""
 
     def serve_node(self, node: Conversation) -> bool:
-        """Do what was asked for with this node; False where nothing was."""
+        """Do what was requested for this node; False if nothing was."""
 
 
 @dataclass
@@ -169,7 +169,7 @@ class LinkWatch:
             port.close()
 
     def look_at_all(self) -> None:
-        """Ask everyone now, and look at each of them anew."""
+        """Ask all nodes now, and inspect each of them again."""
         self._anew.set()
 
     # -- the thread --------------------------------------------------------------------------------------------------
@@ -218,9 +218,9 @@ class LinkWatch:
             self._came(contact)
 
     def _watch_bus(self, port: CanPort | BlePort, poll: float) -> None:
-        """The look-out tells of who answers (:meth:`on_sighting`).
+        """Run a bus: discovery reports answering nodes (:meth:`on_sighting`).
 
-        Here is seen who does not any more, and whether it works.
+        Here silent ones are noticed, and whether the bus works.
         """
         bus = self._buses.add(port)
         bus.discovery.poll(poll)
@@ -247,14 +247,14 @@ class LinkWatch:
             self._anew.wait(LOOK)
 
     def _look_for_all(self) -> None:
-        """Look at all who answer from now on; who does not is still known, and so is seen to leave."""
+        """Inspect all that answer from now on; the others are still known, and so are seen to leave."""
         self._looked_for = set(self._known)
 
     def _is_held(self, uuid: str) -> bool:
         return self._node_locks.holder(uuid) is not None
 
     def on_sighting(self, sighting: Sighting) -> None:
-        """A node answered on this bus; called from the look-out's thread."""
+        """Handle a node that answered on this bus; called from the discovery's thread."""
         uuid, identity = sighting.uuid.hex(), sighting.identity
         before = self._known.pop(uuid, None)  # who was seen last stands last
         self._known[uuid] = sighting
@@ -285,7 +285,7 @@ class LinkWatch:
     # -- a reader is one command's at a time ---------------------------------------------------------------------------
 
     def borrow(self, who: object) -> bool:
-        """Lend the reader to a command of this machine until it is given back; False where this is no reader."""
+        """Lend the reader to a command of this machine until it is given back; False if this is no reader."""
         if not self.place.startswith("nfc:"):
             return False
         self._borrowers.add(id(who))
@@ -294,11 +294,11 @@ class LinkWatch:
         return True
 
     def give_back(self, who: object) -> None:
-        """The command has ended."""
+        """Take the reader back: the command has ended."""
         self._borrowers.discard(id(who))
 
     def _lend(self) -> None:
-        """Close the reader for as long as somebody has it."""
+        """Close the reader for as long as a command has it."""
         self._close()
         self._directory.forget_place(self.place)
         self._publish_state("lent")
@@ -381,14 +381,14 @@ class LinkWatch:
             self._pending.discard(uuid)
 
     def _tell_of_strangers(self) -> None:
-        """How many there are that whitelist mode does not look at, where that is news, and not too often."""
+        """Report the number of nodes that whitelist mode ignores, if it changed, at a limited rate."""
         count, now = self._directory.strangers(self.place), time.monotonic()
         if count != self._strangers_told and now - self._strangers_at >= TELL_STRANGERS:
             self._strangers_told, self._strangers_at = count, now
             self._live.event("link", place=self.place, state="strangers", count=count)
 
     def _wanted(self, contact: Contact) -> bool:
-        """Whether detection shows this node at all: whitelist mode shows others as a count."""
+        """True if detection shows this node: whitelist mode shows others as a count."""
         return self._transparent() or is_listed(self._station, contact.identity.uuid)
 
     def _serve(self, contact: Contact) -> None:

@@ -1,7 +1,7 @@
 """Work with one node on behalf of a request: where it is now, or at its next tap.
 
-A node on a bus is met by the thread of the request. One that comes by NFC is worked with by the thread of its reader,
-while it lies there; the request waits for that, and says until when.
+The thread of the request meets a node on a bus. For one that comes by NFC the thread of its reader does the work, while
+the node is on it; the request waits for that, and reports until when.
 """
 
 from __future__ import annotations
@@ -27,7 +27,10 @@ WAIT = 20.0
 
 
 class NodeLocks:
-    """Who works on which node (UUID in hex). ``given`` is told each that is free after other work than measuring."""
+    """The user of each node (UUID in hex).
+
+    ``given`` is called with each that is free after other work than measuring.
+    """
 
     def __init__(self) -> None:
         self.given: Callable[[str], None] = lambda _uuid: None
@@ -36,7 +39,7 @@ class NodeLocks:
         self._frozen: set[str] = set()
 
     def holder(self, uuid: str) -> str | None:
-        """What works on a node now, None for nothing."""
+        """Return what works on a node now, None if nothing does."""
         with self._news:
             return self._holders.get(uuid)
 
@@ -86,7 +89,7 @@ ON_A_BUS: Final = 10.0
 
 
 def as_program_error(error: Exception) -> TedsProvisionError:
-    """What a thread tells of an exception that is none of ours: the disk's, or a bug."""
+    """Return the program's error for a foreign exception of a thread: the disk's, or a bug."""
     if isinstance(error, OSError):
         return StoreError(f"The system refused: {error.strerror or type(error).__name__}.", hint="See the log.")
     return InternalError(f"Unexpected {type(error).__name__}.", hint="This is a bug: see the daemon's log.")
@@ -159,12 +162,12 @@ class NodeJobs:
         return cast("Result", errand.result)
 
     def contact(self, uuid: str) -> Contact | None:
-        """A node that is on a bus now; None where it is not."""
+        """Return a node that is on a bus now; None if it is not."""
         port = self._bus_of(uuid)
         return None if port is None else self._find(port, uuid)
 
     def on_a_bus(self, uuid: str) -> bool:
-        """Whether a node is on a bus of this station now."""
+        """True if a node is on a bus of this station now."""
         return self._bus_of(uuid) is not None
 
     def _bus_of(self, uuid: str) -> Port | None:
@@ -189,7 +192,7 @@ class NodeJobs:
         return errand
 
     def cancel(self, errand: NodeJob[Any]) -> bool:
-        """Wait no more; False where it runs already."""
+        """Stop waiting; False if it runs already."""
         with self._guard:
             if errand not in self._waiting:
                 return False
@@ -198,7 +201,7 @@ class NodeJobs:
         return True
 
     def serve(self, node: Conversation) -> bool:
-        """Run what waits for this node, which lies on a reader; False where nothing does."""
+        """Run what waits for this node, which is on a reader; False if nothing does."""
         if not node.tapped:
             return False
         uuid, now = node.uuid.hex(), time.monotonic()
@@ -214,4 +217,4 @@ class NodeJobs:
 
 
 def _quiet(_notice: Notice) -> None:
-    """Requests answer; they have nobody to tell in between."""
+    """Ignore notices: requests have their answer."""

@@ -1,7 +1,7 @@
-"""Provisioning on request: it waits for the tap where one is needed, and every step is told as it happens.
+"""Provisioning on request: it waits for the tap if one is needed, and reports every step as it happens.
 
-No button is needed for a tap: the request says what shall be done, and the node that it is for does the rest when it
-lies on the reader. A node on a wired bus is provisioned there where it takes that; where it wants a tap, it is waited.
+A tap needs no button: the request contains the work, and it is done when its node is on the reader. A node on a wired
+bus is provisioned there if it allows that; if it requires a tap, the run waits for it.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class Provisioning:
         self._guard = threading.Lock()
 
     def run_of(self, uuid: str) -> dict[str, Any]:
-        """How the last request for a node stands; raises NotFoundError."""
+        """Return the state of the last request for a node; raises NotFoundError."""
         with self._guard:
             run = self._runs.get(uuid)
         if run is None:
@@ -106,12 +106,12 @@ class Provisioning:
         adopt: bool = False,
         accept: str | None = None,
     ) -> dict[str, Any]:
-        """Ask for it; ``uuid`` may be ``next``: whichever node is tapped next. Returns what is waited for.
+        """Begin a run; ``uuid`` may be ``next``: whichever node is tapped next. Return what it waits for.
 
-        ``adopt``: the datasheet that the board brought is signed; ``accept`` says why it is right in spite of findings.
+        ``adopt``: the board's own datasheet is signed; ``accept`` is the reason to accept it in spite of findings.
 
-        Raises UsageError, NotFoundError, BadDataError, PolicyError for what cannot be built, StoreError where no
-        temporary file can be written, before anybody is waited for.
+        Raises UsageError, NotFoundError, BadDataError, PolicyError for what cannot be built, StoreError if no temporary
+        file can be written, before any wait.
         """
         with self._guard:
             before = self._runs.get(uuid)
@@ -257,17 +257,17 @@ class Provisioning:
 
 
 class _RunReporter:
-    """A reporter whose steps go to the run and to everybody who watches."""
+    """A reporter whose steps go to the run and to all clients."""
 
     def __init__(self, run: ProvisioningRun, live: Live) -> None:
         self._run, self._live = run, live
 
     def started(self, step: str) -> None:
-        """A step begins."""
+        """Report the start of a step."""
         self._step(step, "running", "")
 
     def finished(self, step: StepResult) -> None:
-        """A step ended well."""
+        """Report a step that ended well."""
         self._step(step.name, step.result, step.detail)
 
     def notice(self, notice: Notice) -> None:
@@ -288,7 +288,7 @@ class _RunReporter:
 
 
 def _file(folder: Path, text: str | None, name: str | None) -> Path | None:
-    """A calibration that came as text, as the file that the steps read; its ending says which form it has."""
+    """Return a calibration that came as text, as the file that the steps read; its suffix names the form."""
     if text is None:
         return None
     suffix = Path(name or "calibration.csv").suffix.lower()
@@ -307,10 +307,10 @@ def _file(folder: Path, text: str | None, name: str | None) -> Path | None:
 
 
 class AutoProvisioner:
-    """Takes up what may be; ``adopts`` says whether factory nodes of a bus are among it.
+    """Takes up permitted nodes; ``adopts``: factory nodes of a bus are among them.
 
-    ``signs``: whether the datasheet that such a node brought is signed at once, by a person's word at the start, where
-    nothing is wrong with it. What was refused is not tried again while the node stays as it is.
+    ``signs``: the own datasheet of such a node is signed at once, as confirmed at the start, if it has no fault. A
+    refused node is not tried again while it stays unchanged.
     """
 
     def __init__(
@@ -328,7 +328,7 @@ class AutoProvisioner:
         self._refused: dict[str, TedsProvisionError] = {}
 
     def serve(self, node: Conversation) -> bool:
-        """Take up a node in factory state; False where it is not to be, or has been. Raises as the steps do."""
+        """Take up a node in factory state; False if it is not permitted, or was done. Raises as the steps do."""
         uuid = node.uuid.hex()
         if node.tapped or node.identity.state == NodeState.PROVISIONED:
             return False
@@ -365,7 +365,10 @@ class AutoProvisioner:
         return False
 
     def _sign_own(self, node: Conversation) -> bool:
-        """Sign what a keyed node brought, where that was said at the start; False: it is looked at like any other."""
+        """Sign a keyed node's own datasheet, if that was confirmed at the start.
+
+        False: it is inspected like any other.
+        """
         uuid = node.uuid.hex()
         signs = self._signs and self._adopts() and uuid not in self._virtuals and node.contact.link.capabilities.wired
         if not signs or not self._station.keys.held(node.uuid) or self._station.pins.entry(node.uuid) is None:
@@ -392,7 +395,7 @@ class AutoProvisioner:
         return True
 
     def _virtual(self, node: Conversation, uuid: str) -> Verification:
-        """A virtual transducer gets the datasheet that it was made from."""
+        """Give a virtual transducer the datasheet that it was made from."""
         station, profile = self._station, self._virtuals.profile_of(uuid)
         if profile is not None:
             order = BuildOrder(

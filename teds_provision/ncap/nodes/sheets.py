@@ -43,7 +43,7 @@ MeasuredSheet = Callable[[str], Image | None]
 
 @dataclass(frozen=True)
 class DatasheetRead:
-    """What a node has, or had when it was last read (``now`` False)."""
+    """Datasheet of a node, or of its last reading (``now`` False)."""
 
     image: Image
     judged: NodeVerdict
@@ -96,7 +96,7 @@ class Sheets:
         return (text if isinstance(text, str) else text.decode()), FORMATS[form], image.digest()
 
     def as_json(self, uuid: str) -> tuple[dict[str, Any], str]:
-        """Return what api.md says of `/nodes/UUID/teds`, and the digest of the datasheet."""
+        """Return the body of `/nodes/UUID/teds` (api.md), and the digest of the datasheet."""
         found = self.read(uuid)
         blocks = found.image.blocks
         teds = [
@@ -185,7 +185,7 @@ class Sheets:
 
 
 def parsed(content: str) -> dict[BlockId, bytes]:
-    """The TEDS of a document in XML, JSON or hex; raises BadDataError."""
+    """Return the TEDS of a document in XML, JSON or hex; raises BadDataError."""
     if not content.strip():
         raise BadDataError("The datasheet is empty.")
     return placed(content.encode())
@@ -211,10 +211,10 @@ def _warning(text: str) -> dict[str, str]:
 
 
 def curves(blocks: Mapping[BlockId, bytes]) -> list[dict[str, Any]]:
-    """Every calibration of one input that can be drawn: points of (raw value, value in ``y_unit``), at most 200.
+    """Return every drawable calibration of one input: points of (raw value, value in ``y_unit``), at most 200.
 
-    An angle over a full turn is drawn as it is measured: within its limits, with a gap (the value None) where it goes
-    on at the other end.
+    An angle over a full turn is drawn as it is measured: within its limits, with a gap (the value None) where it
+    continues at the other end.
     """
     sheet = Sheet.from_blocks(blocks)
     found = []
@@ -239,7 +239,7 @@ def curves(blocks: Mapping[BlockId, bytes]) -> list[dict[str, Any]]:
 
 
 def within_a_turn(points: Sequence[tuple[float, float]], low: float) -> list[tuple[float, float | None]]:
-    """A line of (raw value, angle in rad) within [low, low + 2π], with None where it goes on at the other end."""
+    """Return a line of (raw value, angle in rad) within [low, low + 2π], with None where it wraps."""
     found: list[tuple[float, float | None]] = []
     for (x0, y0), (x1, y1) in zip(points, [*points[1:], *points[-1:]], strict=True):
         turn, last = (math.floor((y - low) / TURN) for y in (y0, y1))

@@ -1,8 +1,8 @@
-"""Virtual transducers of this station: each a process of its own, on a bus that does not leave this machine.
+"""Virtual transducers of this station: each in a process, on a bus that does not leave this machine.
 
 They are nodes like others: own key and UUID, same commands, same checks. Their folder in the home holds their flash and
-how they are fed; the daemon starts them, again after they ended, and provisions them when they are made, as it knows
-their key from the file that it made itself.
+their source; the daemon starts them, restarts them after they ended, and provisions them when they are made, as it
+knows their key from the file that it made itself.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ class Virtuals:
         return {default_can_address(bytes.fromhex(uuid)) for uuid in self._all}
 
     def _new_uuid(self) -> bytes:
-        """A UUID whose address on the bus nobody has."""
+        """Return a UUID whose address on the bus is free."""
         taken = self._addresses()
         while True:
             uuid = secrets.token_bytes(UUID_OCTETS)
@@ -194,26 +194,26 @@ class Virtuals:
                 return uuid
 
     def profile_of(self, uuid: str) -> str | None:
-        """The profile that one was made from; None: from a datasheet."""
+        """Return the profile that one was made from; None: from a datasheet."""
         found = json.loads((self._virtual_of(uuid).folder / _FACTS).read_text()).get("profile")
         return found if isinstance(found, str) else None
 
     def calibration_of(self, uuid: str) -> Path | None:
-        """The straight lines of one that was made from a profile, None where it has none."""
+        """Return the linear calibration of one that was made from a profile, None if it has none."""
         path = self._virtual_of(uuid).folder / _CALIBRATION
         return path if path.exists() else None
 
     def name_of(self, uuid: str) -> str:
-        """The name that it was given, "" for none."""
+        """Return the name that it was given, "" for none."""
         return self._virtual_of(uuid).name
 
     def document_of(self, uuid: str) -> str | None:
-        """The datasheet that one was made from, None where it was a profile."""
+        """Return the datasheet that one was made from, None if it was a profile."""
         path = self._virtual_of(uuid).folder / "datasheet"
         return path.read_text(encoding="utf-8") if path.exists() else None
 
     def forget(self, uuid: str) -> Virtual:
-        """It is none of the station's any more, and still runs until :meth:`end`; raises NotFoundError."""
+        """Remove one from the station; it still runs until :meth:`end`; raises NotFoundError."""
         one, octets, station = self._virtual_of(uuid), bytes.fromhex(uuid), self._station
         with station.durable("virtual"):
             station.pins.remove(octets)
@@ -287,7 +287,7 @@ class Virtuals:
 
 
 def ideal_calibration(sheet: Sheet) -> str:
-    """Straight lines over the whole raw range, for the channels that have no values without: nobody measured these.
+    """Return straight lines over the whole raw range, for channels without values otherwise: these were not measured.
 
     A profile does not know the curve of a single board; a transducer in software has none but this.
     """

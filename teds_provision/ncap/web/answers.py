@@ -1,8 +1,8 @@
-"""What every route shares: bodies as values, errors as answers, and the threads that wait for nodes.
+"""Shared by all routes: bodies as values, errors as answers, and the threads that wait for nodes.
 
 A node that does not answer keeps a thread for up to a minute. With one pool for all, a few such reads (a read-only
-token is enough) kept every other request waiting: the status, the check of the next token, the set points. So there is
-a pool for what reads, one for what changes something, and one for actuators.
+token is enough) delayed every other request: the status, the check of the next token, the set points. So there is a
+pool for reads, one for changes, and one for actuators.
 """
 
 from __future__ import annotations
@@ -48,20 +48,20 @@ _STATUS: Final[tuple[tuple[type[TedsProvisionError], int], ...]] = (
     (StoreError, 503),
 )
 ASKED: Final = "teds.asked"
-"""Where in a request's scope the short members of its body stand, for the audit log."""
+"""Key in a request's scope of the short members of its body, for the audit log."""
 _LONGEST_IN_LOG, _MOST_IN_LOG = 200, 16
 _OTHERS: Final = 422  # guard, limits, bad data, policy: the request is understood and not done
 
 
 def status_of(error: TedsProvisionError) -> int:
-    """The status of an error (docs/contract/api.md)."""
+    """Return the HTTP status of an error (docs/contract/api.md)."""
     if isinstance(error, NodeRefusedError) and error.reason == Reason.BUSY:
         return 423
     return next((status for kind, status in _STATUS if isinstance(error, kind)), _OTHERS)
 
 
 def answer_error(request: Request, error: Exception) -> Response:
-    """A TedsProvisionError as an answer, with the words of the command line."""
+    """Return a TedsProvisionError as an answer, with the message of the command line."""
     assert isinstance(error, TedsProvisionError)
     problem = {"code": error.code, "message": error.message, "hint": error.hint}
     caller: Caller = request.scope[CALLER]
@@ -69,7 +69,7 @@ def answer_error(request: Request, error: Exception) -> Response:
 
 
 def answer_refusal(_request: Request, refusal: Exception) -> Response:
-    """A Refusal from within a route (a body that is too long, or does not match its schema)."""
+    """Return a Refusal from within a route (a body that is too long, or does not match its schema)."""
     assert isinstance(refusal, RequestRefusedError)
     error = {"code": refusal.code, "message": refusal.message, "hint": refusal.hint}
     return JSONResponse({"error": error}, refusal.status)
@@ -82,7 +82,10 @@ def answer_bug(_request: Request, error: Exception) -> Response:
 
 
 async def body_of(request: Request, shape: type[Shape]) -> Shape:
-    """The body of a request as its type; raises RequestRefusedError (422 bad-request) if the description forbids it."""
+    """Return the body of a request as its type.
+
+    Raises RequestRefusedError (422 bad-request) if the description forbids it.
+    """
     try:
         found = schema.read(shape, await request.body())
     except schema.BadRequestError as error:
@@ -92,7 +95,7 @@ async def body_of(request: Request, shape: type[Shape]) -> Shape:
 
 
 def _is_short(value: object) -> bool:
-    """Whether a member is named in the log: no datasheet, no calibration."""
+    """True if a member is short enough for the audit log: no datasheet, no calibration."""
     if isinstance(value, list | tuple):
         return len(value) <= _MOST_IN_LOG and all(map(_is_short, value))
     return isinstance(value, bool | int | float) or (isinstance(value, str) and len(value) <= _LONGEST_IN_LOG)

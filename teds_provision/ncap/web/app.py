@@ -41,7 +41,7 @@ _OF_AN_ENTRY: Final = frozenset({"act", "uuid", "outcome"})
 
 
 def build(daemon: Daemon) -> Starlette:
-    """The application; the guard goes in front of it."""
+    """Return the application; the guard goes in front of it."""
     routes: list[BaseRoute] = [
         Mount(
             API,
@@ -69,9 +69,9 @@ def build(daemon: Daemon) -> Starlette:
 
 
 def _noted(daemon: Daemon) -> Callable[[Request, Exception], Awaitable[Response]]:
-    """Errors as answers; who was refused a change, and why, stands in the audit log.
+    """Return errors as answers; a refused change is in the audit log with its client and reason.
 
-    A request that is none (a wrong body, a node that is not there) changes no log. A set point tells of itself.
+    An invalid request (a wrong body, a node that does not exist) changes no log. A set point has its own entry.
     """
 
     def note(request: Request, error: TedsProvisionError) -> None:
@@ -120,8 +120,8 @@ async def _nothing(_request: Request) -> Response:
 class LiveSlots:
     """The places of /live, ``most`` in all and ``of_one`` for one token.
 
-    Where all are taken, a token that has fewer than the one that has most gets the newest place of that one: nobody
-    keeps the others out, however many connections he opens.
+    If all are taken, a token with fewer places than the one that has most gets the newest place of that one: no client
+    excludes the others, however many connections it opens.
     """
 
     def __init__(self, most: int = MOST_LISTENERS, of_one: int = OF_ONE_TOKEN) -> None:
@@ -129,7 +129,7 @@ class LiveSlots:
         self._taken: dict[str, list[Callable[[], object]]] = {}
 
     def acquire(self, token: str, leave: Callable[[], object]) -> bool:
-        """Have a place; ``leave`` is called where it has to be given up for another token. False: there is none."""
+        """Take a place; ``leave`` is called if it has to be given up for another token. False: there is none."""
         own = self._taken.get(token, [])
         if len(own) >= self._of_one:
             return False
@@ -182,7 +182,7 @@ def _live(daemon: Daemon) -> Callable[[WebSocket], Awaitable[None]]:
 
 
 async def _end_in_time(socket: WebSocket, tokens: Tokens, caller: Caller, leaving: asyncio.Event) -> None:
-    """End the connection where its token is not good any more, or its place is another one's."""
+    """End the connection when its token is invalid, or its place is another one's."""
     while True:
         with suppress(TimeoutError):
             await asyncio.wait_for(leaving.wait(), LOOK_AT_TOKEN)

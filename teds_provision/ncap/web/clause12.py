@@ -72,7 +72,7 @@ class Clause12:
         return {"timIds": ",".join(map(str, numbers)), "uuids": ",".join(present)}
 
     def transducers(self, given: dict[str, str]) -> Fields:
-        """The channels of one."""
+        """Return the channels of one transducer module."""
         uuid = self._uuid(given)
         channels = self._daemon.directory.channel_names(uuid)
         return {
@@ -82,7 +82,7 @@ class Clause12:
         }
 
     def read_data(self, given: dict[str, str]) -> Fields:
-        """The last value of a channel."""
+        """Return the last value of a channel."""
         uuid, channel = self._uuid(given), _integer(given, "channelId")
         if channel not in {number for number, _ in self._daemon.directory.channel_names(uuid)}:
             raise NotFoundError(f"Node {uuid} has no channel {channel}.")

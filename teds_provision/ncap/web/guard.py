@@ -1,8 +1,8 @@
-"""In front of every request, WebSocket included: where it came from, who it is, and what it brings.
+"""In front of every request, WebSocket included: its origin, its token, and its body.
 
 A page in the user's browser reaches a server on loopback, and so does any page of the net through it. So Host and
-Origin are held against an exact list, fetch metadata say whether another site asks, a token says who it is, and what
-changes anything comes as JSON, which a form cannot send. The Unix socket has the file's mode in place of all that.
+Origin are checked against an exact list, fetch metadata reveal whether another site asks, a token identifies the
+client, and changes come as JSON, which a form cannot send. The Unix socket has the file's mode in place of all that.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ class Caller:
     kind: Literal["socket", "browser", "script"]
     read_only: bool = False
     digest: str = ""
-    """Of the token, which tells two of one name apart; "" for the user himself."""
+    """Digest of the token, which distinguishes two of one name; "" for the user's own socket."""
 
     @property
     def actor(self) -> str | None:
-        """Who stands in the audit log; None: the user who runs the daemon."""
+        """The actor for the audit log; None: the user who runs the daemon."""
         return {"socket": None, "browser": "page"}.get(self.kind, by_token(self.name))
 
     @property
@@ -103,7 +103,7 @@ class ServedNames:
 
 
 def front(hosts: tuple[str, ...], port: int, *, tls: bool) -> ServedNames:
-    """The names of a server: loopback's always, and those that were allowed."""
+    """Return the names of a server: loopback's always, and those that were allowed."""
     names = {
         "127.0.0.1",
         "localhost",
@@ -172,7 +172,7 @@ class Guard:
         return Caller(found.name, found.kind, found.read_only, found.digest)
 
     async def _login(self, scope: Scope) -> RequestRefusedError:
-        """Trade the token of `ncap open` for a cookie; told as a redirection to the page without it."""
+        """Trade the token of `ncap open` for a cookie, with a redirection to the page without it."""
         assert self.front is not None
         if scope["method"] != "GET":
             return RequestRefusedError(405, "usage", "The login address takes GET requests only.")
@@ -208,7 +208,7 @@ class Guard:
 
 
 def _unreadable(failure: StoreError) -> RequestRefusedError:
-    """The file of the tokens cannot be read: nobody is let in, and whoever asks is told no folder."""
+    """Return the refusal if the file of the tokens cannot be read; it names no folder."""
     told = for_readers({"message": failure.message, "hint": failure.hint})
     return RequestRefusedError(503, failure.code, told["message"], told["hint"])
 
@@ -245,7 +245,7 @@ def _require_origin(named: ServedNames, headers: Mapping[str, str]) -> None:
 
 
 def _require_form(scope: Scope, headers: Mapping[str, str], caller: Caller) -> None:
-    """What changes anything comes as JSON, is not too long, and not from a read-only token."""
+    """Require JSON of limited size, and no read-only token, for a change."""
     if scope["type"] != "http":
         return
     length = headers.get("content-length", "")
@@ -265,7 +265,7 @@ def _require_form(scope: Scope, headers: Mapping[str, str], caller: Caller) -> N
 
 
 def _limited(receive: Receive) -> Receive:
-    """A body without a stated length is cut off all the same."""
+    """Return a body without a stated length, cut off at the limit."""
     taken = 0
 
     async def next_message() -> Message:
@@ -298,7 +298,7 @@ def _wants_html(scope: Scope) -> bool:
 
 
 async def _refuse(scope: Scope, send: Send, refusal: RequestRefusedError, *, as_page: bool) -> None:
-    """Tell it as JSON, to a browser's address line as a plain page."""
+    """Send a refusal as JSON, to a browser's address line as a plain page."""
     if as_page and refusal.code:
         text = f"<!doctype html><html lang=en><meta charset=utf-8><title>{refusal.status}</title>"
         text += f"<p>{html.escape(refusal.message)}<p>{html.escape(refusal.hint)}"

@@ -52,7 +52,7 @@ def route(daemon: Daemon) -> Route:
 
 
 def text(status: dict[str, Any], plant: dict[str, Any] | None = None) -> str:
-    """The status, and that of the plant where one was joined, as Prometheus reads it."""
+    """Return the status, and that of the plant if one was joined, in Prometheus's form."""
     lines: dict[str, dict[str, float]] = {name: {} for name in _HELP}  # of equal labels one line: two end a scrape
     for name, labels, value in chain(_lines(status), _registry(plant) if plant is not None else ()):
         inner = ",".join(f'{key}="{_escaped(word)}"' for key, word in labels.items())
@@ -67,7 +67,7 @@ def text(status: dict[str, Any], plant: dict[str, Any] | None = None) -> str:
 
 
 def _number(value: float) -> str:
-    """All digits of it: a counter of a million with six of them stands still, and then jumps."""
+    """Return all digits: a counter of a million with six of them stops, and then jumps."""
     return repr(int(value)) if float(value).is_integer() else repr(float(value))
 
 

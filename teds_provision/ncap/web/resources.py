@@ -138,7 +138,7 @@ class Resources:
         return JSONResponse({"profiles": await asyncio.to_thread(found)})
 
     async def log(self, request: Request) -> Response:
-        """GET /log: the newest entries that are meant, before ``before`` where it is given, and whether they hold."""
+        """GET /log: the newest selected entries, before ``before`` if it is given, and the verdict on them."""
         words = request.query_params
         limit = _integer(request, "limit", 200, MOST_ENTRIES)
         before = _integer(request, "before", 0, FURTHEST, least=1) or None
@@ -210,9 +210,9 @@ class Resources:
         return StreamingResponse(lent(), media_type="text/plain")
 
     async def lend_until_closed(self, request: Request) -> Response:
-        """GET /nodes/UUID/let-go: a measured node is the caller's to write to until this answer is ended.
+        """GET /nodes/UUID/let-go: a measured node is the caller's to write to until this answer ends.
 
-        Over the socket alone. A caller that dies closes it, and one that hangs has the node for a while only.
+        Over the socket alone. A caller that dies closes it, and one that hangs has the node for a limited time.
         """
         caller: Caller = request.scope[CALLER]
         if caller.kind != "socket":
@@ -311,7 +311,7 @@ class Resources:
         return JSONResponse(await changing(begin), 202)
 
     async def _uuid_of_a_label(self, word: str) -> str:
-        """A node that nobody has seen yet is named by its whole UUID, as its label says it."""
+        """Return the whole UUID, as on a label, of a node that was never seen."""
         digits = word.lower().removeprefix("0x")
         if len(digits) == 20 and not set(digits) - set("0123456789abcdef"):
             return digits
@@ -401,7 +401,7 @@ class Resources:
 
 
 def _shown(request: Request, found: dict[str, Any]) -> JSONResponse:
-    """An answer that may name files and users of this machine, which are nothing for a token that may only read."""
+    """Return an answer; for a read-only token without files and users of this machine."""
     caller: Caller = request.scope[CALLER]
     return JSONResponse(for_readers(found) if caller.read_only else found)
 
@@ -416,7 +416,7 @@ def _integer(request: Request, name: str, default: int, most: int, least: int = 
 
 
 def _unix(request: Request, name: str) -> float | None:
-    """A moment in unix seconds, or as ISO 8601; None where it is left out."""
+    """Return a moment in unix seconds, or from ISO 8601; None if it is left out."""
     text = request.query_params.get(name)
     if not text:
         return None
@@ -424,7 +424,7 @@ def _unix(request: Request, name: str) -> float | None:
 
 
 def _moment(name: str, text: str) -> str:
-    """A parameter as the log writes moments: ISO 8601 with a zone, or unix seconds."""
+    """Return a parameter as the log writes moments: ISO 8601 with a zone, or unix seconds."""
     try:
         at = datetime.fromtimestamp(float(text), UTC) if _UNIX.fullmatch(text) else datetime.fromisoformat(text)
         return iso(at if at.tzinfo is not None else at.replace(tzinfo=UTC))  # a zone may leave the years that there are

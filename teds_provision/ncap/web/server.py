@@ -1,4 +1,4 @@
-"""The servers: uvicorn on the Unix socket of the home, and on loopback (or, with TLS, elsewhere) where asked for."""
+"""The servers: uvicorn on the Unix socket of the home, and on loopback (or, with TLS, elsewhere) if configured."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class HttpConnection(H11Protocol):
     _late: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """It begins: the head of its first request is awaited."""
+        """Handle a new connection: wait for the head of its first request."""
         super().connection_made(transport)
         self._began = time.monotonic()
         self._await()
@@ -47,7 +47,7 @@ class HttpConnection(H11Protocol):
             self._make_room()
 
     def _make_room(self) -> None:
-        """End the oldest connection that works for nobody."""
+        """End the oldest idle connection."""
         mine = [
             connection
             for connection in self.connections
@@ -61,24 +61,24 @@ class HttpConnection(H11Protocol):
             self.limit_concurrency = MOST  # all of them work for somebody: 503
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """It has ended."""
+        """Handle the end of a connection."""
         self._forget()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """A piece of a request."""
+        """Handle a piece of a request."""
         super().data_received(data)
         self._await()
 
     @property
     def is_known(self) -> bool:
-        """Whether its request, or the one before, came with a good token (or by the Unix socket)."""
+        """True if its request, or the one before, came with a good token (or by the Unix socket)."""
         scope: Any = self.scope  # None before its first request
         return scope is not None and CALLER in scope
 
     @property
     def is_silent(self) -> bool:
-        """Whether nothing that it asked for is being done, nor any body on its way."""
+        """True if no request of it is running, nor any body on its way."""
         return self.conn.their_state is h11.IDLE
 
     def end(self) -> None:
@@ -117,7 +117,7 @@ class _Server(uvicorn.Server):
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A listening TCP socket; raises LinkError where the address is taken or not this machine's."""
+    """Return a listening TCP socket; raises LinkError if the address is taken or not this machine's."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

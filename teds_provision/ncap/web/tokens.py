@@ -90,7 +90,7 @@ class Tokens:
     # -- for the daemon ----------------------------------------------------------------------------------------------
 
     def login_link(self, *, read_only: bool = False) -> str:
-        """A token for the URL of `ncap open`: it works once, within five minutes, and is never written down."""
+        """Return a token for the URL of `ncap open`: it works once, within five minutes, and is never written down."""
         token = secrets.token_urlsafe(32)
         now = time.monotonic()
         with self._guard:
@@ -99,7 +99,7 @@ class Tokens:
         return token
 
     def login(self, token: str) -> str | None:
-        """Turn a token of `ncap open` into the token of a browser's cookie; None where it is not good (any more)."""
+        """Turn a token of `ncap open` into the token of a browser's cookie; None if it is invalid or expired."""
         with self._guard:
             until, read_only = self._logins.pop(digest_of(token), (0.0, False))
         if until < time.monotonic():
@@ -114,7 +114,7 @@ class Tokens:
         return cookie
 
     def find(self, token: str) -> Token | None:
-        """The token that this is, None for none; compares in constant time."""
+        """Return the matching token, None for none; compares in constant time."""
         digest, now = digest_of(token), time.time()
         found = None
         for known_token in self._read():
@@ -123,7 +123,7 @@ class Tokens:
         return found
 
     def is_good(self, digest: str) -> bool:
-        """Whether the token of this digest is good still: neither removed nor over."""
+        """True if the token of this digest is still valid: neither removed nor expired."""
         now = time.time()
         return any(token.digest == digest and (not token.until or token.until > now) for token in self._read())
 
