@@ -50,7 +50,7 @@ LETTING_GO: Final = 5.0
 
 
 class ApiError(TedsProvisionError):
-    """What the daemon refused; ``status`` is that of HTTP, ``code`` that of the command line."""
+    """The daemon refused; ``status`` is that of HTTP, ``code`` that of the command line."""
 
     def __init__(self, status: int, code: str, message: str, hint: str = "") -> None:
         super().__init__(message, hint=hint)
@@ -83,10 +83,10 @@ _EXIT_BY_STATUS: Final = {
 
 
 def _is_over(connection: http.client.HTTPConnection) -> bool:
-    """Whether the base station has ended a connection that was kept open: after half a minute, or with its process.
+    """True if the base station has ended a connection that was kept open: after half a minute, or with its process.
 
-    Nothing is to come on it between two requests; what can be read is its end. A change that is sent on it would fail,
-    and could not be sent again, as nobody knows whether it was done.
+    Between two requests only its end can arrive. A change that is sent on it would fail, and could not be sent again,
+    as it might have been done.
     """
     if connection.sock is None:
         return False
@@ -96,7 +96,7 @@ def _is_over(connection: http.client.HTTPConnection) -> bool:
 
 
 def default_home() -> Path:
-    """The home of this user: TEDS_PROVISION_HOME, else the platform's user data folder."""
+    """Return the home of this user: TEDS_PROVISION_HOME, else the platform's user data folder."""
     named = os.environ.get("TEDS_PROVISION_HOME")
     if named:
         return Path(named).expanduser()
@@ -108,7 +108,10 @@ def default_home() -> Path:
 def connect(
     url: str | None = None, *, token: str | None = None, home: str | Path | None = None, timeout: float = 120.0
 ) -> Client:
-    """A client: of ``url`` with a ``token`` (ncap token add), else of the Unix socket in ``home`` (default: yours)."""
+    """Return a client of ``url`` with a ``token`` (ncap token add), else of the Unix socket in ``home``.
+
+    The default home is the user's.
+    """
     return Client(url, token=token, home=home, timeout=timeout)
 
 
@@ -147,7 +150,7 @@ class Client:
     # -- requests ----------------------------------------------------------------------------------------------------
 
     def request(self, method: str, path: str, body: Any = None, *, if_match: str | None = None) -> Any:
-        """One request below /api/v1; its JSON, or its text where it is noperation. Raises ApiError, LinkError."""
+        """Send one request below /api/v1; return its JSON, or its text otherwise. Raises ApiError, LinkError."""
         status, kind, octets = self._ask(method, path, None if body is None else json.dumps(body), if_match)
         try:
             value = json.loads(octets) if kind.startswith("application/json") else octets.decode()
@@ -215,7 +218,7 @@ class Client:
         return found
 
     def plant(self) -> Plant:
-        """The plant that the station belongs to; raises ApiError (404) where it joined none."""
+        """Return the plant that the station belongs to; raises ApiError (404) if it joined none."""
         found: Plant = self.request("GET", "/plant")
         return found
 
@@ -242,14 +245,17 @@ class Client:
     def past(
         self, node: str, channel: int, *, since: float | None = None, until: float | None = None, points: int = 600
     ) -> Past:
-        """The last hour of a channel, thinned to ``points`` bins; moments in unix seconds (None: an hour ago, now)."""
+        """Return the last hour of a channel, thinned to ``points`` bins.
+
+        Moments in unix seconds (None: an hour ago, now).
+        """
         asked = {"channel": channel, "points": points, "from": since, "until": until}
         words = urlencode({name: value for name, value in asked.items() if value is not None})
         found: Past = self.request("GET", f"/nodes/{quote(node, safe='')}/past?{words}")
         return found
 
     def teds(self, node: str) -> Sheet:
-        """A node's datasheet, decoded and checked."""
+        """Return a node's datasheet, decoded and checked."""
         found: Sheet = self.request("GET", f"/nodes/{quote(node, safe='')}/teds")
         self._keep_tag(node, found["uuid"])
         return found
@@ -270,7 +276,7 @@ class Client:
         """Write a datasheet (XML, JSON, hex); ``dry_run``: only show what that would change.
 
         ``accept_calibration``: why a calibration that the guard refuses is right. ``retype``: the board may become one
-        of another type than it says it is (else ApiError, ``wrong-board``).
+        of another type than it claims (else ApiError, ``wrong-board``).
 
         If this client has read the datasheet (:meth:`teds`, or a dry run) since it last wrote it, that reading is the
         condition: ApiError (412, ``changed``), and nothing is written, if the node has another datasheet by now.
@@ -299,8 +305,8 @@ class Client:
     ) -> Provisioning:
         """Provision a node, or the next that is tapped; ``calibration`` is the content of a file of that name.
 
-        ``adopt``: in place of a profile the datasheet that the board brought is signed; ``accept_calibration`` says why
-        it is right where something was found.
+        ``adopt``: in place of a profile the datasheet that the board brought is signed; ``accept_calibration`` is the
+        reason to accept it in spite of findings.
         """
         body = {
             "profile": profile,
@@ -315,11 +321,11 @@ class Client:
         return found
 
     def groups(self) -> list[Group]:
-        """The measurement groups."""
+        """Return the measurement groups."""
         return list(self.request("GET", "/groups")["groups"])
 
     def measurements(self) -> list[Measurement]:
-        """What is measured."""
+        """Return the measurements."""
         return list(self.request("GET", "/measurements")["measurements"])
 
     def measure(
@@ -337,9 +343,9 @@ class Client:
         dead_man: int | None = None,
         scalar_rate: float | None = None,
     ) -> Measurement:
-        """Measure nodes, a ``group``, or whoever comes and is meant by ``match``, from now on.
+        """Measure nodes, a ``group``, or nodes that ``match`` selects as they come, from now on.
 
-        ``rate`` and ``scalar_rate`` in Hz, ``dead_man`` in ms. ``frozen``: nobody joins later, none is let go.
+        ``rate`` and ``scalar_rate`` in Hz, ``dead_man`` in ms. ``frozen``: the members are fixed at the start.
         """
         body = {
             "uuids": uuids,
@@ -371,21 +377,21 @@ class Client:
         return found
 
     def release_actuator(self, node: str, channel: int) -> bool | None:
-        """Let an actuator go; whether the node reports that it is safe, None where it did not say."""
+        """Release an actuator; return whether the node reports that it is safe, None without a report."""
         found: Applied = self.request("PUT", f"/nodes/{quote(node, safe='')}/channels/{channel}", {"hold": 0})
         return found["safe"]
 
     def log(self, last: int = 200) -> list[Entry]:
-        """The newest entries of the audit log."""
+        """Return the newest entries of the audit log."""
         return list(self.request("GET", f"/log?limit={last}")["entries"])
 
     def login_url(self, *, read_only: bool = False) -> str:
-        """The page's address with a token that works once; over the Unix socket only."""
+        """Return the page's address with a token that works once; over the Unix socket only."""
         return str(self.request("POST", "/login-link", {"read_only": read_only})["url"])
 
     @contextmanager
     def readers(self) -> Iterator[bool]:
-        """Have the readers of the base station for the length of the block; False where it does not run."""
+        """Borrow the readers of the base station for the block; False if it does not run."""
         connection = _UnixConnection(self._home / SOCKET, self._timeout)
         try:
             connection.request("GET", f"{API}/lend")
@@ -400,10 +406,10 @@ class Client:
 
     @contextmanager
     def released(self, uuid: str, command: str) -> Iterator[bool]:
-        """Have a node that the base station measures let go for the length of the block; then it is measured again.
+        """Have the base station release a node that it measures for the block; then it is measured again.
 
-        False where no base station runs, or it does not measure the node (``uuid``: 20 hex digits). Raises
-        PolicyError where it does not answer within :data:`LETTING_GO` seconds, or cannot let the node go.
+        False if no base station runs, or it does not measure the node (``uuid``: 20 hex digits). Raises PolicyError if
+        it does not answer within :data:`LETTING_GO` seconds, or cannot release the node.
         """
         connection = _UnixConnection(self._home / SOCKET, LETTING_GO)
         try:
@@ -430,7 +436,7 @@ class Client:
             connection.close()
 
     def live(self) -> Iterator[dict[str, Any]]:
-        """What happens now: ``hello``, then values, events and beats, until the connection ends.
+        """Yield live messages: ``hello``, then values, events and beats, until the connection ends.
 
         Needs the package websockets (the extra ``ncap``).
         """
@@ -457,7 +463,7 @@ class _UnixConnection(http.client.HTTPConnection):
         self._path = path
 
     def connect(self) -> None:
-        """Open it; raises LinkError (5) where nobody listens."""
+        """Open it; raises LinkError (5) if no server listens."""
         self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self.sock.settimeout(self.timeout)
         try:

@@ -2,10 +2,10 @@
 
 Every error that a user can meet is a :class:`TedsProvisionError`. Its class fixes the exit code of the command line
 (table "exit" of the command-line contract) and the stable word that ``--json`` reports as ``code``; the instance
-carries a one-sentence message (what happened and why) and a hint (what to do next). A foreign exception that escapes
-is a bug and ends with exit 1.
+carries a one-sentence message (what happened and why) and a hint (what to do next). A foreign exception that escapes is
+a bug and ends with exit 1.
 
-This module stands below every room and imports nothing.
+This module is below every room and imports nothing.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import re
 from typing import ClassVar, Final
 
 _LONG_WORD: Final = r"\S{513,}"
-"""Longer than any path or key that a person reads: somebody's five thousand letters, given back to him."""
+"""Longest word that is shown whole: longer than any path or key that a person reads."""
 
 
 def _shortened(text: str) -> str:
-    """The text with the middle left out of words that are too long to be read; an error has three lines."""
+    """Return the text with the middle left out of words that are too long to be read; an error has three lines."""
     return re.sub(_LONG_WORD, lambda word: f"{word[0][:200]}[…]{word[0][-40:]}", text)
 
 
@@ -35,7 +35,7 @@ class TedsProvisionError(Exception):
 
 
 class InternalError(TedsProvisionError):
-    """A foreign exception where a thread would have ended without a word (exit 1)."""
+    """A foreign exception that would otherwise end a thread silently (exit 1)."""
 
     code = "bug"
 
@@ -107,7 +107,7 @@ class NodeSilentError(LinkError):
 
 
 class GarbledError(LinkError):
-    """What came over the link is torn, corrupt or breaks the wire format."""
+    """A message over the link is torn, corrupt or breaks the wire format."""
 
     code = "garbled"
 
@@ -184,7 +184,7 @@ class NotMemberError(PolicyError):
 
 
 class RosterExpiredError(PolicyError):
-    """The roster is older than the owner's CA said that it may become."""
+    """The roster is older than the owner's CA allows."""
 
     code = "roster-expired"
 
@@ -241,7 +241,7 @@ class UnknownMasterKeyError(VaultError):
 
 
 class VaultChangedError(VaultError):
-    """What a person was asked about is not true any more: another command changed the vault meanwhile."""
+    """The question that an operator answered is obsolete: another command changed the vault meanwhile."""
 
     code = "vault-changed"
 
@@ -253,7 +253,7 @@ class VaultLockedError(VaultChangedError):
 
 
 class NoPassphraseError(VaultError):
-    """A passphrase or PIN is needed, and nobody can be asked for it."""
+    """A passphrase or PIN is needed, and there is no terminal to ask at."""
 
     code = "no-passphrase"
 

@@ -1,9 +1,9 @@
 """Files written whole or not at all, and read with a limit: the one way for every room.
 
-A new file begins under a temporary name of our own in the same folder (``.NAME.<16 hex digits>.teds-part``), made with
-``O_EXCL``, so a planted link is never written through. It gets its name only when its octets are on the disk; the
-folder is brought to the disk after that. What a killed writer left is recognised by that name and by the lock that its
-writer held, and removed by the next one; nothing else in the folder is ever touched.
+A new file begins under a temporary name in the same folder (``.NAME.<16 hex digits>.teds-part``), made with ``O_EXCL``,
+so a planted link is never written through. It gets its name only when its octets are on the disk; the folder is brought
+to the disk after that. The file of a killed writer is recognised by that name and by the lock that its writer held, and
+removed by the next one; nothing else in the folder is ever touched.
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ def write_whole(
 ) -> None:
     """Put a file in the place of ``path``, whole and durable.
 
-    Raises UsageError where a folder lies there, NotFoundError where its own is missing (and ``failure`` is no other
-    one), else ``failure``; the old file is then as it was.
+    Raises UsageError if a folder is there, NotFoundError if its own is missing (and ``failure`` is no other one), else
+    ``failure``; the old file is then as it was.
     """
     try:
         with whole_file(path, replace=True, mode=mode) as file:
@@ -98,9 +98,9 @@ def write_whole(
 
 
 def open_lock(path: Path) -> int:
-    """Open the file that is locked while another one is changed, made where it is missing; returns its descriptor.
+    """Open the file that is locked while another one is changed, made if it is missing; return its descriptor.
 
-    Raises StoreError where it cannot be made: the first thing that a read-only or full disk refuses.
+    Raises StoreError if it cannot be made: the first thing that a read-only or full disk refuses.
     """
     try:
         return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
@@ -118,9 +118,9 @@ def write_new(
 
 @contextmanager
 def new_file(path: Path, *, mode: int = PRIVATE, failure: type[TedsProvisionError] = StoreError) -> Iterator[BinaryIO]:
-    """Give a new file to write; when the block ends well it becomes ``path``, whole and durable, never over another.
+    """Yield a new file to write; when the block ends well it becomes ``path``, whole and durable, never over another.
 
-    Raises UsageError where something lies at ``path``, NotFoundError where its folder is missing, else ``failure``.
+    Raises UsageError if ``path`` exists, NotFoundError if its folder is missing, else ``failure``.
     """
     require_new(path)
     try:
@@ -133,7 +133,7 @@ def new_file(path: Path, *, mode: int = PRIVATE, failure: type[TedsProvisionErro
 
 
 def require_new(path: Path) -> None:
-    """Raise UsageError where something lies at ``path``, NotFoundError where there is no folder for it."""
+    """Raise UsageError if ``path`` exists, NotFoundError if there is no folder for it."""
     if path.exists() or path.is_symlink():
         raise _taken(path)
     if not path.parent.is_dir():
@@ -174,16 +174,16 @@ def read_text(path: Path, max_octets: int, what: str, *, failure: type[TedsProvi
 
 
 def open_to_read(path: Path) -> BinaryIO:
-    """Open a file to read from; raises NotFoundError where it is not there or cannot be read."""
+    """Open a file to read from; raises NotFoundError if it does not exist or cannot be read."""
     with _failing_as(path, NotFoundError):
         return open(_opened(path), "rb")
 
 
 def _opened(path: Path, flags: int = 0) -> int:
-    """Open what is read to its end; raises OSError, NotFoundError for a named pipe.
+    """Open a file that is read to its end; raises OSError, NotFoundError for a named pipe.
 
-    Whoever opens a pipe that nobody writes to waits for ever. The pipe of a shell's ``<(command)`` has no name but that
-    of its descriptor, and somebody writes to it.
+    Opening a pipe without a writer waits for ever. The pipe of a shell's ``<(command)`` has no name but that of its
+    descriptor, and has a writer.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | flags)
     mode = os.fstat(descriptor).st_mode
@@ -197,7 +197,7 @@ def _opened(path: Path, flags: int = 0) -> int:
 
 
 def require_no_pipe(path: Path) -> None:
-    """Raise NotFoundError where a named pipe lies, before somebody else's code opens it and waits."""
+    """Raise NotFoundError for a named pipe, before foreign code opens it and waits."""
     with suppress(OSError, ValueError):
         if stat.S_ISFIFO(path.stat().st_mode) and _is_named(path):
             raise NotFoundError(f"{path} is a pipe, not a file.")
@@ -209,7 +209,7 @@ def _is_named(path: Path) -> bool:
 
 @contextmanager
 def _failing_as(path: Path, failure: type[TedsProvisionError]) -> Iterator[None]:
-    """Say why a file cannot be read."""
+    """Report why a file cannot be read."""
     try:
         yield
     except FileNotFoundError:
@@ -235,10 +235,9 @@ def _read(descriptor: int, most: int) -> bytes:
 
 
 def json_files(paths: Sequence[Path], what: str) -> list[str]:
-    """Files that are named, and every ``*.json`` below folders that are named, by name; each once.
+    """Return named files, and every ``*.json`` below named folders, by name; each once.
 
-    As text: paths are made of them where they are read, by several processes. Raises NotFoundError, which says ``what``
-    is missing, for a folder without one; a file that is not there is left to whoever reads it.
+    As text: paths are made of them where they are read, by several processes.
     """
     found: list[str] = []
     for path in paths:
@@ -253,7 +252,7 @@ def json_files(paths: Sequence[Path], what: str) -> list[str]:
 
 
 def _below(folder: str) -> Iterator[str]:
-    """The JSON files in a folder and its folders, by name; neither links to folders nor what cannot be looked into."""
+    """Yield the JSON files in a folder and its folders, by name; neither links to folders nor unreadable ones."""
     here: list[os.DirEntry[str]] = []
     with suppress(OSError), os.scandir(folder) as entries:
         here = sorted(entries, key=attrgetter("name"))
@@ -265,7 +264,7 @@ def _below(folder: str) -> Iterator[str]:
 
 
 def _is_folder(entry: os.DirEntry[str]) -> bool:
-    """Whether it is a folder itself; its own folder knew that already, so that most need no look at the disk."""
+    """True if it is a folder itself; the directory entry knows that already, so that most need no look at the disk."""
     try:
         return entry.is_dir(follow_symlinks=False)
     except OSError:
@@ -273,7 +272,7 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 
 def _is_file(entry: os.DirEntry[str]) -> bool:
-    """Whether it is a file, or a link to one."""
+    """True if it is a file, or a link to one."""
     try:
         return entry.is_file()
     except OSError:
@@ -281,7 +280,7 @@ def _is_file(entry: os.DirEntry[str]) -> bool:
 
 
 def holds(path: Path, octets: bytes) -> bool:
-    """Whether a regular file holds exactly these octets; no more of it is read than they are long. Raises OSError."""
+    """True if a regular file holds exactly these octets; reads no more of it than their length. Raises OSError."""
     if not path.is_file():
         return False
     with open_to_read(path) as file:
@@ -315,7 +314,7 @@ def private_folder(folder: Path) -> Path:
 
 @contextmanager
 def short_path(path: Path) -> Iterator[str]:
-    """A name for a Unix socket that the system takes, however deep its folder lies; raises OSError."""
+    """Yield a name for a Unix socket that the system takes, however deep its folder is; raises OSError."""
     if len(os.fsencode(path)) <= _LONGEST_SOCKET:
         yield str(path)
         return
@@ -327,7 +326,7 @@ def short_path(path: Path) -> Iterator[str]:
 
 
 def listen_alone(path: Path, waiting: int) -> socket.socket:
-    """A Unix socket that only this user can reach; what a killed process left is replaced. Raises StoreError."""
+    """Return a Unix socket that only this user can reach; that of a killed process is replaced. Raises StoreError."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     before = os.umask(0o177)  # its mode is set when it is bound: there is no moment in which others may connect
     try:
@@ -360,7 +359,7 @@ def _publish(draft: Path, path: Path, *, replace: bool) -> None:
 
 
 def _sweep(path: Path) -> None:
-    """Remove what killed writers of ``path`` left: a name of our own, our file, old, and locked by nobody."""
+    """Remove the files of killed writers of ``path``: a temporary name, our file, old, and without a lock."""
     ours = re.compile(re.escape(f".{path.name}.") + "[0-9a-f]{16}" + re.escape(_SUFFIX))
     with suppress(OSError):
         for name in os.listdir(path.parent):

@@ -1,6 +1,6 @@
-"""Rooms whose modules and names are loaded at their first use (PEP 562), so that imports stand on top and cost nothing.
+"""Rooms whose modules and names are loaded at their first use (PEP 562), so that top-level imports cost nothing.
 
-A room's ``__init__`` names its modules for type checkers and has them loaded late for everybody else::
+A room's ``__init__`` names its modules for type checkers and has them loaded late for everything else::
 
     if TYPE_CHECKING:
         from teds_provision.handover import life, trust
@@ -11,7 +11,7 @@ Users write ``from teds_provision import handover`` on top and ``handover.trust.
 call loads the module. ``from teds_provision.handover.trust import spoken`` on top loads it at once, which is right for
 what every use of a module needs.
 
-This module stands below every room and imports nothing of ours.
+This module is below every room and imports nothing of ours.
 """
 
 from __future__ import annotations
@@ -26,11 +26,10 @@ _NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
 
 
 def lazy(package: str, names: Mapping[str, str] = _NOTHING) -> Callable[[str], object]:
-    """Return the ``__getattr__`` of a package: it gives the package's modules, and names out of them.
+    """Return the ``__getattr__`` of a package, which resolves its modules, and names out of them.
 
-    ``names`` says which of its modules has which: ``{"fitting": "fit residuals"}`` is ``package.fit`` and
-    ``package.residuals`` of ``package.fitting``. No such name may be a module's too: Python would put the module in
-    its place.
+    ``names`` maps a module to its names: ``{"fitting": "fit residuals"}`` is ``package.fit`` and ``package.residuals``
+    of ``package.fitting``. No such name may be a module's too: Python would put the module in its place.
     """
     where = {name: module for module, listed in names.items() for name in listed.split()}
 
@@ -52,7 +51,7 @@ def lazy(package: str, names: Mapping[str, str] = _NOTHING) -> Callable[[str], o
 
 
 class _LateModule:
-    """Stands for a module until something of it is asked for; keeps what was asked for."""
+    """A placeholder of a module until its first use; caches what was used."""
 
     def __init__(self, module: str) -> None:
         self.__dict__["_module"] = module
@@ -64,7 +63,7 @@ class _LateModule:
 
 
 def late(module: str) -> object:
-    """Return what stands for a heavy library until its first use, so that its import can stand on top.
+    """Return a placeholder of a heavy library until its first use, so that its import can be at the top.
 
     For type checkers: ``if TYPE_CHECKING: import numpy as np``, ``else: np = late("numpy")``.
     """
@@ -117,15 +116,15 @@ def package_of(module: str) -> str:
 
 
 def how_to_install(extra: str) -> str:
-    """The command that adds one of our extras to this installation, as a hint."""
+    """Return the command that adds one of our extras to this installation, as a hint."""
     return f"Install it: {install_command(f'{_TOOL}[{extra}]')}"
 
 
 def install_command(*requirements: str) -> str:
-    """The command that adds requirements to this installation, wherever it is.
+    """Return the command that adds requirements to this installation, wherever it is.
 
-    ``uv tool`` undoes at its next upgrade what it was not told, so it is told all again; ``pipx inject`` takes no extra
-    of the tool itself from version 1.5 on; an environment of uv's has no pip.
+    ``uv tool`` drops at its next upgrade what it was not given, so it is given all again; ``pipx inject`` takes no
+    extra of the tool itself from version 1.5 on; an environment of uv's has no pip.
     """
     prefix = pathlib.Path(sys.prefix)
     quoted = " ".join(map(shlex.quote, requirements))

@@ -1,8 +1,8 @@
 """How much of a file is read: the limits of every reader in one place, stated in docs/formats.md.
 
-What comes from outside is looked at cheaply (octets, tags, brackets, depth) before anything is built from it, so that
-no file costs more than 10 s and 300 MB. Every check raises BadDataError that says what is too much and where the limit
-is. This module stands below every room and imports nothing of ours but the errors.
+Untrusted input is checked cheaply (octets, tags, brackets, depth) before anything is built from it, so that no file
+costs more than 10 s and 300 MB. Every check raises BadDataError that names the excess and the limit. This module is
+below every room and imports nothing of ours but the errors.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ _STRINGS: Final = re.compile(r"""\"(?:[^"\\]|\\.)*+\"|'[^'\n]*+'|\#[^\n]*+""")
 
 
 def check_size(octets: int, limit: int, what: str) -> None:
-    """Raise BadDataError where something has more octets (or characters) than are read."""
+    """Raise BadDataError if something has more octets (or characters) than the limit allows."""
     if octets > limit:
         raise BadDataError(f"{_upper(what)} has {octets} octets; at most {limit} are read.")
 
 
 def check_count(count: int, limit: int, what: str) -> None:
-    """Raise BadDataError where there are more of something than are read."""
+    """Raise BadDataError if there are more of something than the limit allows."""
     if count > limit:
         raise BadDataError(f"There are {count} {what} here; at most {limit} are read.")
 
@@ -97,7 +97,7 @@ def load_json(text: str | bytes, what: str, *, octets: int = LIMITS.teds_file, f
 
 
 def check_depth(value: object, limit: int, what: str) -> None:
-    """Raise BadDataError where lists and tables nest deeper than ``limit``; walks level by level, never deeper."""
+    """Raise BadDataError if lists and tables nest deeper than ``limit``; walks level by level, never deeper."""
     level: list[object] = [value]
     for _ in range(limit + 1):
         inside: list[object] = []

@@ -13,7 +13,7 @@ else:
 
 
 def printable(text: str) -> str:
-    """A name as a node gives it, without the characters that control a terminal or reverse the direction of text."""
+    """Return a node's name without the characters that control a terminal or reverse the direction of text."""
     if text.isprintable():
         return text
     return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)
@@ -27,9 +27,9 @@ def sanitize(text: str) -> str:
 
 
 def sanitize_json(text: str) -> str:
-    """JSON with every character that is not printable escaped: same meaning, and no control of the terminal.
+    """Return JSON with every unprintable character escaped: same meaning, and no control of the terminal.
 
-    JSON itself escapes only what lies below U+0020; a terminal also obeys U+009B, and U+202E reverses what people read.
+    JSON itself escapes only what is below U+0020; a terminal also obeys U+009B, and U+202E reverses what people read.
     """
     if text.isprintable():
         return text

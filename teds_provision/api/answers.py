@@ -1,4 +1,4 @@
-"""What answers hold: each class is a schema of the description, under its own name.
+"""Answers of the API: each class is a schema of the description, under the same name.
 
 Values are in the SI unit of the datasheet, times in unix seconds unless they are texts. More members may come.
 """
@@ -16,7 +16,7 @@ _Origin = TypedDict("_Origin", {"from": Literal["session", "kept", "plain"]})  #
 
 
 class Problem(TypedDict):
-    """What is wrong, and what to do about it."""
+    """An error and its remedy."""
 
     code: str
     message: str
@@ -134,7 +134,7 @@ class Report(TypedDict):
 
 
 class Verdict(_Origin):
-    """Whether a datasheet is authentic, and how that is known."""
+    """Verdict on a datasheet, and how it is known."""
 
     verdict: Literal["authentic", "unsigned", "unverified", "not authentic", "unproven"]
     checks: list[Check]
@@ -220,7 +220,7 @@ class Measurement(TypedDict):
 
 
 class Sink(TypedDict):
-    """Where values go, and what became of them."""
+    """A destination of values, with its counters."""
 
     measurement: str
     name: str
@@ -313,7 +313,7 @@ class Change(TypedDict):
 
 
 class Finding(TypedDict):
-    """What the guard says of a datasheet."""
+    """The guard's finding on a datasheet."""
 
     severity: str
     message: str
@@ -369,7 +369,7 @@ class Step(TypedDict):
 
 
 class SheetPlan(TypedDict):
-    """What writing a datasheet changes, or changed."""
+    """Changes that writing a datasheet makes, or made."""
 
     uuid: Uuid
     dry_run: bool
@@ -392,7 +392,7 @@ class Provisioning(TypedDict):
 
 
 class AppliedValue(TypedDict):
-    """What an actuator was set to."""
+    """The value to which an actuator was set."""
 
     channel: int
     value: float
@@ -401,7 +401,7 @@ class AppliedValue(TypedDict):
 
 
 class Applied(TypedDict):
-    """What became of a set point."""
+    """Result of a set point."""
 
     applied: AppliedValue | None
     until: float | None
@@ -461,7 +461,7 @@ class DetectionMode(TypedDict):
 
 
 class PlantStation(TypedDict):
-    """Where a station of the plant stands: its newest page that counts, and seconds since that was made."""
+    """State of a station of the plant: its newest page that counts, and seconds since that was made."""
 
     name: str
     fingerprint: str
@@ -480,7 +480,7 @@ class PlantConflict(TypedDict):
 
 
 class PlantAlarm(TypedDict):
-    """What a person has to know of the plant, or to decide."""
+    """An alarm of the plant for an operator to note, or to decide."""
 
     code: str
     about: str
@@ -508,7 +508,7 @@ class Plant(TypedDict):
 
 
 class PlantClaims(TypedDict):
-    """What the stations of the plant say of one node; ``holders`` by key id."""
+    """The stations' claims about one node; ``holders`` by key id."""
 
     uuid: Uuid
     name: str | None
@@ -524,7 +524,7 @@ class PlantNodes(TypedDict):
 
 
 class Job(TypedDict):
-    """What a keeper lets a line build; ``units`` and ``passed`` are those of this station."""
+    """What a keeper permits a line to build; ``units`` and ``passed`` are those of this station."""
 
     id: str
     title: str
@@ -547,7 +547,7 @@ class LineStation(TypedDict):
 
     ``first_pass`` is the share of its boards that passed at their first attempt; ``failures`` counts attempts by the
     code that ended them, ``steps`` holds median and worst seconds of each step: from evidence that is here, of other
-    stations from their pages, which say no seconds.
+    stations from their pages, which contain no seconds.
     """
 
     station: str

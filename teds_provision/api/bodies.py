@@ -1,7 +1,7 @@
-"""What a request may say: each class is the body of one operation, in the order of ``operations``.
+"""Request bodies: each class is the body of one operation, in the order of ``operations``.
 
-A member that may be left out may be null too. What only the state of the station decides (is there such a node, may
-this name be taken) is not here: it has error codes of its own.
+A member that may be left out may be null too. Conditions that depend on the station's state (does the node exist, may
+this name be taken) are not here: they have separate error codes.
 """
 
 from __future__ import annotations

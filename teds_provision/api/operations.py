@@ -137,7 +137,7 @@ REFUSALS: Final = {
 
 
 def document() -> dict[str, Any]:
-    """The whole description."""
+    """Return the whole description."""
     named: dict[str, Schema] = {}
     paths: dict[str, dict[str, Any]] = {}
     for operation in OPERATIONS:

@@ -1,7 +1,7 @@
 """From a type to its JSON schema (2020-12, as OpenAPI 3.1 takes it), and from JSON to a value of that type.
 
-A value is checked against the schema itself, so that a body is refused exactly where the published description forbids
-it. The subset is what the types of this room need: type, enum, const, pattern, minLength, maxLength, minimum, maximum,
+A value is checked against the schema itself, so that a body is refused exactly if the published description forbids it.
+The subset is what the types of this room need: type, enum, const, pattern, minLength, maxLength, minimum, maximum,
 minItems, items, properties, required, additionalProperties, anyOf, oneOf.
 """
 
@@ -32,7 +32,7 @@ Shape = TypeVar("Shape")
 
 
 class Meta:
-    """What a schema says beside the type: ``Annotated[float, Meta(minimum=0)]``."""
+    """Schema keywords beside the type: ``Annotated[float, Meta(minimum=0)]``."""
 
     def __init__(self, **facts: Any) -> None:
         self.facts = facts
@@ -50,7 +50,7 @@ _PLAIN: Final = {str: "string", int: "integer", float: "number", bool: "boolean"
 
 
 def schema_of(shape: Any, named: dict[str, Schema]) -> Schema:
-    """The schema of a type. Typed dictionaries become references; their own schemas are put into ``named``."""
+    """Return the schema of a type. Typed dictionaries become references; their own schemas are put into ``named``."""
     if is_typeddict(shape):
         if shape.__name__ not in named:
             named[shape.__name__] = {}  # here already, should it hold itself
@@ -95,11 +95,11 @@ def schema_of(shape: Any, named: dict[str, Schema]) -> Schema:
 
 
 def read(shape: type[Shape], octets: bytes) -> Shape:
-    """A body of that shape; nothing at all counts as ``{}``. A member that is null is as one that is not there.
+    """Return a body of that shape; an empty one counts as ``{}``. A null member counts as absent.
 
     Raises BadRequestError for what is not JSON (RFC 8259: UTF-8 alone, no byte order mark, no NaN, no half of a
-    surrogate pair), for two members of one name (section 4: each reader takes another of them, so what was checked in
-    front of us is not what we would do), and for what the schema forbids.
+    surrogate pair), for two members of one name (section 4: readers differ on which one they take, so a check in front
+    of us might see the other one), and for what the schema forbids.
     """
     try:
         text = octets.decode()
@@ -129,9 +129,9 @@ def _no_constant(name: str) -> Any:
 
 
 def fit(schema: Schema, value: Any, where: str = "") -> Any:
-    """The value as its schema has it (1.0 is the integer 1, 1 the number 1.0); raises BadRequestError if it forbids it.
+    """Return the value as its schema has it (1.0 is the integer 1, 1 the number 1.0); BadRequestError if forbidden.
 
-    ``where`` names the value in what is said: ``uuids[2]``.
+    ``where`` names the value in the message: ``uuids[2]``.
     """
     kinds = schema.get("type", [])
     kind = _kind_of(value, kinds if isinstance(kinds, list) else [kinds])

@@ -42,7 +42,10 @@ _SETTINGS: Final = {
 
 
 def programs() -> Path | None:
-    """The folder of the newest server's programs (15 or newer), None where Debian's `postgresql` is not installed."""
+    """Return the folder of the newest server's programs (15 or newer).
+
+    None if Debian's `postgresql` is not installed.
+    """
     found = [
         room for room in _ROOMS.glob("*/bin/postgres") if room.parts[-3].isdigit() and int(room.parts[-3]) >= _OLDEST
     ]
@@ -51,7 +54,7 @@ def programs() -> Path | None:
 
 
 def runs_as() -> str | None:
-    """The user that the server runs as: oneself, or as root ``postgres``; None where root has no such user."""
+    """Return the user that the server runs as: this one, or as root ``postgres``; None if root has no such user."""
     me = pwd.getpwuid(os.geteuid()).pw_name if os.geteuid() else SUPERUSER
     with suppress(KeyError):
         return pwd.getpwnam(me).pw_name
@@ -74,7 +77,7 @@ class Cluster:
 
     @property
     def root_certificate(self) -> Path:
-        """What a client verifies it with."""
+        """Certificate with which a client verifies it."""
         return self.folder / "root.crt"
 
     @property
@@ -84,7 +87,7 @@ class Cluster:
         return self._server.pid
 
     def url(self, database: str) -> str:
-        """What `registry connect` takes."""
+        """Return the URL for `registry connect`."""
         return f"postgresql://localhost:{self.port}/{database}?sslrootcert={self.root_certificate}"
 
     def psql(self, text: str, database: str = "postgres") -> str:
@@ -163,7 +166,7 @@ class Cluster:
 
 @contextmanager
 def running(folder: Path, port: int, bin: Path) -> Iterator[Cluster]:
-    """Give a server with data of its own in ``folder``, which user ``postgres`` must be able to reach."""
+    """Run a separate server with its data in ``folder``, which user ``postgres`` must be able to reach."""
     made = Cluster(folder, port, bin)
     made.make()
     made.start()

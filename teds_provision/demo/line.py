@@ -1,6 +1,6 @@
 """A line on one machine: an order for three boards, an office that signs, a bench that builds, and proof of each.
 
-What goes wrong on purpose: a board of another type, one board too many, and one that somebody changes afterwards.
+Faults on purpose: a board of another type, one board too many, and one that is changed afterwards.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from teds_provision.teds.profile.load import find_profile
 OTHER = "tactile-finger-sensor"
 BOARDS = 3
 _LOGIN = "SCRAM-SHA-256$4096:" + "A" * 22 + "==$" + "B" * 43 + "=:" + "C" * 43 + "="
-"""The verifier of no password: nobody logs in anywhere in the demo."""
+"""A verifier without a password: there are no logins in the demo."""
 
 
 @dataclass(frozen=True)
 class LineDemoResult:
-    """What the line came to: its steps, units that passed, evidence by verdict, and the boards that were refused."""
+    """Result of the line: its steps, units that passed, evidence by verdict, and the boards that were refused."""
 
     steps: tuple[StepResult, ...]
     passed: int
@@ -161,7 +161,7 @@ def _build(demo: Demo, line: LineRun, uuid: bytes) -> int:
 
 
 def _tamper(folder: Path) -> None:
-    """Change a digit of a TEDS where it lies in the flash of a virtual node, past its station and its key."""
+    """Change a digit of a TEDS in the flash of a virtual node, bypassing its station and its key."""
     file = folder / "flash.json"
     told = json.loads(file.read_text(encoding="utf-8"))
     blocks = told["flash"]["blocks"]

@@ -1,7 +1,7 @@
-"""The demo with a page: a base station that runs, three virtual transducers that it made, a group that is measured.
+"""The demo with a page: a running base station, three virtual transducers that it made, a measured group.
 
-The station is the real one (``ncap run`` in a process of its own), its home is thrown away, and it is reached on
-127.0.0.1 alone. A fourth node waits beside the simulated reader: powering it is a tap.
+The station is the real one (``ncap run`` in a process), its home is thrown away, and it is reached on 127.0.0.1 alone.
+A fourth node waits beside the simulated reader: powering it is a tap.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _ENDING: Final = 15.0
 
 @dataclass(frozen=True)
 class PageDemo:
-    """What runs: the page's address with a token that works once, the home, and the command that lays a node down."""
+    """A running demo: the page's address with a token that works once, the home, and the command that places a node."""
 
     url: str
     home: Path
@@ -134,7 +134,7 @@ def _run(*words: str) -> None:
 
 
 def _failure(said: bytes) -> TedsProvisionError:
-    """The error of a process of ours, from its line of JSON."""
+    """Return the error of a child process, from its line of JSON."""
     try:
         error: dict[str, Any] = json.loads(said)["error"]
         return TedsProvisionError(str(error["message"]), hint=str(error["hint"]))

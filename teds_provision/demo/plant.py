@@ -1,7 +1,7 @@
 """Three stations of one owner and their registry: from the roster to a stolen station whose datasheet is refused.
 
-The registry is a PostgreSQL of the demo's own where Debian's server is installed, else a folder. Stations, database and
-a virtual board (a process of its own, on a CAN bus over multicast) are gone at the end.
+The registry is a PostgreSQL for the demo if Debian's server is installed, else a folder. Stations, database and a
+virtual board (a process, on a CAN bus over multicast) are gone at the end.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ class _Story:
         return plant.connecting.database(station, self.server.url(_DATABASE))
 
     def _login(self, station: Station) -> Any:
-        """The station's request, and at the database its login."""
+        """Make the station's request, and its login at the database."""
         asked = open_request(plant.membership.request(station))
         if self.server is not None:
             self.server.psql(plant.schema.member_sql(asked.fingerprint, asked.login), _DATABASE)

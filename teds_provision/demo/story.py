@@ -1,6 +1,6 @@
 """The whole story on one machine: two base stations, one virtual node, NFC and CAN frames, a handover.
 
-The node is a process of its own; the stations live in this one, with throwaway homes and vaults that are deleted at the
+The node is a separate process; the stations live in this one, with throwaway homes and vaults that are deleted at the
 end. Nothing leaves the machine: NFC goes over UDP on 127.0.0.1, CAN over multicast with hop limit 0.
 """
 
@@ -60,7 +60,7 @@ else:  # numpy and what measuring needs are loaded when the demo gets there
 
 @dataclass
 class Demo:
-    """What the demo is at: its folder, stations, links and the steps so far."""
+    """State of the demo: its folder, stations, links and the steps so far."""
 
     folder: Path
     reporter: Reporter
@@ -172,12 +172,12 @@ def calibrations(folder: Path) -> dict[str, Path]:
 
 
 def provision_gripper(demo: Demo, station: Station, uuid: bytes, calibration: Path) -> None:
-    """The same steps for a node without NFC, over the bus that it hangs on."""
+    """Do the same steps for a node without NFC, over its bus."""
     provision_over(demo, station, "can", uuid, BuildOrder(GRIPPER, calibration=calibration, name="hand"))
 
 
 def calibrate_sensor(demo: Demo, station: Station, calibration: Path) -> None:
-    """A new datasheet for the sensor, with its calibration; signed and written by its new owner."""
+    """Give the sensor a new datasheet with its calibration; signed and written by its new owner."""
     order = BuildOrder("magnetic-angular-position-sensor", calibration=calibration, name="crane slew angle")
     provision_over(demo, station, "can", demo.uuid, order)
 
@@ -204,7 +204,7 @@ def measure_group(demo: Demo, station: Station, uuids: tuple[bytes, ...]) -> Non
 
 
 def _last_row(file: Path) -> str:
-    """The newest calibrated value of each column that has a unit, as people read it."""
+    """Return the newest calibrated value of each column that has a unit, as people read it."""
     with file.open(encoding="utf-8", newline="") as lines:
         rows = list(csv.reader(line for line in lines if not line.startswith("#")))
     newest = {
@@ -292,7 +292,7 @@ def _measure(demo: Demo, station: Station) -> None:
 
 
 def new_station(demo: Demo, name: str) -> Station:
-    """A station with a throwaway vault, closed with the demo."""
+    """Return a station with a throwaway vault, closed with the demo."""
     secret = secrets.token_hex(16)
     with demo.steps.step("init") as step:
         station, _ = initialise(
@@ -316,7 +316,7 @@ def _over_can(demo: Demo, station: Station) -> None:
 
 @contextmanager
 def _node(demo: Demo, name: str, profile: str, *links: str) -> Iterator[bytes]:
-    """A virtual transducer in a process of its own, while the context lasts; gives its UUID."""
+    """Run a virtual transducer in a process while the context lasts; yield its UUID."""
     folder = make_node(demo, name, profile)
     with run_node(folder, *links, "--can", demo.can, "--source", "sine:4") as uuid:
         yield uuid
@@ -365,7 +365,7 @@ def _ready(process: subprocess.Popen[str]) -> bytes:
 
 
 def _failure(what: str, said: str) -> LinkError:
-    """Tell what the node's process said on its stdout: an error as JSON, or nothing that can be read."""
+    """Return the error from a node process's stdout: an error as JSON, or nothing readable."""
     try:
         error = json.loads(said)["error"]
         return LinkError(f"{what}: {error['message']}", hint=error["hint"])

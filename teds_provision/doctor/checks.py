@@ -22,7 +22,7 @@ Room = Literal["machine", "link", "store"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the doctor's report; ``fix`` is a command or one sentence, "" where nothing is wrong."""
+    """One line of the doctor's report; ``fix`` is a command or one sentence, "" if nothing is wrong."""
 
     name: str
     result: Result
@@ -32,7 +32,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class System:
-    """Where to look: the station's home, the root of the file system, the environment, and the links asked for."""
+    """What to check: the station's home, the root of the file system, the environment, and the requested links."""
 
     home: Path
     nfc: str | None = None
@@ -42,14 +42,14 @@ class System:
     root: Path = Path("/")
     environment: Mapping[str, str] = field(default_factory=lambda: os.environ)
     settings: Mapping[str, frozenset[str]] | None = None
-    """Names that config.toml may have, by table ("" outside of one); None where nobody knows them."""
+    """Valid names of config.toml, by table ("" outside of one); None if they are unknown."""
     bad_value: Callable[[Mapping[str, Any]], str] = lambda _: ""
-    """Says which value of config.toml no command takes, and why; "" where all are good."""
+    """Returns which value of config.toml no command takes, and why; "" if all are good."""
     ask: Callable[[str, bool], str] | None = None
-    """Gives the passphrase without asking anybody, None where nobody gave one."""
+    """Returns the passphrase without a prompt, None if it was not given."""
 
     def at(self, path: str) -> Path:
-        """A path of the system, below the root that is looked at."""
+        """Return a path of the system, below the checked root."""
         return self.root / path.lstrip("/")
 
 
@@ -59,7 +59,7 @@ _MODULES: Final = ("machine", "links", "station", "fleet", "plant")
 
 
 def check(name: str, room: Room) -> Callable[[Look], Look]:
-    """Register a check under its name; ``room`` decides the exit code where it fails."""
+    """Register a check under its name; ``room`` decides the exit code if it fails."""
 
     def register(look: Look) -> Look:
         CHECKS[name] = (room, look)

@@ -1,4 +1,4 @@
-"""What the doctor looks at among the nodes: what is due, what was left half done, what another program changed."""
+"""The doctor's checks of nodes: overdue work, unfinished runs, changes by another program."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _unknown(values: dict[str, Any], system: System) -> Iterator[str]:
 
 @check("profiles", "machine")
 def profiles(system: System) -> Iterator[Finding]:
-    """Can every profile in this home be read; the shipped ones are tested where they are made."""
+    """Check that every profile in this home can be loaded; the shipped ones are tested where they are made."""
     folder = system.home / "profiles"
     if not folder.is_dir():
         yield Finding("profiles", "skipped", f"There is no folder {folder}.")
@@ -80,7 +80,7 @@ def profiles(system: System) -> Iterator[Finding]:
 
 @check("store file", "store")
 def store_file(system: System) -> Iterator[Finding]:
-    """Is the store there where the vault is: one without the other is a loss."""
+    """Check that the store is there if the vault is: one without the other is a loss."""
     if (system.home / "vault.json").exists() and not has_store(system.home):
         why = f"{system.home} has a vault but no store: names, pins and wrapped keys of all nodes are missing."
         yield Finding("store file", "failed", why, "teds-provision restore FILE (a backup)")
@@ -88,7 +88,7 @@ def store_file(system: System) -> Iterator[Finding]:
 
 @check("nodes", "store")
 def nodes(system: System) -> Iterator[Finding]:
-    """What waits for somebody: calibrations that have ended, names twice, drafts, nodes never verified, rotations."""
+    """Report what needs an operator: ended calibrations, duplicate names, drafts, unverified nodes, rotations."""
     if not has_store(system.home):
         return
     with Store.open(system.home) as opened:
@@ -110,7 +110,7 @@ def nodes(system: System) -> Iterator[Finding]:
 
 @check("seals", "store")
 def seals(system: System) -> Iterator[Finding]:
-    """Do the rows that decide whom the station believes carry its seal; only where nobody has to be asked for that."""
+    """Check the MACs of the rows that decide whom the station trusts; only if no prompt is needed for that."""
     if not has_store(system.home):
         return
     station = Station.open(system.home, ask=system.ask or _nobody)

@@ -1,7 +1,7 @@
-"""What the doctor looks at around readers and buses: from sysfs and the file system, opening what was asked for only.
+"""The doctor's checks of readers and buses: from sysfs and the file system, opening only what was requested.
 
 Known readers are those of nfcpy 1.0.4 (nfc/clf/device.py). A partial path such as ``usb`` hides why a reader does not
-open, so each one is looked at by itself.
+open, so each one is checked separately.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ _LISTEN_SECONDS: Final = 0.5
 
 @check("nfc readers", "link")
 def readers(system: System) -> Iterator[Finding]:
-    """Every USB reader that nfcpy knows: may this user open it, and does something else hold it.
+    """Check every USB reader that nfcpy knows: this user's permission, and other users of the reader.
 
-    What is wrong with one is a failure only where a USB reader was asked for.
+    A fault of one is a failure only if a USB reader was requested.
     """
     found = False
     for device in sorted(system.at("/sys/bus/usb/devices").glob("*")):
@@ -108,7 +108,7 @@ def _pcscd(system: System, found: bool) -> Iterator[Finding]:
 
 @check("pc/sc", "link")
 def pcsc(system: System) -> Iterator[Finding]:
-    """Which PC/SC readers pcscd offers; a failure only where one was asked for."""
+    """Report the PC/SC readers of pcscd; a failure only if one was requested."""
     asked = (system.nfc or "").partition(":")[0] == "pcsc"
     if system.root != Path("/"):
         yield Finding("pc/sc", "skipped", "These checks are running on another machine's files.")
@@ -163,7 +163,7 @@ def nfc_loopback(system: System) -> Iterator[Finding]:
 
 @check("nfc", "link")
 def nfc(system: System) -> Iterator[Finding]:
-    """Open the reader that was asked for, and look what lies on it."""
+    """Open the requested reader, and check what is on it."""
     if system.nfc is None:
         yield Finding("nfc", "skipped", "No reader was given, so none was opened.", "")
         return
@@ -216,7 +216,7 @@ def can_interfaces(system: System) -> Iterator[Finding]:
 
 
 def _kernel_can() -> bool:
-    """Whether the kernel makes CAN sockets."""
+    """True if the kernel makes CAN sockets."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except (OSError, AttributeError):
@@ -225,7 +225,7 @@ def _kernel_can() -> bool:
 
 
 def _bitrate(system: System, name: str) -> tuple[int, str]:
-    """Bit rate (0: unknown) and state as ``ip`` tells them; sysfs has neither."""
+    """Return bit rate (0: unknown) and state from ``ip``; sysfs has neither."""
     if system.root != Path("/"):
         return 0, ""
     words = ["ip", "-details", "-json", "link", "show", name]
@@ -319,7 +319,7 @@ _MANY: Final = 5
 
 @check("bluetooth switches", "machine")
 def switches(system: System) -> Iterator[Finding]:
-    """Does the kernel know a Bluetooth adapter, and is it blocked by rfkill or by a switch."""
+    """Check that the kernel knows a Bluetooth adapter, and that neither rfkill nor a switch blocks it."""
     found = sorted(path.name for path in system.at("/sys/class/bluetooth").glob("hci*") if ":" not in path.name)
     if not found:
         yield Finding("bluetooth switches", "skipped", "The kernel has no Bluetooth adapter.")
@@ -369,7 +369,7 @@ def bluetooth(system: System) -> Iterator[Finding]:
 
 
 def _require(found: list[AdapterFacts], spec: BleSpec) -> None:
-    """Raise NoReaderError where there is no adapter, or not the one that was named."""
+    """Raise NoReaderError if there is no adapter, or not the one that was named."""
     if not found:
         raise NoReaderError("bluetoothd has no adapter.", hint="Plug one in; bluetoothctl list")
     if spec.adapter is not None and spec.adapter not in {adapter.name for adapter in found}:

@@ -1,4 +1,4 @@
-"""What the doctor looks at on any machine: Python, the libraries, libusb, the clock."""
+"""The doctor's checks of any machine: Python, the libraries, libusb, the clock."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def libraries(system: System) -> Iterator[Finding]:
 
 
 def _shadowed() -> Iterator[Finding]:
-    """The package ``ndef`` of PyPI installs a module of the name that nfcpy needs from ``ndeflib``."""
+    """Check for the package ``ndef`` of PyPI, whose module shadows the one that nfcpy needs from ``ndeflib``."""
     try:
         version = metadata.version("ndef")
     except metadata.PackageNotFoundError:
@@ -139,7 +139,7 @@ def _drift(system: System) -> float | None:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """The leading numbers of a version: enough to compare releases."""
+    """Return the leading numbers of a version: enough to compare releases."""
     numbers = []
     for part in version.split("."):
         digits = "".join(character for character in part if character.isdigit())

@@ -1,4 +1,4 @@
-"""What the doctor looks at in the plant: the registry that this station joined. No connection is opened."""
+"""The doctor's checks of the plant: the registry that this station joined. No connection is opened."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the doctor looks at in the station: home, store, audit log, vault, keyring, and the workspace's ``keys/``."""
+"""The doctor's checks of the station: home, store, audit log, vault, keyring, and the workspace's ``keys/``."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def _backups(opened: Store, nodes: int) -> Iterator[Finding]:
 
 @check("keyring", "store")
 def keyring(system: System) -> Iterator[Finding]:
-    """Which keyring would hold the keys, is it one that may, and does it answer; a failure only where it is used."""
+    """Check which keyring would hold the keys, whether it is permitted, and answers; a failure only if it is used."""
     used = _keystore(system)
     try:
         with _quiet_logging():
@@ -149,7 +149,7 @@ def _quiet_logging() -> Iterator[None]:
 
 @check("vault", "store")
 def vault(system: System) -> Iterator[Finding]:
-    """Is what holds the station's keys there; nobody is asked for a passphrase or PIN."""
+    """Check that the store of the station's keys is there, without a prompt for passphrase or PIN."""
     used = _keystore(system)
     if used is None:
         yield Finding("vault", "skipped", _NO_STATION, _INIT)
@@ -167,7 +167,7 @@ def vault(system: System) -> Iterator[Finding]:
 
 @check("unlock", "store")
 def unlocked(system: System) -> Iterator[Finding]:
-    """Does a process hold the vault open."""
+    """Report a process that holds the vault open."""
     left = agent.seconds_left(system.home)
     if left is None:
         yield Finding("unlock", "ok", "The vault is locked.")
@@ -200,7 +200,7 @@ def _keystore(system: System) -> str | None:
 
 @check("keys folder", "machine")
 def keys_folder(system: System) -> Iterator[Finding]:
-    """Does the workspace's ``keys/`` hold public keys only."""
+    """Check that the workspace's ``keys/`` holds public keys only."""
     folder = system.workspace / "keys"
     if not folder.is_dir():
         yield Finding("keys folder", "skipped", "There is no keys/ folder here.")
@@ -215,7 +215,7 @@ def keys_folder(system: System) -> Iterator[Finding]:
 
 
 def holds_private_key(path: Path) -> bool:
-    """Say whether a file holds a private key in PEM, a private JWK, or a private key of SSH or PKCS #8 in DER."""
+    """True if a file holds a private key in PEM, a private JWK, or a private key of SSH or PKCS #8 in DER."""
     try:
         with open_to_read(path) as file:
             octets = file.read(_MAX_KEY_FILE)

@@ -39,7 +39,7 @@ else:
     np = late("numpy")
 
 NOT_STATED: Final = math.nan
-"""Stands for a number that the TEDS do not give, or call not available: IEEE 1451.0 writes NaN for that itself."""
+"""Represents a number that the TEDS lack, or call not available: IEEE 1451.0 writes NaN for that itself."""
 ROUNDING: Final = 4 * 2.0**-23
 """Limits and coefficients are Float32: a value this much of the limit beyond it is not beyond it."""
 TURN: Final = 2 * math.pi
@@ -49,14 +49,14 @@ _RADIANS: Final = units_of(radians=1)
 
 
 def spans_a_turn(units: Units, low: float, high: float) -> bool:
-    """Whether limits in SI units are one turn apart, so that an angle beyond one of them comes back at the other."""
+    """True if limits in SI units are one turn apart, so that an angle beyond one of them comes back at the other."""
     return units == _RADIANS and abs(high - low - TURN) < _NEARLY_A_TURN
 
 
 def wrapped(values: NDArray[np.float64], low: Ends, high: Ends, turn: Ends) -> NDArray[np.float64]:
-    """Angles moved by whole turns into [low, high), all in one unit, in which ``turn`` is a turn; NaN where not finite.
+    """Return angles moved by whole turns into [low, high), all in one unit with this ``turn``; NaN if not finite.
 
-    ``high`` is Float32 and may lie short of the turn by its rounding: what falls between comes to ``low``.
+    ``high`` is Float32 and may be short of the turn by its rounding: what falls between comes to ``low``.
     """
     with np.errstate(invalid="ignore"):
         moved = low + np.mod(values - low, turn)
@@ -78,7 +78,7 @@ class ChannelKind(IntEnum):
 
 @dataclass(frozen=True)
 class Sampling:
-    """How a channel samples: SampMode (a mask), SDefault as it stands (sources disagree on it); None: not stated."""
+    """Sampling modes of a channel: SampMode (a mask), SDefault unchanged (sources disagree on it); None: not stated."""
 
     modes: int | None = None
     default: int | None = None
@@ -100,11 +100,10 @@ class Timing:
 class Channel:
     """One TransducerChannel. Limits and uncertainty are in SI units as its own TEDS states them, NaN where it does not.
 
-    ``units`` are the exponents of PhyUnits, ``unit`` the unit in which its values are computed, ``shown`` the one in
-    which people see them: ``display`` where a profile names one, else ``unit``. ``kind`` is None for a
-    ChanType that is not known, ``halt`` is ActHalt (field 36). ``described`` is False where there is no
-    TransducerChannel TEDS at all. ``calibration`` is None where there is none or none that can be computed;
-    ``calibration_problem`` then says why.
+    ``units`` are the exponents of PhyUnits, ``unit`` the unit in which its values are computed, ``shown`` the display
+    unit: ``display`` if a profile names one, else ``unit``. ``kind`` is None for a ChanType that is not known, ``halt``
+    is ActHalt (field 36). ``described`` is False if there is no TransducerChannel TEDS. ``calibration`` is None if
+    there is none or none that can be computed; ``calibration_problem`` is then the reason.
     """
 
     number: int
@@ -127,24 +126,24 @@ class Channel:
 
     @property
     def actuator(self) -> bool:
-        """Whether it acts; everything else gives values."""
+        """True for an actuator; everything else gives values."""
         return self.kind is ChannelKind.ACTUATOR
 
     @property
     def period(self) -> float:
-        """SPeriod in seconds, NaN where not stated."""
+        """SPeriod in seconds, NaN if not stated."""
         return self.timing.period
 
     @cached_property
     def unit(self) -> WrittenUnit:
-        """Unit that its datasheet suggests: the calibrated one where that has a usual name, else a friendly one."""
+        """Return the unit that its datasheet suggests: the calibrated one if that is usual, else a friendly one."""
         if self.calibration is not None and self.calibration.unit.text[:1] not in ("", "("):
             return self.calibration.unit
         return display_unit(self.units)
 
     @cached_property
     def shown(self) -> WrittenUnit:
-        """Unit in which people see its values: the profile's where one is known and fits, else the datasheet's."""
+        """Return the display unit: the profile's if one is known and fits, else the datasheet's."""
         if self.display:
             with suppress(BadDataError):
                 chosen = display_unit(self.units, self.display)
@@ -159,17 +158,17 @@ class Channel:
 
     @property
     def has_range(self) -> bool:
-        """Whether both limits are stated."""
+        """True if both limits are stated."""
         return math.isfinite(self.low) and math.isfinite(self.high)
 
     @property
     def full_turn(self) -> bool:
-        """Whether its values wrap: a sensor of angles whose limits are one turn apart. A set point never wraps."""
+        """True if its values wrap: a sensor of angles whose limits are one turn apart. A set point never wraps."""
         return not self.actuator and spans_a_turn(self.units, self.low, self.high)
 
     @property
     def stated_uncertainty(self) -> float:
-        """Uncertainty in SI units: that of the calibration where it states one, else that of the channel."""
+        """Uncertainty in SI units: that of the calibration if it states one, else that of the channel."""
         own = self.calibration
         if own is not None and own.uncertainty is not None and math.isfinite(own.uncertainty):
             return own.unit.difference_to_si(own.uncertainty)
@@ -177,21 +176,21 @@ class Channel:
 
     @property
     def calibrated_at(self) -> datetime | None:
-        """Date of the last calibration, None where there is none."""
+        """Date of the last calibration, None if there is none."""
         return self.calibration.date if self.calibration is not None else None
 
     @property
     def due(self) -> datetime | None:
-        """When the next calibration is due, None where nothing says so."""
+        """When the next calibration is due, None if unknown."""
         return self.calibration.due if self.calibration is not None else None
 
     def overdue(self, now: datetime) -> bool:
-        """Whether the next calibration was due before ``now``."""
+        """True if the next calibration was due before ``now``."""
         return self.calibration is not None and self.calibration.overdue(now)
 
     @property
     def value_problem(self) -> str:
-        """Why its samples give no values in a unit, as a sentence; "" where they do.
+        """Why its samples give no values in a unit, as a sentence; "" if they do.
 
         Without a calibration only floats (in SI units), counts, bits, times and fractions of a ratio are values.
         """
@@ -225,7 +224,7 @@ def described(number: int, blocks: Mapping[BlockId, bytes]) -> Channel:
 
 
 def channel_from(decoded: DecodedTeds) -> Channel:
-    """What a decoded TransducerChannel TEDS alone says of its channel."""
+    """Return the channel of a decoded TransducerChannel TEDS alone."""
     return read_channel(0, "", decoded)
 
 
@@ -256,12 +255,12 @@ def read_channel(number: int, name: str, teds: DecodedTeds | None) -> Channel:
 
 
 def number_of(teds: DecodedTeds, name: str) -> float:
-    """Number of a field, NaN where it is not stated."""
+    """Return the number of a field, NaN if it is not stated."""
     value = teds.get(name)
     return float(value) if isinstance(value, (int, float)) else NOT_STATED
 
 
 def integer_of(teds: DecodedTeds, name: str) -> int | None:
-    """Integer of a field, None where it is not stated."""
+    """Return the integer of a field, None if it is not stated."""
     value = teds.get(name)
     return value if isinstance(value, int) else None

@@ -35,7 +35,7 @@ FLOAT32_STEP: Final = 2.0**-23
 
 @dataclass(frozen=True)
 class CurveChannel:
-    """What is known of a channel, in SI units; NaN where it is not stated."""
+    """Facts of a channel, in SI units; NaN where not stated."""
 
     number: int
     units: Units
@@ -50,12 +50,12 @@ class CurveChannel:
 
     @property
     def full_turn(self) -> bool:
-        """Whether its values wrap, so that a zero offset only turns the scale."""
+        """True if its values wrap, so that a zero offset only turns the scale."""
         return not self.actuator and spans_a_turn(self.units, self.low, self.high)
 
     @property
     def tolerance(self) -> float:
-        """Stated uncertainty, 0 where none is stated."""
+        """Stated uncertainty, 0 if none is stated."""
         return self.uncertainty if self.uncertainty > 0 else 0.0
 
     def show(self, value: float, *, difference: bool = False, like: WrittenUnit | None = None) -> str:
@@ -66,7 +66,7 @@ class CurveChannel:
 
 
 def channel_of(number: int, blocks: Mapping[BlockId, bytes], profile: Profile | None) -> CurveChannel:
-    """What TEDS and profile say of a channel; the limits are those of the TEDS."""
+    """Return the facts of a channel from TEDS and profile; the limits are those of the TEDS."""
     own = described(number, blocks)
     said = profile.channel(number) if profile is not None else None
     ends = said.raw_range if said is not None else own.sample.raw_range if own.sample is not None else None
@@ -111,7 +111,7 @@ class Curve:
         return less - TURN * np.round(less / TURN) if self.channel.full_turn else less
 
     def inputs_at(self, index: int) -> tuple[float, ...]:
-        """Inputs of a flat index into the results."""
+        """Return the inputs of a flat index into the results."""
         places = np.unravel_index(index, self.result.shape)
         return tuple(float(axis[place]) for axis, place in zip(self.axes, places, strict=True))
 
@@ -134,13 +134,13 @@ class Curve:
         return float(np.median(last - first))
 
     def monotone(self, direction: str) -> bool:
-        """Whether the results never go the other way; ``direction`` is increasing, decreasing or either."""
+        """True if the results never go the other way; ``direction`` is increasing, decreasing or either."""
         rises = bool((self.steps >= -self.noise).all())
         falls = bool((self.steps <= self.noise).all())
         return {"increasing": rises, "decreasing": falls}.get(direction, rises or falls)
 
     def worst_step(self, direction: str) -> tuple[tuple[float, ...], float]:
-        """Inputs before the largest step the wrong way, and that step (signed)."""
+        """Return the inputs before the largest step the wrong way, and that step (signed)."""
         rising = direction == "increasing" or (direction == "either" and self.net >= 0)
         at = int(np.argmin(self.steps) if rising else np.argmax(self.steps))
         places = np.unravel_index(at, self.steps.shape)
@@ -148,7 +148,7 @@ class Curve:
         return inputs, float(self.steps[places])
 
     def after(self, value: float) -> float:
-        """The sample of the channel's own input that follows one."""
+        """Return the sample of the channel's own input that follows one."""
         axis = self.axes[self.main]
         return float(axis[min(int(np.searchsorted(axis, value, side="right")), len(axis) - 1)])
 
@@ -161,11 +161,10 @@ def curve_of(
     also: Calibration | None = None,
     dense: bool = False,
 ) -> Curve:
-    """Evaluate a calibration (finite, boundaries ascending) over what all its inputs can give.
+    """Evaluate a calibration (finite, boundaries ascending) over everything that its inputs can give.
 
-    One input is sampled at every integer, or at 65537 places and both sides of each boundary. Where the curve (and that
-    of ``also``, which it is to be compared with) is straight between its boundaries, these and the ends are enough
-    unless ``dense``.
+    One input is sampled at every integer, or at 65537 places and both sides of each boundary. If the curve (and that of
+    ``also``, to be compared with) is straight between its boundaries, these and the ends are enough unless ``dense``.
     """
     main = next((n for n, part in enumerate(calibration.inputs) if part.channel == channel.number), 0)
     straight = not dense and _straight(calibration) and (also is None or _straight(also))
@@ -183,7 +182,7 @@ def curve_of(
 
 
 def _samples(calibration: Calibration) -> int:
-    """Samples of each input: many of one, of several so few that the whole grid stays affordable."""
+    """Return the samples of each input: many of one, of several so few that the whole grid stays affordable."""
     count = len(calibration.inputs)
     terms = math.prod(part.degree + 1 for part in calibration.inputs)
     return SAMPLES if count == 1 else max(3, int(min(GRID, TERMS / terms) ** (1 / count)))
@@ -196,9 +195,11 @@ def _straight(calibration: Calibration) -> bool:
 def _axis(
     boundaries: tuple[float, ...], source: CurveChannel | None, count: int, actuator: bool, unit: WrittenUnit
 ) -> NDArray[np.float64]:
-    """Samples of one input: every integer where there are few, else evenly spread; and both sides of each boundary.
+    """Return the samples of one input: every integer if there are few, else evenly spread.
 
-    Two samples at least, whatever a foreign datasheet says of its limits.
+    And both sides of each boundary.
+
+    Two samples at least, whatever limits a foreign datasheet has.
     """
     low, high, whole = _ends(boundaries, source, actuator, unit)
     if whole and high - low < SAMPLES and count == SAMPLES:

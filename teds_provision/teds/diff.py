@@ -1,4 +1,4 @@
-"""What changes between two datasheets of a node, in physical terms rather than octets."""
+"""Differences between two datasheets of a node, in physical terms rather than octets."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ _OPAQUE_OCTETS: Final = 16
 
 @dataclass(frozen=True)
 class Change:
-    """One difference: ``before`` and ``after`` as people read them ("" where added or removed), ``text`` the sentence.
+    """One difference: ``before`` and ``after`` as people read them ("" if added or removed), ``text`` the sentence.
 
-    ``field`` is the name of the TEDS field, "curve" for a calibration's course, "" for a block as a whole.
+    ``field`` is the name of the TEDS field, "curve" for a calibration's curve, "" for a block as a whole.
     """
 
     channel: int
@@ -132,7 +132,7 @@ _Path = tuple[tuple[str, int], ...]
 def _differing(
     ones: Mapping[_Path, Field], others: Mapping[_Path, Field]
 ) -> Iterator[tuple[_Path, Field | None, Field | None]]:
-    """Leaves that are not octet for octet the same in both; None where one side lacks it."""
+    """Yield the leaves that differ in their octets; None for one that one side lacks."""
     for path in dict.fromkeys((*ones, *others)):
         one, other = ones.get(path), others.get(path)
         if one is None or other is None or one.raw != other.raw:
@@ -203,13 +203,13 @@ def _spec(access_code: int, path: _Path) -> FieldSpec | None:
 # What another calibration changes in the readings of a channel.
 
 CURVE_FIELDS: Final = frozenset({"CalInput", "Coefs", "Method", "ZeroOffset", "SIConvrt"})
-"""Fields that make the curve: they are told as one change."""
+"""Fields that make the curve: they are reported as one change."""
 
 
 def curve_change(channel: int, old: Mapping[BlockId, bytes], new: Mapping[BlockId, bytes]) -> str | None:
-    """``gain +0.8 %, at full scale +0.35 N, stated uncertainty 0.2 N``; "" where no reading changes.
+    """Return ``gain +0.8 %, at full scale +0.35 N, stated uncertainty 0.2 N``; "" if no reading changes.
 
-    None where one of the calibrations cannot be computed: then its fields are to be compared one by one.
+    None if one of the calibrations cannot be computed: then its fields are to be compared one by one.
     """
     one, other = channel_of(channel, old, None), channel_of(channel, new, None)
     before, after = _calibration(channel, old, one), _calibration(channel, new, other)
@@ -265,7 +265,7 @@ def _place(curve: Curve, at: int) -> str:
 
 
 def _gain(was: Curve, curve: Curve) -> float | None:
-    """Change in percent of the mean slope over the range (least squares), None where it was nothing."""
+    """Return the change in percent of the mean slope over the range (least squares), None if it was zero."""
 
     def slope(curve: Curve) -> float:
         along = np.moveaxis(curve.result, curve.main, 0).reshape(len(curve.axes[curve.main]), -1).mean(axis=1)

@@ -1,9 +1,9 @@
-"""Whether a datasheet suffices for a task: ``angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz``.
+"""Requirements of a task on a datasheet: ``angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz``.
 
 A requirement names a quantity (or a channel) and bounds on it; it is judged against the channels of a :class:`Sheet`
-(``nodes --fits``, ``measure --require``). The quantity itself, ``low`` and ``high`` look at the range: with
-``>=`` it must reach up to the value, with ``<=`` down to it. ``range`` is its width, ``uncertainty`` the worst case
-(``%`` of the width, or in the unit), ``rate`` the highest sampling rate. A full turn reaches every angle.
+(``nodes --fits``, ``measure --require``). The quantity itself, ``low`` and ``high`` concern the range: with ``>=`` it
+must reach up to the value, with ``<=`` down to it. ``range`` is its width, ``uncertainty`` the worst case (``%`` of the
+width, or in the unit), ``rate`` the highest sampling rate. A full turn reaches every angle.
 """
 
 from __future__ import annotations
@@ -83,13 +83,13 @@ class Term:
 
     @property
     def upward(self) -> bool:
-        """Whether it is a lower bound (``>=``, ``>``)."""
+        """True if it is a lower bound (``>=``, ``>``)."""
         return self.operator[0] == ">"
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """Terms that one channel must meet together; ``quantity`` or ``channel`` (a name) says which are looked at."""
+    """Terms that one channel must meet together; ``quantity`` or ``channel`` (a name) selects the channels."""
 
     terms: tuple[Term, ...]
     quantity: str = ""
@@ -97,11 +97,11 @@ class Requirement:
 
     @property
     def subject(self) -> str:
-        """What is asked for, in words."""
+        """The subject of the requirement, in words."""
         return f'the channel "{self.channel}"' if self.channel else self.quantity or "a channel"
 
     def concerns(self, channel: Channel) -> bool:
-        """Whether a channel is one that this requirement looks at."""
+        """True if a channel is one that this requirement concerns."""
         if self.channel:
             return channel.name == self.channel
         return not self.quantity or channel.units == QUANTITIES[self.quantity]
@@ -109,7 +109,7 @@ class Requirement:
 
 @dataclass(frozen=True)
 class Fit:
-    """How one channel stands to one requirement; ``why`` names every bound that is not met, or what it has."""
+    """How one channel meets one requirement; ``why`` names every bound that is not met, or what it has."""
 
     channel: int | None
     name: str
@@ -147,9 +147,9 @@ def parse_require(text: str, file: str) -> tuple[Requirement, ...]:
 
 
 def judge(requirement: Requirement, sheet: Sheet, now: datetime | None = None) -> tuple[Fit, ...]:
-    """How the channels of a datasheet stand to a requirement; one line with ``channel`` None where none is concerned.
+    """Judge the channels of a datasheet by a requirement; one line with ``channel`` None if none is concerned.
 
-    ``skipped``: the datasheet does not say. With ``now`` an overdue calibration meets no bound on the uncertainty.
+    ``skipped``: the datasheet has no such value. With ``now`` an overdue calibration meets no bound on the uncertainty.
     """
     concerned = [channel for channel in sheet.channels if requirement.concerns(channel)]
     if not concerned:
@@ -158,7 +158,7 @@ def judge(requirement: Requirement, sheet: Sheet, now: datetime | None = None) -
 
 
 def met(requirement: Requirement, fits: Iterable[Fit]) -> bool:
-    """Whether a group meets a requirement: some channel does, and of a channel that is named every one."""
+    """True if a group meets a requirement: some channel does, and of a channel that is named every one."""
     results = [fit.result for fit in fits if fit.channel is not None]
     return bool(results) and (all if requirement.channel else any)(result == "passed" for result in results)
 
@@ -189,7 +189,7 @@ def _sentence(parts: Iterable[str]) -> str:
 
 
 def _has(term: Term, channel: Channel) -> float:
-    """What a channel has, in SI units (a rate in Hz, an uncertainty asked in % as a share of the range)."""
+    """Return a channel's value, in SI units (a rate in Hz, an uncertainty in % as a share of the range)."""
     width = channel.high - channel.low
     match term.what:
         case "rate":
@@ -226,7 +226,7 @@ def _meets(term: Term, has: float, channel: Channel) -> bool:
 
 
 def _every_angle(channel: Channel) -> bool:
-    """Whether a channel covers a full turn, which reaches every angle."""
+    """True if a channel covers a full turn, which reaches every angle."""
     return channel.units == NAMED["rad"] and channel.high - channel.low >= 2 * math.pi * (1 - ROUNDING)
 
 

@@ -1,8 +1,8 @@
 """The guard: refuses calibrations of the kinds that have hurt robots before.
 
 Erased words, a sign or slope reversed, gain and offset swapped, a table that is not monotone where it must be, results
-beyond the limits, a fit worse than the stated uncertainty. Looked at over every raw value that the channel can give:
-all that its data model allows, or the ``raw-range`` of its profile. Findings speak in physical units.
+beyond the limits, a fit worse than the stated uncertainty. Checked over every raw value that the channel can give: all
+that its data model allows, or the ``raw-range`` of its profile. Findings are in physical units.
 """
 
 from __future__ import annotations
@@ -229,7 +229,7 @@ def _residual(curve: Curve, given: Calibration | None) -> Iterator[Raised]:
 
 
 def _swapped(new: Calibration, old: Calibration) -> bool:
-    """Whether coefficients 0 and 1 of every cell are exchanged (to a quarter), and were different before."""
+    """True if coefficients 0 and 1 of every cell are exchanged (to a quarter), and were different before."""
     shape = [(part.segments, part.degree) for part in new.inputs]
     if shape != [(part.segments, part.degree) for part in old.inputs] or len(shape) != 1 or shape[0][1] < 1:
         return False
@@ -265,7 +265,7 @@ _SMALLEST_NORMAL: Final = 2.0**-126
 
 @dataclass(frozen=True)
 class GuardFinding:
-    """One finding: an ``error`` refuses the datasheet (unless a person says why it is right), a ``warning`` does not.
+    """One finding: an ``error`` refuses the datasheet (unless a reason to accept it is given), a ``warning`` does not.
 
     ``message`` goes behind "channel 1: " and has no full stop. Codes: erased, unreadable, inconsistent, unknown, flat,
     overflow, limits, unlimited, reversed, swapped, not-monotone, jump, residual, removed, changed, overdue.
@@ -305,10 +305,10 @@ def check_calibration(
 
 
 def misfit(calibration: Calibration, had: Channel, now: Channel, of: ChannelProfile | None) -> str:
-    """Why a calibration that was made for the channel ``had`` is none of the channel ``now``; "" where it fits.
+    """Return why a calibration for the channel ``had`` does not fit the channel ``now``; "" if it does.
 
-    Looked at: ChanType, DatModel, ModLenth, dimension of the unit, method, raw range, and whether its points lie within
-    the limits. ``of`` is what the profile says of the channel. Half a sentence, without a full stop.
+    Compared: ChanType, DatModel, ModLenth, dimension of the unit, method, raw range, and whether its points are within
+    the limits. ``of`` is the profile's channel. Half a sentence, without a full stop.
     """
     if not now.described:
         return "the datasheet has no such channel"
@@ -399,7 +399,7 @@ class _Judge:
                 yield GuardFinding(self.number, "overdue", text, "warning")
 
     def _not_understood(self, decoded: DecodedTeds, error: BadDataError) -> GuardFinding:
-        """An error where the fields are ours; else somebody else's form, of which nothing can be said."""
+        """Return an error if the fields are ours; else a foreign form, which cannot be judged."""
         text = f"{error.message} It was not checked."
         if decoded.field("CalInput") is None and decoded.field("Coefs") is None:
             return GuardFinding(self.number, "unknown", text, "warning")
@@ -452,7 +452,7 @@ class _Judge:
         return replace(channel, monotone=calibration.monotone, raw=raw if raw and raw[0] < raw[1] else channel.raw)
 
     def _before(self, channel: CurveChannel) -> Calibration | None:
-        """Calibration that the node has now; None where there is none that can be computed and compared."""
+        """Return the calibration that the node has now; None if there is none that can be computed and compared."""
         octets = self.old.get((self.number, AccessCode.CALIBRATION))
         if octets is None:
             return None

@@ -103,7 +103,7 @@ def _hex(value: object, name: str) -> bytes:
 
 
 class TedsBlock(NamedTuple):
-    """A TEDS or bare data block: its channel and access code where they are known, and its octets as they are."""
+    """A TEDS or bare data block: its channel and access code if they are known, and its octets unchanged."""
 
     channel: int | None
     access_code: int | None
@@ -111,13 +111,13 @@ class TedsBlock(NamedTuple):
 
 
 def class_of(octets: bytes) -> int | None:
-    """Access code that the TEDSID of a framed TEDS or a bare data block names, None where there is none."""
+    """Return the access code in the TEDSID of a framed TEDS or a bare data block, None if there is none."""
     framed = teds_class(octets[4:])
     return framed if framed is not None else teds_class(octets)
 
 
 def split_run(octets: bytes) -> list[bytes]:
-    """Framed TEDS that stand one after the other; everything as one piece where they do not close to the octet."""
+    """Return framed TEDS that follow one another; everything as one piece if they do not close to the octet."""
     pieces: list[bytes] = []
     at = 0
     while at < len(octets):
@@ -141,5 +141,5 @@ def with_class(octets: bytes) -> TedsBlock:
 
 
 def is_run(blocks: Sequence[TedsBlock]) -> bool:
-    """Whether blocks put one after the other come apart again as they were."""
+    """True if concatenated blocks can be separated again."""
     return [block.octets for block in blocks] == split_run(b"".join(block.octets for block in blocks))

@@ -171,7 +171,7 @@ class _View:
         return values if self.channel.actuator else (values - self.unit.offset) / self.unit.scale
 
     def _thinned(self, mask: Any) -> Any:
-        """Indices to draw where the mask holds: about 2000, corners of the curve kept by the spread."""
+        """Return indices to draw within the mask: about 2000, corners of the curve kept by the spread."""
         places = np.flatnonzero(mask)
         step = max(1, len(places) // _LINE_POINTS)
         return np.unique(np.append(places[::step], places[-1:]))
@@ -184,7 +184,7 @@ class _View:
         return wrapped(values, ends[0], ends[1], abs(self.unit.difference_from_si(TURN)))
 
     def _drawn(self, values: Any) -> Any:
-        """Values of a line, with a gap where an angle goes on at the other end of its turn."""
+        """Return the values of a line, with a gap where an angle continues at the other end of its turn."""
         if not self.channel.full_turn:
             return values
         values = self._wrapped(values)
@@ -259,7 +259,7 @@ class _View:
         axes.set_title(text, fontsize=8, loc="left", pad=3)
 
     def _uncertainty(self, axes: Any, largest: float) -> str:
-        """Draw the stated uncertainty unless it lies far outside; returns the words for it."""
+        """Draw the stated uncertainty unless it is far outside; return the words for it."""
         if self.channel.actuator or not self.channel.tolerance:
             return ""
         width = self.unit.difference_from_si(self.channel.tolerance)

@@ -1,8 +1,8 @@
-"""The typed datasheet: everything that the TEDS of one node say, as values with types and units.
+"""The typed datasheet: the content of one node's TEDS, as values with types and units.
 
-:meth:`Sheet.from_image` never raises, whatever the octets. What is missing is None, NaN or "", what is wrong stands in
-``findings`` beside the values. Who may be believed is another question: a Sheet is made from verified and foreign TEDS
-alike (``protocol.datasheet`` judges the signature).
+:meth:`Sheet.from_image` never raises, whatever the octets. Missing values are None, NaN or "", faults are in
+``findings`` beside the values. Trust is another question: a Sheet is made from verified and foreign TEDS alike
+(``protocol.datasheet`` judges the signature).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _DAMAGED: Final = (Conformity.MALFORMED, Conformity.FRAME_BAD, Conformity.FRAME_
 
 @dataclass(frozen=True)
 class SheetFinding:
-    """What is wrong or strange in one TEDS of the sheet, or between them; ``offset`` counts from its first octet."""
+    """A fault in one TEDS of the sheet, or between them; ``offset`` counts from its first octet."""
 
     channel: int
     access_code: int
@@ -101,11 +101,11 @@ class Sheet:
 
     @classmethod
     def from_blocks(cls, blocks: Mapping[BlockId, bytes]) -> Sheet:
-        """Datasheet of framed TEDS by (channel, access code); its UUID is what the Meta-TEDS says, or empty."""
+        """Return the datasheet of framed TEDS by (channel, access code); its UUID is the Meta-TEDS's, or empty."""
         return _Reader(b"", blocks).sheet()
 
     def shown_in(self, units: Mapping[int, str]) -> Sheet:
-        """The same datasheet, with the values of these channels shown to people in these units, where they fit."""
+        """Return the same datasheet, with the values of these channels in these display units, if they fit."""
         if not units:
             return self
         return replace(
@@ -113,11 +113,11 @@ class Sheet:
         )
 
     def channel(self, number: int) -> Channel | None:
-        """Channel of that number, None where it is not described."""
+        """Return the channel of that number, None if it is not described."""
         return next((channel for channel in self.channels if channel.number == number), None)
 
     def named(self, name: str) -> Channel | None:
-        """The one channel of that name, None where there is none or more than one."""
+        """Return the only channel of that name, None if there is none or more than one."""
         found = [channel for channel in self.channels if channel.name == name]
         return found[0] if len(found) == 1 else None
 
@@ -133,13 +133,13 @@ def channel_of(number: int, blocks: Mapping[BlockId, bytes]) -> Channel:
 
 
 def name_among(number: int, blocks: Mapping[BlockId, bytes]) -> str:
-    """Name of a channel (0: of the node) among framed TEDS, "" where there is none that can be printed."""
+    """Return the name of a channel (0: of the node) among framed TEDS, "" if there is none that can be printed."""
     octets = blocks.get((number, AccessCode.NAME))
     return node_name(decode(octets) if octets is not None else None)
 
 
 def node_name(decoded: DecodedTeds | None) -> str:
-    """TCName of a decoded name TEDS, "" where it has none that can be printed."""
+    """Return TCName of a decoded name TEDS, "" if it has none that can be printed."""
     name = decoded.get("TCName") if decoded is not None else None
     return name if isinstance(name, str) and name.isprintable() else ""
 
@@ -158,7 +158,7 @@ class _Reader:
         self.understood: dict[int, Calibration] = {}
 
     def decoded(self, channel: int, access_code: int) -> DecodedTeds | None:
-        """One TEDS decoded, None where it is not there."""
+        """Return one TEDS decoded, None if it is absent."""
         key = (channel, access_code)
         if key not in self.seen:
             octets = self.blocks.get(key)
@@ -209,7 +209,7 @@ class _Reader:
         return Sheet(self.uuid or meta.uuid or b"", meta, described, self.understood, findings)
 
     def of_blocks(self) -> Iterator[SheetFinding]:
-        """What the decoder found in each TEDS, and TEDS that stand in a place that is not theirs."""
+        """Yield the decoder's findings for each TEDS, and TEDS in a wrong place."""
         for channel, code in sorted(self.blocks):
             teds = self.decoded(channel, code)
             if teds is None:
@@ -233,7 +233,7 @@ _OF_CHANNELS: Final = (AccessCode.CHANNEL, AccessCode.CALIBRATION)
 
 
 def _between(uuid: bytes, meta: Meta, channels: list[Channel]) -> Iterator[SheetFinding]:
-    """What the TEDS of a node say against each other."""
+    """Yield contradictions between the TEDS of a node."""
     if uuid and meta.uuid and meta.uuid[-len(uuid) :] != uuid:
         message = f"The Meta-TEDS names the UUID {meta.uuid.hex()}, not {uuid.hex()}."
         yield SheetFinding(0, AccessCode.META, "error", "uuid", message)
@@ -257,7 +257,7 @@ def _of_calibration(channel: Channel) -> Iterator[SheetFinding]:
 
 
 def _same_names(channels: list[Channel]) -> Iterator[SheetFinding]:
-    """Channels that cannot be told apart by name."""
+    """Yield channels with equal names."""
     names: dict[str, int] = {}
     for channel in channels:
         first = names.setdefault(channel.name, channel.number) if channel.name else channel.number
@@ -267,7 +267,7 @@ def _same_names(channels: list[Channel]) -> Iterator[SheetFinding]:
 
 
 def computable(calibration: Calibration) -> str:
-    """Why nothing can be computed with a calibration; "" where it can."""
+    """Return why a calibration cannot be computed; "" if it can."""
     unit = calibration.unit
     if not is_finite(calibration):
         return "A number of the calibration is not finite."

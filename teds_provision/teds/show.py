@@ -53,7 +53,7 @@ class Context:
 
 
 def meaning_of(field: Field, spec: FieldSpec | None) -> tuple[str, bool]:
-    """Words for a code, and whether it stands for something weak that no new TEDS may use."""
+    """Return the words for a code, and whether it means something weak that no new TEDS may use."""
     value = field.value
     if spec is None or not isinstance(value, int):
         return "", False
@@ -67,7 +67,7 @@ def meaning_of(field: Field, spec: FieldSpec | None) -> tuple[str, bool]:
 
 
 def text_of(field: Field, context: Context, spec: FieldSpec | None) -> str:
-    """Value of a field for people; hex digits where nothing better is known."""
+    """Return the value of a field for people; hex digits if nothing better is known."""
     kind = spec.kind if spec is not None else ""
     match field.value:
         case Units() as units:
@@ -133,7 +133,7 @@ def instant(value: TimeInstance) -> str:
 
 
 def span(value: TimeInstance) -> str:
-    """Length of a time, in days where it is that long."""
+    """Return the length of a time, in days if it is that long."""
     total = value.seconds + value.nanoseconds / 1e9
     text = seconds(total)
     return f"-{text}" if value.negative else text
@@ -147,7 +147,7 @@ def hexadecimal(octets: bytes) -> str:
 
 
 def key(field: Field) -> str:
-    """A key or signature: the form it came in, and the fingerprint of a P-256 point."""
+    """Describe a key or signature: the form it came in, and the fingerprint of a P-256 point."""
     found = read_key(field.raw)
     if found.point is not None:
         return f"P-256 key, fingerprint {fingerprint(found.point)[:FINGERPRINT_DIGITS]} ({found.form})"
@@ -161,7 +161,7 @@ def fingerprint(point: bytes) -> str:
 
 
 def signed_block(raw: bytes, beside: Mapping[tuple[int, int], bytes]) -> str:
-    """Which TEDS a SignedBlock means, and whether the one that lies beside it is that one."""
+    """Return which TEDS a SignedBlock means, and whether the present one matches."""
     channel, code, digest = int.from_bytes(raw[:2], "big"), raw[2], raw[3:]
     text = f"channel {channel} {name_of(code)} {digest.hex()[:FINGERPRINT_DIGITS]}…"
     octets = beside.get((channel, code))
@@ -300,7 +300,7 @@ class ShownTeds:
 
     @property
     def title(self) -> str:
-        """``channel 1 · ChanTEDS (3)``, ``ChanTEDS (3)``, or that nothing says what it is."""
+        """``channel 1 · ChanTEDS (3)``, ``ChanTEDS (3)``, or that it is unknown."""
         code = self.block.access_code
         name = f"{table(code).name} ({code})" if code is not None else "unknown class"
         if self.decoded.access_code is not None and code is not None and self.decoded.access_code != code:
@@ -346,7 +346,7 @@ def _context(block: TedsBlock, decoded: DecodedTeds, beside: dict[tuple[int, int
 
 
 def _unit(block: TedsBlock, decoded: DecodedTeds, beside: Mapping[tuple[int, int], bytes]) -> WrittenUnit | None:
-    """Unit of LowLimit, HiLimit and OError: the channel's, or the calibrated one; None where nothing names one."""
+    """Return the unit of LowLimit, HiLimit and OError: the channel's, or the calibrated one; None if unknown."""
     if decoded.access_code == AccessCode.CHANNEL:
         channel = channel_from(decoded)
         return channel.unit if channel.units_stated else None

@@ -1,8 +1,8 @@
 """Units as people write them, and the standard's exponents of SI units (teds.md, "Data types").
 
-``parse_unit("degC")`` gives the exponents that go into a TEDS together with scale and offset into SI;
-``format_units`` gives the way back. The units people use every day stand in a table here, so that building a datasheet
-and their products need not load ``pint`` (0.4 s); rare ones go to it (extra ``units``). The tests hold both against it.
+``parse_unit("degC")`` gives the exponents that go into a TEDS together with scale and offset into SI; ``format_units``
+is the inverse. Everyday units are in a table here, so that building a datasheet and their products need not load
+``pint`` (0.4 s); rare ones go to it (extra ``units``). The tests compare both with it.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ _COUNTS: Final = {"count", "bit", "number", "dimensionless"}
 
 @dataclass(frozen=True)
 class WrittenUnit:
-    """A unit as somebody wrote it: ``SI value = scale × value + offset``."""
+    """A unit as written: ``SI value = scale × value + offset``."""
 
     text: str
     units: Units
@@ -224,11 +224,11 @@ class WrittenUnit:
         return (value - self.offset) / self.scale
 
     def difference_to_si(self, value: float) -> float:
-        """A difference (an uncertainty, a step) in SI units: scaled, the offset left out."""
+        """Return a difference (an uncertainty, a step) in SI units: scaled, without the offset."""
         return value * abs(self.scale)
 
     def difference_from_si(self, value: float) -> float:
-        """A difference given in SI units, in this unit."""
+        """Return a difference given in SI units, in this unit."""
         return value / abs(self.scale)
 
 
@@ -291,7 +291,7 @@ _UPPER: Final = str.maketrans("⁻¹²³", "-123")
 
 
 def _compound(text: str) -> WrittenUnit | None:
-    """Products and quotients of units of our own table, from left to right; None where it is anything else."""
+    """Parse products and quotients of units of our own table, from left to right; None for anything else."""
     factors = _factors(text)
     if factors is None:
         return None
@@ -314,7 +314,7 @@ def _compound(text: str) -> WrittenUnit | None:
 
 
 def _factors(text: str) -> list[tuple[re.Match[str], int]] | None:
-    """Each factor of a product with the side that it stands on (1 above, -1 below); None where it is no product."""
+    """Return each factor of a product with its side (1 above, -1 below); None if it is no product."""
     upper, slash, lower = text.partition("/(")
     if slash and (not lower.endswith(")") or "/" in lower):  # one denominator in brackets, and nothing after it
         return None
@@ -468,7 +468,7 @@ def format_units(units: Units) -> str:
 
 
 def name_of_units(units: Units) -> str:
-    """Name of the SI unit for people, ``count`` for a plain number: the one place that says so."""
+    """Return the name of the SI unit for people, ``count`` for a plain number: the only place for it."""
     return format_units(units) or "count"
 
 
@@ -492,7 +492,10 @@ _SHORT: Final = {
 
 
 def display_unit(units: Units, preferred: str | None = None) -> WrittenUnit:
-    """Unit in which to show values of these exponents: the preferred one where it fits, else friendly, else SI."""
+    """Return the unit in which to show values of these exponents: the preferred one if it fits.
+
+    Else a friendly one, else SI.
+    """
     for text in (preferred, _FRIENDLY.get(units)):
         if text:
             unit = parse_unit(text)
@@ -539,7 +542,7 @@ _TIMES: Final = {
 
 
 def _quantity(value: object) -> tuple[float, str]:
-    """The number and the unit of ``"100 us"``."""
+    """Return the number and the unit of ``"100 us"``."""
     match = _QUANTITY.match(value) if isinstance(value, str) else None
     if match is None:
         raise BadDataError(
@@ -569,12 +572,15 @@ def parse_seconds(value: object) -> float:
 
 
 def short_unit(text: str) -> str:
-    """Sign of a unit where it has one (``°`` for ``degree``), for showing."""
+    """Return the symbol of a unit if it has one (``°`` for ``degree``), for showing."""
     return _SHORT.get(text, text)
 
 
 def recognize(units: Units, scale: float, offset: float) -> WrittenUnit:
-    """Unit of these exponents that converts into SI this way; one without a usual name is called after its scale."""
+    """Return the unit of these exponents with this conversion into SI.
+
+    One without a usual name is called after its scale.
+    """
     if _close(scale, 1.0) and offset == 0:
         return WrittenUnit(format_units(units), units)
     for text, of, its_scale, its_offset in _usual_units():

@@ -1,6 +1,6 @@
 """Calibration files: CSV of measured points or of segments, TOML and JSON of points or ready coefficients.
 
-Metadata of a CSV stand in lines ``# key: value``; every error names file, line and field.
+Metadata of a CSV are lines ``# key: value``; every error names file, line and field.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class CsvTable:
     rows: list[Row] = field(default_factory=list)
 
     def by_channel(self) -> dict[int | None, list[Row]]:
-        """Rows by the channel of their line; None where the file has no such column."""
+        """Return rows by the channel of their line; None if the file has no such column."""
         groups: dict[int | None, list[Row]] = {}
         for row in self.rows:
             groups.setdefault(row.channel, []).append(row)
@@ -66,7 +66,7 @@ class CsvTable:
 
 @dataclass(frozen=True)
 class _Columns:
-    """Where the numbers stand in a line, and their names for errors."""
+    """Positions of the numbers in a line, and their names for errors."""
 
     names: tuple[str, ...]
     places: tuple[int, ...]
@@ -90,7 +90,7 @@ def read_csv(text: str, file: str, keys: Sequence[str]) -> CsvTable:
 
 
 def _data_lines(table: CsvTable, text: str, keys: Sequence[str]) -> list[tuple[int, str]]:
-    """Lines that are neither empty nor comments, with their numbers; what comments say goes into the table."""
+    """Return lines that are neither empty nor comments, with their numbers; comments go into the table."""
     file = table.file
     check_size(len(text), LIMITS.text_file, file)
     data: list[tuple[int, str]] = []
@@ -162,7 +162,7 @@ def _number(text: str, *, decimal_comma: bool) -> float:
 
 
 def _header(table: CsvTable, number: int, cells: list[str]) -> _Columns | None:
-    """Columns that a header names; None where the first line is data."""
+    """Return the columns that a header names; None if the first line is data."""
     if all(map(_is_number, cells)):
         return None
     heads = [_name_and_unit(cell) for cell in cells]
@@ -297,10 +297,10 @@ def read_calibrations(text: str, file: str, profile: Profile) -> dict[int, Calib
 
 
 def fit_points(text: str, file: str, *, method: str | None = None, degree: int | None = None) -> dict[int, Calibration]:
-    """Fit the points of a CSV for what they are, by channel number: no profile says what they are to be.
+    """Fit the points of a CSV as they are, by channel number, without a profile's demands.
 
-    ``method`` and ``degree`` go before what the file says. Raises BadDataError (file, line, field) as reading one does,
-    and for a file of segments, which has no points.
+    ``method`` and ``degree`` take precedence over those of the file. Raises BadDataError (file, line, field) as reading
+    one does, and for a file of segments, which has no points.
     """
     table = read_csv(text, file, CSV_KEYS)
     out: dict[int, Calibration] = {}
@@ -379,7 +379,7 @@ def _order(table: TomlTable, file: str) -> CalibrationOrder:
 
 
 def _only_channel(order: CalibrationOrder, profile: Profile) -> ChannelProfile:
-    """The one channel that wants a calibration, or the one that there is."""
+    """Return the only channel that needs a calibration, or the only one that exists."""
     wanting = [channel for channel in profile.channels if channel.calibration.required] or profile.channels
     if len(wanting) != 1:
         raise order.wrong("channel", f"{profile.name} has {len(profile.channels)} channels: say which one this is for.")

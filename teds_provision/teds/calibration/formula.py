@@ -34,7 +34,7 @@ _HALVINGS: Final = 64
 
 @dataclass(frozen=True)
 class Evaluation(Generic[_Value]):
-    """Result of the formula in calibrated units, and where an input lay outside its outer boundaries."""
+    """Result of the formula in calibrated units, and where an input was outside its outer boundaries."""
 
     value: _Value
     outside: _Value
@@ -87,7 +87,7 @@ class PreparedCurve:
         return total
 
     def outside(self, *inputs: Floats) -> NDArray[np.bool_]:
-        """Where an input lies outside its outer boundaries, or is not a number."""
+        """Return where an input is outside its outer boundaries, or is not a number."""
         flags = np.zeros(inputs[0].shape, dtype=bool)
         for part, values in zip(self.calibration.inputs, inputs, strict=True):
             flags |= ~((values >= part.boundaries[0]) & (values <= part.boundaries[-1]))
@@ -95,11 +95,11 @@ class PreparedCurve:
 
 
 class PreparedInverse:
-    """The way back through a calibration: which input gives a result. Raises BadDataError where more than one would.
+    """The inverse of a calibration: which input gives a result. Raises BadDataError if more than one would.
 
-    ``low`` and ``high`` are the ends between which the input ``main`` is looked for; other inputs are given with each
-    call. Results beyond what lies between the ends give the nearer end. ``step`` is how close is close enough, 0 for as
-    close as Float64 gets.
+    ``low`` and ``high`` are the ends between which the input ``main`` is searched; other inputs are given with each
+    call. Results beyond those of the ends give the nearer end. ``step`` is how close is close enough, 0 for as close as
+    Float64 gets.
     """
 
     def __init__(self, curve: PreparedCurve, low: float, high: float, *, main: int = 0, step: float = 0.0) -> None:
@@ -140,7 +140,7 @@ class PreparedInverse:
         return nodes, start, table[:, 1], edges[:-1], edges[1:]
 
     def __call__(self, results: Floats, others: Sequence[Floats] = ()) -> Floats:
-        """Inputs that give these results, kept between the ends."""
+        """Return the inputs that give these results, kept between the ends."""
         results = np.asarray(results, dtype=np.float64)
         if self._straight is not None:
             nodes, start, slope, below, above = self._straight
@@ -177,8 +177,8 @@ def evaluate(calibration: Calibration, *inputs: NDArray[np.float64]) -> Evaluati
 def evaluate(calibration: Calibration, *inputs: object) -> object:
     """Apply the formula and the zero offset to one value, or one array, per input.
 
-    Arrays are broadcast against each other; ``outside`` is then an array of the same shape (1 where an input lies
-    outside its boundaries or is NaN), else 0.0 or 1.0. Raises BadDataError for another number of inputs.
+    Arrays are broadcast against each other; ``outside`` is then an array of the same shape (1 where an input is outside
+    its boundaries or is NaN), else 0.0 or 1.0. Raises BadDataError for another number of inputs.
     """
     parts: tuple[CalibrationInput, ...] = calibration.inputs
     if len(inputs) != len(parts):
@@ -249,10 +249,10 @@ MOST_LEFT_OUT = 200
 
 
 def left_out(calibration: Calibration) -> tuple[float, ...]:
-    """Differences (reference - curve) of each inner point from a fit without it, in the order of the points.
+    """Return differences (reference - curve) of each inner point from a fit without it, in the order of the points.
 
-    What residuals cannot say of a table, which goes through every point. Nothing where there are too few points for
-    that, more than 200, or an actuator's.
+    The residuals of a table are always 0, as it goes through every point. Empty if there are too few points for that,
+    more than 200, or an actuator's.
     """
     points = calibration.points
     inputs = {raw for raw, _ in points}
@@ -394,7 +394,7 @@ def kind_of(calibration: Calibration) -> str:
 
 
 def describe_calibration(calibration: Calibration, now: datetime | None = None) -> dict[str, Any]:
-    """Plain data of a calibration; residuals where it has its points, ``overdue`` where ``now`` is given."""
+    """Return plain data of a calibration; residuals if it has its points, ``overdue`` if ``now`` is given."""
     left = residuals(calibration)
     shown = None
     if left is not None:

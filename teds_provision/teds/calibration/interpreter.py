@@ -1,7 +1,7 @@
 """From the octets of a channel to values with a unit, and back, prepared once from its datasheet.
 
 This is the papers' interpreter: no line of code knows a sensor, everything comes from the :class:`Sheet`. It works in
-blocks; whoever measures hands it the octets of many samples at once.
+blocks: callers pass the octets of many samples at once.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ else:
 
 @dataclass(frozen=True)
 class Values:
-    """A block of samples: ``raw`` as the data model says, ``value`` in the channel's unit, NaN where not ``valid``.
+    """A block of samples: ``raw`` by the data model, ``value`` in the channel's unit, NaN where not ``valid``.
 
-    Not valid: the raw value cannot be (more than SigBits, not a number), or the value lies beyond the limits by more
+    Not valid: the raw value is impossible (more than SigBits, not a number), or the value is beyond the limits by more
     than the stated uncertainty, or is not a number. Angles over a full turn wrap, so no limit is beyond them.
-    ``extrapolated``: an input lay outside the calibrated range; such a value is valid as long as the limits hold, which
-    the guard looked at before the datasheet was signed.
+    ``extrapolated``: an input was outside the calibrated range; such a value is valid as long as it is within the
+    limits, which the guard checked before the datasheet was signed.
     """
 
     raw: NDArray[np.generic]
@@ -50,14 +50,14 @@ class Values:
 class ChannelInterpreter:
     """Reads and writes the samples of one channel of a datasheet.
 
-    ``unit`` is the unit of the values, ``uncertainty`` the worst case in it (None where not stated), ``limits`` are
-    LowLimit and HiLimit in it (infinite where not stated), ``turn`` is a turn in it where values wrap into
-    ``wraps_into``, else infinite. ``problem`` says in a sentence why raw values are all that there is ("" where values
-    can be had), for example a channel without calibration.
+    ``unit`` is the unit of the values, ``uncertainty`` the worst case in it (None if not stated), ``limits`` are
+    LowLimit and HiLimit in it (infinite if not stated), ``turn`` is a turn in it if values wrap into ``wraps_into``,
+    else infinite. ``problem`` is a sentence on why there are raw values only ("" if there are values), for example a
+    channel without calibration.
     """
 
     def __init__(self, sheet: Sheet, number: int) -> None:
-        """Prepare channel ``number``; raises BadDataError where it is not there or its samples cannot be read."""
+        """Prepare channel ``number``; raises BadDataError if it does not exist or its samples cannot be decoded."""
         channel = sheet.channel(number)
         if channel is None:
             raise BadDataError(f"The datasheet describes no channel {number}.")
@@ -104,7 +104,7 @@ class ChannelInterpreter:
         return self.values(raw, rows)
 
     def values(self, raw: NDArray[np.generic], others: Mapping[int, NDArray[np.generic]] | None = None) -> Values:
-        """Values of raw values (of :meth:`SampleReader.raw`); raises BadDataError where an input is missing."""
+        """Return values of raw values (of :meth:`SampleReader.raw`); raises BadDataError if an input is missing."""
         shown, valid, extrapolated = self._computed(raw, others or {})
         valid &= (shown >= self._floor) & (shown <= self._ceiling) & np.isfinite(shown)
         return Values(raw, np.where(valid, shown, math.nan), valid, extrapolated)
@@ -112,9 +112,9 @@ class ChannelInterpreter:
     def calibrated(
         self, raw: NDArray[np.generic], others: Mapping[int, NDArray[np.generic]] | None = None
     ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-        """What the calibration of a sensor gives, in its own unit, neither wrapped nor held against any limit.
+        """Return the result of a sensor's calibration, in its own unit, neither wrapped nor limited.
 
-        Beside it: which raw values are possible, and which lie beyond the calibrated range. Raises BadDataError where
+        In addition: which raw values are possible, and which are beyond the calibrated range. Raises BadDataError if
         there is no calibration that can be computed, or an input is missing.
         """
         if self.problem or self._curve is None or self.channel.actuator:
@@ -167,10 +167,10 @@ class ChannelInterpreter:
         return self.within_turn(shown), valid, extrapolated
 
     def encode(self, values: Floats | float, others: Mapping[int, NDArray[np.generic]] | None = None) -> bytes:
-        """Octets of values in :attr:`unit`: kept within the limits, converted, rounded to what the sample can hold.
+        """Return the octets of values in :attr:`unit`, kept within the limits, converted and rounded to the sample.
 
         For an actuator the set point to send, for a virtual sensor the sample that it would give. Raises BadDataError
-        where there is no way back (no calibration, a curve that turns, a value that is not finite).
+        if there is no inverse (no calibration, a curve that turns, a value that is not finite).
         """
         values = np.clip(self.within_turn(np.atleast_1d(np.asarray(values, dtype=np.float64))), *self.limits)
         if not np.isfinite(values).all():
@@ -178,7 +178,7 @@ class ChannelInterpreter:
         return self.reader.write(self.raw_numbers(values, others))
 
     def raw_numbers(self, values: Floats, others: Mapping[int, NDArray[np.generic]] | None = None) -> Floats:
-        """Raw values (not yet rounded) that stand for values in :attr:`unit`.
+        """Return the raw values (not yet rounded) for values in :attr:`unit`.
 
         Raises BadDataError as :meth:`encode` does.
         """
@@ -199,14 +199,14 @@ class ChannelInterpreter:
         return self._inverse(self._nearest_turn(stated, more) if math.isfinite(self.turn) else stated, more)
 
     def within_turn(self, values: Floats) -> Floats:
-        """Values in :attr:`unit` within [LowLimit, HiLimit) where the channel spans a full turn, else as they are."""
+        """Return values in :attr:`unit` within [LowLimit, HiLimit) if the channel spans a full turn, else unchanged."""
         return wrapped(values, *self.wraps_into, self.turn) if math.isfinite(self.turn) else values
 
     @property
     def given(self) -> Range | None:
         """Lowest and highest value in :attr:`unit`, not wrapped, that the curve gives of all raw values.
 
-        None where it takes the raw values of other channels, or has no way back.
+        None if it takes the raw values of other channels, or has no inverse.
         """
         if self.problem or self.others or self._curve is None:
             return None
@@ -214,7 +214,7 @@ class ChannelInterpreter:
         return min(ends), max(ends)
 
     def _nearest_turn(self, values: Floats, others: Sequence[Floats]) -> Floats:
-        """Angles, in the unit of the curve, moved by whole turns to where the curve gives them, or comes nearest."""
+        """Return angles, in the unit of the curve, moved by whole turns into or nearest to its range."""
         assert self.channel.calibration is not None
         turn = self.channel.calibration.unit.difference_from_si(TURN)
         low, high = self._inverse.ends(values.shape, others)
@@ -223,9 +223,9 @@ class ChannelInterpreter:
         return np.where((above <= high) | (above - high <= low + turn - above), above, above - turn)
 
     def beyond(self, value: float, told: WrittenUnit | None = None) -> str:
-        """Why a value may not be set, as a sentence in the unit ``told``; "" where the datasheet's limits allow it.
+        """Return why a value may not be set, as a sentence in the unit ``told``; "" if the datasheet's limits allow it.
 
-        ``value`` is in :attr:`unit`; without ``told`` the sentence is in the unit that people see.
+        ``value`` is in :attr:`unit`; without ``told`` the sentence is in the display unit.
         """
         low, high = self.limits
         if math.isfinite(value) and low - ROUNDING * abs(low) <= value <= high + ROUNDING * abs(high):
@@ -242,7 +242,7 @@ class ChannelInterpreter:
 
     @property
     def shown_as_computed(self) -> bool:
-        """Whether the curve gives values in :attr:`unit` as they are."""
+        """True if the curve gives values in :attr:`unit` without conversion."""
         return self._same
 
     @cached_property
@@ -261,7 +261,7 @@ class ChannelInterpreter:
         return PreparedInverse(curve, low, high, main=main, step=step)
 
     def _ends(self, curve: PreparedCurve) -> Range | None:
-        """Between which inputs of the curve its inverse is looked for; None where the datasheet sets no ends."""
+        """Return the inputs of the curve between which its inverse is searched; None if the datasheet sets no ends."""
         if not self.channel.actuator:
             return curve.calibration.raw_range or self.reader.form.raw_range
         ends = [float(self._stated(np.asarray(limit))) for limit in self.limits]
@@ -269,7 +269,10 @@ class ChannelInterpreter:
 
     @cached_property
     def _way_back(self) -> PreparedInverse | None:
-        """For an actuator: from its raw set point to values; None where its curve turns, so that none can be told."""
+        """Return an actuator's conversion from raw set point to values.
+
+        None if its curve turns, which makes it ambiguous.
+        """
         try:
             return self._inverse if self._curve is not None else None
         except BadDataError:
@@ -295,7 +298,7 @@ class ChannelInterpreter:
 
     @cached_property
     def _same(self) -> bool:
-        """Whether the curve gives values in :attr:`unit` as they are."""
+        """True if the curve gives values in :attr:`unit` without conversion."""
         own = self.channel.calibration
         scale, offset = (own.unit.scale, own.unit.offset) if own is not None else (1.0, 0.0)
         return (scale, offset) == (self.unit.scale, self.unit.offset)
@@ -317,7 +320,7 @@ class ChannelInterpreter:
         return (si - own.unit.offset) / own.unit.scale if own is not None else si
 
     def _limits(self) -> Range:
-        """The narrower of the channel's limits (SI) and those of its calibration, in :attr:`unit`."""
+        """Return the narrower of the channel's limits (SI) and those of its calibration, in :attr:`unit`."""
         channel, own = self.channel, self.channel.calibration
         lows, highs = [channel.low], [channel.high]
         if own is not None:

@@ -2,9 +2,9 @@
 
 ``Y = Σi … Σp C[i, …, p] · (X1 - H1)^i · … · (Xn - Hn)^p`` with a coefficient set for every cell of the grid that the
 segment boundaries of the inputs span (teds.md, "5 CalTEDS"; the formula is certain, the field numbers are not).
-Coefficients stand cell after cell, the last input running fastest, and within a cell exponent after exponent, again the
-last input fastest; a value on a boundary belongs to the upper segment (both from memory); outside the outer boundaries
-the end segment holds and the result is flagged.
+Coefficients are ordered cell after cell, the last input running fastest, and within a cell exponent after exponent,
+again the last input fastest; a value on a boundary belongs to the upper segment (both from memory); outside the outer
+boundaries the end segment applies and the result is flagged.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ PLAIN: Final = parse_unit("1")
 
 
 def float32(values: tuple[float, ...], name: str) -> tuple[float, ...]:
-    """Round to what a Float32 holds; raises BadDataError where one does not fit."""
+    """Round to what a Float32 holds; raises BadDataError if one does not fit."""
     try:
         return struct.unpack(f">{len(values)}f", struct.pack(f">{len(values)}f", *values))
     except (OverflowError, struct.error) as error:
@@ -68,7 +68,7 @@ class CalibrationInput:
 
     @property
     def ascending(self) -> bool:
-        """Whether the boundaries ascend strictly, as they must for the formula to mean anything."""
+        """True if the boundaries ascend strictly, as they must for the formula to mean anything."""
         return all(low < high for low, high in zip(self.boundaries, self.boundaries[1:], strict=False))
 
 
@@ -76,12 +76,11 @@ class CalibrationInput:
 class Calibration:
     """Calibration of one channel; every number is rounded to what the TEDS will hold (Float32).
 
-    ``unit`` is the calibrated unit with its way into SI (SIConvrt); limits, uncertainty and zero offset are in it. For
-    an actuator the formula runs from calibrated units to raw, and the zero offset is raw. ``points`` are the
+    ``unit`` is the calibrated unit with its conversion into SI (SIConvrt); limits, uncertainty and zero offset are in
+    it. For an actuator the formula runs from calibrated units to raw, and the zero offset is raw. ``points`` are the
     (raw, value) pairs that it was fitted to; they do not go into the TEDS. ``interval`` is in seconds, ``zeroed`` when
-    the zero offset was set where the sensor is mounted. ``monotone`` and
-    ``raw_range`` are what the transducer type demands and delivers, carried along so that the guard knows them without
-    the profile.
+    the zero offset was set where the sensor is mounted. ``monotone`` and ``raw_range`` are what the transducer type
+    demands and delivers, carried along so that the guard knows them without the profile.
     """
 
     channel: int
@@ -131,11 +130,11 @@ class Calibration:
             return None
 
     def overdue(self, now: datetime) -> bool:
-        """Whether the due date has passed."""
+        """True if the due date has passed."""
         return self.due is not None and self.due < now
 
     def date_warnings(self, now: datetime, demanded_interval: float | None = None) -> list[str]:
-        """What a person should know about the calibration's age, as sentences."""
+        """Return warnings about the calibration's age, as sentences."""
         if self.date is None:
             if demanded_interval is None:
                 return ["the calibration has no date."]
@@ -189,7 +188,7 @@ class Calibration:
 
 
 def instant(moment: datetime) -> TimeInstance:
-    """A moment as a TEDS has it, to the second."""
+    """Return a moment as a TEDS has it, to the second."""
     seconds = (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(seconds=1)
     return TimeInstance(abs(seconds), 0, seconds < 0)
 
@@ -197,11 +196,11 @@ def instant(moment: datetime) -> TimeInstance:
 def from_decoded(
     decoded: DecodedTeds, *, channel: int | None = None, units: Units | None = None, actuator: bool = False
 ) -> Calibration:
-    """Calibration of a decoded Calibration TEDS; ``units`` and ``actuator`` as the channel's own TEDS says.
+    """Return the calibration of a decoded Calibration TEDS; ``units`` and ``actuator`` from the channel's own TEDS.
 
     Without ``channel`` it is that of the first input.
 
-    Raises BadDataError where the TEDS has no coefficients of the general form, or they do not fit together.
+    Raises BadDataError if the TEDS has no coefficients of the general form, or they do not fit together.
     """
     number = channel or 0
     inputs = tuple(_input(field, number) for field in decoded.fields if field.name == "CalInput")
@@ -306,12 +305,12 @@ def _seconds(value: object) -> float | None:
 
 
 def is_sound(calibration: Calibration) -> bool:
-    """Whether it can be computed: every number of it is a number, and the boundaries of its segments ascend."""
+    """True if it can be computed: every number of it is a number, and the boundaries of its segments ascend."""
     return is_finite(calibration) and all(part.ascending for part in calibration.inputs)
 
 
 def is_finite(calibration: Calibration) -> bool:
-    """Whether every number of it is a number."""
+    """True if every number of it is a number."""
     numbers = [*calibration.coefficients, calibration.zero_offset]
     for part in calibration.inputs:
         numbers += [*part.boundaries, *part.offsets]

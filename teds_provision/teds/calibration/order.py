@@ -1,4 +1,4 @@
-"""What a calibration file says, and the calibration that comes of it for one channel of a profile."""
+"""The content of a calibration file, and the resulting calibration for one channel of a profile."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
 
 def is_number(value: object) -> bool:
-    """Whether a value is a finite number that a Float32 may hold."""
+    """True if a value is a finite number that a Float32 may hold."""
     return type(value) in (int, float) and abs(value) <= FLOAT32_MAXIMUM  # type: ignore[arg-type]
 
 
 @dataclass
 class CalibrationOrder:
-    """What a file says about one calibration, before it is fitted to a channel: values with their places."""
+    """A file's content about one calibration, before it is fitted to a channel: values with their places."""
 
     file: str
     line: int
@@ -35,11 +35,11 @@ class CalibrationOrder:
         return BadDataError(f"{self.file}:{line}: {key}: {message}" if key else f"{self.file}:{line}: {message}")
 
     def get(self, key: str) -> object:
-        """Value of a key, None where it is absent."""
+        """Return the value of a key, None if it is absent."""
         return self.values[key][0] if key in self.values else None
 
     def number(self, key: str) -> float | None:
-        """Number of a key."""
+        """Return the number of a key."""
         value = self.get(key)
         if value is None:
             return None
@@ -62,7 +62,7 @@ class CalibrationOrder:
 
 
 def calibration_of(order: CalibrationOrder, channel: ChannelProfile) -> Calibration:
-    """Fit or take over what the file says for a channel; raises BadDataError with file, line and field."""
+    """Fit or take over the file's calibration for a channel; raises BadDataError with file, line and field."""
     unit = _unit(order, channel)
     try:
         curve = _curve(order, channel)
@@ -91,7 +91,10 @@ def calibration_of(order: CalibrationOrder, channel: ChannelProfile) -> Calibrat
 
 
 def _misfit(curve: Calibration) -> float | None:
-    """Largest residual of a fit in the calibrated unit; None where it is Float32 rounding (or raw, of an actuator)."""
+    """Return the largest residual of a fit in the calibrated unit.
+
+    None if it is Float32 rounding (or raw, of an actuator).
+    """
     left = None if curve.actuator else residuals(curve)
     if left is None:
         return None
@@ -159,7 +162,7 @@ def _segments(order: CalibrationOrder, channel: ChannelProfile, method: Method |
 
 
 def _connected(order: CalibrationOrder) -> list[tuple[float, ...]]:
-    """Rows of the table of segments (from, to, offset, C0, C1 …), each of which begins where the last one ends."""
+    """Return rows of the table of segments (from, to, offset, C0, C1 …), each beginning where the last one ends."""
     value, line = order.values["segments"]
     rows = value if isinstance(value, list) else []
     for number, (above, below) in enumerate(pairwise(rows)):

@@ -1,4 +1,4 @@
-"""A calibration as plain data, whole: what a recording or a ROS topic needs to calibrate raw values anew."""
+"""A calibration as plain data, whole: what a recording or a ROS topic needs to calibrate raw values again."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def calibration_as_json(calibration: Calibration) -> dict[str, Any]:
 
 
 def calibration_from_json(data: object, channel: int, units: Units) -> Calibration:
-    """The calibration of a channel with these exponents; raises BadDataError where the data are none."""
+    """Return the calibration of a channel with these exponents; raises BadDataError if the data are none."""
     if not isinstance(data, dict) or data.get("method") not in METHODS:
         raise BadDataError("The calibration is not that of a recording.")
     try:

@@ -30,10 +30,10 @@ class Point:
 
 
 def with_point(text: str, file: str, point: Point, *, node: str, unit: WrittenUnit, today: date) -> str:
-    """The text of a file with one point more; an empty text becomes a new file in ``unit``.
+    """Return the text of a file with one more point; an empty text becomes a new file in ``unit``.
 
-    Values stand in the unit of the file. Raises PolicyError where the file is of another node, BadDataError where it is
-    no calibration CSV with these columns, or its unit is of another kind.
+    Values are in the unit of the file. Raises PolicyError if the file is of another node, BadDataError if it is no
+    calibration CSV with these columns, or its unit is of another kind.
     """
     if not text:
         head = f"# node: {node}\n# date: {today}\nchannel, raw, value [{unit.text}], # spread, # count\n"
@@ -63,7 +63,7 @@ def _row(point: Point, unit: WrittenUnit) -> str:
 
 
 def points_of(text: str, file: str) -> list[Mapping[str, float | int | None]]:
-    """The points of such a file as plain data: channel, raw, value (in the file's unit), spread, count."""
+    """Return the points of such a file as plain data: channel, raw, value (in the file's unit), spread, count."""
     table = read_csv(text, file, CSV_KEYS)
     lines = text.splitlines()
     out: list[Mapping[str, float | int | None]] = []
@@ -84,7 +84,7 @@ def points_of(text: str, file: str) -> list[Mapping[str, float | int | None]]:
 
 
 def _number(text: str) -> float | None:
-    """A remark that is a number; None for what somebody else wrote there."""
+    """Return a remark that is a number; None for other text."""
     try:
         number = float(text)
     except ValueError:

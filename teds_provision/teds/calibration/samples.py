@@ -1,8 +1,8 @@
-"""Samples of a channel: data model, octets and bits, the raw numbers that they can give, and reading and writing them.
+"""Samples of a channel: data model, octets and bits, the possible raw numbers, and reading and writing them.
 
 DatModel, ModLenth and SigBits are fields 40 to 42 of the TransducerChannel TEDS (teds.md, "3 ChanTEDS"). Samples come
 in blocks (operation.md section 2): a number of samples of one channel, each ModLenth octets, most significant octet
-first. Integers stand right-justified, floats are IEEE 754, a fraction has its point before the first bit.
+first. Integers are right-justified, floats are IEEE 754, a fraction has its point before the first bit.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ _OCTETS: Final = {
 
 @dataclass(frozen=True)
 class SampleForm:
-    """How one sample stands on the wire: DatModel, ModLenth (octets), SigBits; 0 where the TEDS does not say."""
+    """Form of one sample on the wire: DatModel, ModLenth (octets), SigBits; 0 if the TEDS has none."""
 
     model: int
     octets: int
@@ -80,17 +80,17 @@ class SampleForm:
 
     @property
     def raw_range(self) -> Range | None:
-        """Lowest and highest raw value that it can give; None where it sets none."""
+        """Lowest and highest raw value that it can give; None if it sets none."""
         return raw_range(self.model, self.octets, self.bits)
 
     @property
     def integer(self) -> bool:
-        """Whether raw values are whole numbers."""
+        """True if raw values are whole numbers."""
         return self.model in (DataModel.UNSIGNED, DataModel.LONG_INTEGER)
 
     @property
     def problem(self) -> str:
-        """Why samples of this form cannot be read as numbers, as half a sentence; "" where they can."""
+        """Why samples of this form cannot be read as numbers, as half a sentence; "" if they can."""
         if self.model not in _OCTETS:
             return f"its data model {self.model} is reserved"
         least, most = _OCTETS[DataModel(self.model)]
@@ -101,7 +101,7 @@ class SampleForm:
 
 
 def raw_range(model: int, octets: int, bits: int) -> Range | None:
-    """Lowest and highest raw value, ends included; None where the model sets none (floats, bits, times, unknown).
+    """Return lowest and highest raw value, ends included; None if the model sets none (floats, bits, times, unknown).
 
     SigBits counts right-justified bits of an integer, and the leading bits of a fraction; 0, or more than the octets
     hold, means all of them.
@@ -148,10 +148,10 @@ class SampleReader:
         return self.form.octets > WORD
 
     def raw(self, octets: Octets) -> NDArray[np.generic]:
-        """Raw values as the data model says: unsigned 64-bit integers, Float64 for floats, fractions and times.
+        """Return raw values by the data model: unsigned 64-bit integers, Float64 for floats, fractions and times.
 
         Integers and bits of more than 8 octets come as Python integers in an object array. Takes octets one sample
-        after the other, or an array of shape (samples, ModLenth). Raises BadDataError where they do not divide evenly.
+        after the other, or an array of shape (samples, ModLenth). Raises BadDataError if they do not divide evenly.
         """
         rows = self._rows(octets)
         model = self.form.model

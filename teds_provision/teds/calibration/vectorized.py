@@ -58,7 +58,7 @@ class ManyChannels:
         self._prepare()
 
     def _prepare(self) -> None:
-        """What can be left out, since it changes nothing: a call of numpy costs as much for few samples as for many."""
+        """Drop operations without effect: a call of numpy costs as much for few samples as for many."""
         self._form = np.dtype(f">u{self._width}") if self._width in (1, 2, 4, 8) else None
         self._native = np.dtype(np.int64 if self._width < WORD else np.uint64)
         self._may_be_more = bool((self._most < 2.0 ** (8 * self._width) - 1).any())
@@ -83,11 +83,11 @@ class ManyChannels:
 
     @staticmethod
     def _bare(row: Floats) -> Floats | float:
-        """A number for each channel; of one channel the number itself, which numpy takes in half the time."""
+        """Return a number for each channel; of one channel the number itself, which numpy takes in half the time."""
         return float(row[0]) if len(row) == 1 else row
 
     def _lay_curves(self, curves: Sequence[Calibration | None]) -> None:
-        """The curves as one table; a channel without one gives its raw values (one segment, C = [0, 1])."""
+        """Arrange the curves as one table; a channel without one gives its raw values (one segment, C = [0, 1])."""
         parts = [curve.inputs[0] for curve in curves if curve is not None]
         segments = max((part.segments for part in parts), default=1)
         degree = max([1, *(part.degree for part in parts)])  # steps have 0: then the second coefficient is 0
@@ -115,7 +115,10 @@ class ManyChannels:
 
     @classmethod
     def side_by_side(cls, channels: Sequence[ChannelInterpreter], usable: Sequence[bool]) -> ManyChannels | None:
-        """Side by side, or None where they are not of one form; those that are not ``usable`` give no values."""
+        """Return them side by side, or None if they are not of one form.
+
+        Those that are not ``usable`` give no values.
+        """
         widths = {interpreter.octets for interpreter in channels}
         if len(widths) != 1 or max(widths) > WORD:
             return None
@@ -140,7 +143,7 @@ class ManyChannels:
             return self._valued(numbers, self._curved(numbers))
 
     def _curved(self, numbers: Floats) -> Floats:
-        """What the curves give for raw numbers, in their own units."""
+        """Return the curves' results for raw numbers, in their own units."""
         offset, *terms = self._plain or self._segments(numbers)
         distance = numbers - offset
         total: Floats = terms[-1] * distance
@@ -183,13 +186,13 @@ class ManyChannels:
 
 
 def _most(interpreter: ChannelInterpreter) -> float:
-    """The largest raw value that counts."""
+    """Return the largest raw value that counts."""
     bound = interpreter.reader.form.raw_range
     return math.inf if bound is None else bound[1]
 
 
 def _can_stand_beside(interpreter: ChannelInterpreter) -> bool:
-    """A sensor of unsigned integers with a curve over its own raw value, of not too many segments, or none."""
+    """True for a sensor of unsigned integers with a curve over its own raw value, of not too many segments, or none."""
     if interpreter.reader.form.model != DataModel.UNSIGNED or interpreter.channel.actuator or interpreter.others:
         return False
     curve = interpreter.channel.calibration

@@ -1,6 +1,6 @@
-"""The zero of a sensor where it is mounted: what many samples of it say, and a Calibration TEDS with another offset.
+"""The zero of a mounted sensor: statistics of many samples, and a Calibration TEDS with another offset.
 
-Values here are in the calibrated unit, the zero offset included, and before any limit is looked at: a sensor whose zero
+Values here are in the calibrated unit, the zero offset included, and before any limit is applied: a sensor whose zero
 is off may well read beyond its limits.
 """
 
@@ -32,7 +32,7 @@ _STEP: Final = 2.0**-23
 
 @dataclass(frozen=True)
 class SampleStatistics:
-    """What ``count`` samples of one quantity say: mean, standard deviation, and by how much the mean moved meanwhile.
+    """Statistics of ``count`` samples: mean, standard deviation, and by how much the mean moved meanwhile.
 
     ``drift`` is the mean of the second half less that of the first.
     """
@@ -48,12 +48,12 @@ class SampleStatistics:
         return _SIGMAS * self.spread / math.sqrt(self.count) + 4 * _STEP * abs(self.mean)
 
     def restless(self, most: float) -> bool:
-        """Whether it spreads, or drifts, by more than ``most``."""
+        """True if it spreads, or drifts, by more than ``most``."""
         return max(self.spread, abs(self.drift)) > most
 
 
 def reading_of(values: NDArray[np.float64], turn: float = math.inf) -> SampleStatistics:
-    """Reading of samples; ``turn``: they are angles in a unit in which this is a turn, and their mean is circular.
+    """Return the reading of samples; ``turn``: they are angles in a unit with this turn, and their mean is circular.
 
     The mean of angles lies within half a turn of the first one.
     """
@@ -69,26 +69,26 @@ def reading_of(values: NDArray[np.float64], turn: float = math.inf) -> SampleSta
 
 
 def shortest(difference: NDArray[np.float64], turn: float) -> NDArray[np.float64]:
-    """Differences of angles the shorter way round, as they are where ``turn`` is infinite."""
+    """Return differences of angles the shorter way round, unchanged if ``turn`` is infinite."""
     return difference - turn * np.round(difference / turn) if math.isfinite(turn) else difference
 
 
 def turn_of(calibration: Calibration, *, full_turn: bool) -> float:
-    """A turn in the calibrated unit, infinite where the channel's values do not wrap."""
+    """Return a turn in the calibrated unit, infinite if the channel's values do not wrap."""
     return TURN / abs(calibration.unit.scale) if full_turn else math.inf
 
 
 def offset_for(calibration: Calibration, reading: float, wanted: float, turn: float = math.inf) -> float:
-    """The zero offset (as a Float32 holds it) with which a sensor that gives ``reading`` now gives ``wanted``.
+    """Return the zero offset (as a Float32 holds it) with which a sensor that gives ``reading`` now gives ``wanted``.
 
-    Of angles the one nearest to 0: an offset of whole turns says nothing.
+    Of angles the one nearest to 0: an offset of whole turns has no effect.
     """
     offset = calibration.zero_offset + (wanted - reading)
     return float32((float(shortest(np.asarray(offset), turn)),), "zero_offset")[0]
 
 
 def with_zero_offset(teds: bytes, offset: float, at: datetime) -> bytes:
-    """A Calibration TEDS (Length to Checksum) with another zero offset and its date; all else octet for octet.
+    """Return a Calibration TEDS (Length to Checksum) with another zero offset and its date; all else octet for octet.
 
     Raises BadDataError for a TEDS that is damaged.
     """

@@ -41,11 +41,11 @@ def compose(
 ) -> bytes:
     """Compose a framed TEDS from values by field name, in ascending order of types.
 
-    ``fields`` is a mapping, or a sequence of pairs where fields repeat; nested structures take either again. A key
-    that is a number is a field that the table does not know, its value octets. Units are spelled as nested tuples in
-    the 2007 edition and packed in that of 2024. ``width`` is the number of length octets of every tuple (1 to 4);
-    without it 1 is taken, or 2 where a field needs it. Text-based TEDS take ``("Text", {"LangCode", "Text",
-    "Compress"})`` once per language. Raises BadDataError naming the field.
+    ``fields`` is a mapping, or a sequence of pairs if fields repeat; nested structures take either again. A key that is
+    a number is a field that the table does not know, its value octets. Units are spelled as nested tuples in the 2007
+    edition and packed in that of 2024. ``width`` is the number of length octets of every tuple (1 to 4); without it 1
+    is used, or 2 if a field needs it. Text-based TEDS take ``("Text", {"LangCode", "Text", "Compress"})`` once per
+    language. Raises BadDataError naming the field.
     """
     if not 1 <= access_code <= 255:
         raise BadDataError(f"An access code goes from 1 to 255, not {access_code}.")
@@ -71,7 +71,7 @@ class Composer:
         self.width = width
 
     def block(self, pairs: list[tuple[str, object]]) -> bytes:
-        """Data block with its TEDSID."""
+        """Return the data block with its TEDSID."""
         head = self.tedsid(dict(pairs).get("TEDSID"))
         content = [pair for pair in pairs if pair[0] not in _NOT_CONTENT]
         if self.table.access_code in TEXT_BASED:
@@ -147,7 +147,7 @@ class Composer:
 
 
 def _spread(pairs: list[tuple[str, object]], known: Mapping[str, FieldSpec]) -> list[tuple[str, object]]:
-    """One pair per value where a repeated structure is given as a list of mappings."""
+    """Return one pair per value if a repeated structure is given as a list of mappings."""
     done: list[tuple[str, object]] = []
     for name, value in pairs:
         spec = known.get(name)
@@ -172,11 +172,11 @@ def encode(decoded: DecodedTeds) -> bytes:
 
 
 def recompose(decoded: DecodedTeds) -> bytes:
-    """Encode the fields of a decoded TEDS anew: TEDSID, width, order, spelling of units and Length as they should be.
+    """Encode the fields of a decoded TEDS again, with correct TEDSID, width, order, spelling of units and Length.
 
     The result is equal to the original for a clean TEDS. Unknown fields keep their octets. A framed TEDS gives a framed
-    one with right Length and checksum, a bare data block gives a bare one. Raises BadDataError where there is nothing
-    to encode from (malformed octets, a message).
+    one with right Length and checksum, a bare data block gives a bare one. Raises BadDataError if there is nothing to
+    encode from (malformed octets, a message).
     """
     if decoded.verdict in {"malformed", "message"}:
         raise BadDataError(f"This cannot be encoded anew: its verdict is {decoded.verdict}.")
@@ -190,7 +190,7 @@ def recompose(decoded: DecodedTeds) -> bytes:
 
 
 def tuple_width(decoded: DecodedTeds) -> int:
-    """How many length octets the tuples of a decoded TEDS have, as its TEDSID says; 1 where it does not say."""
+    """Return the number of length octets of a decoded TEDS's tuples, by its TEDSID; 1 if it has none."""
     for field in decoded.fields:
         if field.name == "TEDSID":
             width = field.raw[-1] if field.raw else 1
@@ -212,7 +212,7 @@ def _again(field: Field, known: Mapping[int, FieldSpec], fields: Table | None, e
 
 
 def _leaf(field: Field, spec: FieldSpec | None, edition: Edition) -> bytes:
-    """Value octets from the value; from the raw octets where no value came of them or it has other spellings."""
+    """Return value octets from the value; from the raw octets if they gave no value or have another spelling."""
     if spec is None or field.value is None or not field.name:
         return field.raw
     if isinstance(field.value, Units):
@@ -232,7 +232,7 @@ def _written(field: Field, spec: FieldSpec, edition: Edition) -> bytes:
 
 
 def _tail(decoded: DecodedTeds) -> bytes:
-    """What stands behind the tuples of a text-based TEDS, octet for octet."""
+    """Return the octets behind the tuples of a text-based TEDS, unchanged."""
     if not decoded.text:
         return b""
     last = decoded.fields[-1] if decoded.fields else None
@@ -255,11 +255,11 @@ _ONE_FORM: Final = frozenset({AccessCode.SECURITY, AccessCode.ORIGIN, AccessCode
 
 
 def convert(decoded: DecodedTeds, edition: Edition, *, uuid: bytes | None = None) -> tuple[bytes, list[Finding]]:
-    """Convert a decoded TEDS to an edition, framed or bare as it came; findings say what was changed or lost.
+    """Convert a decoded TEDS to an edition, framed or bare as it came; findings list what was changed or lost.
 
-    A UUID of one edition cannot be said in the other: ``uuid`` gives the new one, else the field is left out (an error
-    finding). The profile's own TEDS (access codes 128, 130, 131) have one form only and are returned as they are.
-    Raises BadDataError for octets that have no fields to convert, or no TEDSID.
+    A UUID of one edition does not exist in the other: ``uuid`` gives the new one, else the field is left out (an error
+    finding). The profile's own TEDS (access codes 128, 130, 131) have one form only and are returned unchanged. Raises
+    BadDataError for octets that have no fields to convert, or no TEDSID.
     """
     if decoded.edition is None or decoded.access_code is None or decoded.verdict in {"malformed", "message"}:
         raise BadDataError(f"This cannot be converted: it is no TEDS of known edition (verdict {decoded.verdict}).")
@@ -363,7 +363,10 @@ class _Conversion:
         return composer.tuple(part.type, part.raw)
 
     def text(self, composer: Composer) -> bytes:
-        """Text-based TEDS: the directory is written anew where it describes the texts; else all is kept behind it."""
+        """Return a text-based TEDS: its directory is rewritten if it describes the texts.
+
+        Else all is kept behind it.
+        """
         entries = self.directory()
         if entries:
             pairs: list[tuple[str, object]] = [
@@ -383,7 +386,10 @@ class _Conversion:
         return self.framed(self.tedsid(first, composer.width) + block[2 + len(first.raw) :])
 
     def directory(self) -> list[Field]:
-        """One entry for each text; none where the directory does not describe them, or holds more than it should."""
+        """Return one entry for each text.
+
+        None if the directory does not describe them, or holds more than it should.
+        """
         fields = self.decoded.fields
         standard = {"TEDSID", "NumLang", "DirBlock", "SubSum"}
         if fields[0].name != "TEDSID" or any(part.name not in standard for part in fields):

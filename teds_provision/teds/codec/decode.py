@@ -35,7 +35,7 @@ MAX_FINDINGS: Final = 1000
 
 
 class Head:
-    """What is known of some octets before their tuples are walked: frame, edition, class, width."""
+    """Facts about some octets before their tuples are walked: frame, edition, class, width."""
 
     def __init__(self, octets: bytes, *, framed: bool) -> None:
         self.octets = octets
@@ -94,7 +94,7 @@ class Head:
         return 4, end
 
     def trailing(self, length: int) -> bool:
-        """A whole TEDS with more octets behind it, as a dump of flash gives: decoded up to its checksum."""
+        """Accept trailing bytes (flash dumps): a whole TEDS is decoded up to its checksum."""
         end = length + 4
         if not MINIMUM_OCTETS <= end < len(self.octets):
             return False
@@ -105,7 +105,7 @@ class Head:
         return True
 
     def tedsid(self, start: int, end: int) -> None:
-        """Take edition, class and tuple width from the TEDSID, wherever it stands."""
+        """Take edition, class and tuple width from the TEDSID, at any position."""
         at = start if self.octets[start] == TEDSID else self.search_tedsid(start, end)
         self.tedsid_at = at
         if at != start:
@@ -128,7 +128,7 @@ class Head:
         self.check_class(self.table, value, at)
 
     def width_of(self, width: int, place: int) -> int:
-        """Octets of the length part of all later tuples, 1 where the TEDSID asks for something impossible."""
+        """Return the length octets of all later tuples, 1 if the TEDSID has an impossible value."""
         if 1 <= width <= 4:
             return width
         message = f"The TEDSID asks for tuples of {width} length octets."
@@ -166,7 +166,7 @@ _made: Final[Callable[[tuple[object, ...]], Field]] = partial(tuple.__new__, Fie
 
 
 def decode(octets: bytes, *, strict: bool = False) -> DecodedTeds:
-    """Decode a framed TEDS or a bare data block, 2007 or 2024 edition (told by the length of the TEDSID).
+    """Decode a framed TEDS or a bare data block, 2007 or 2024 edition (by the length of the TEDSID).
 
     Never raises, whatever the octets, unless ``strict``: then BadDataError with the first finding of severity error. A
     message is recognised and not taken apart here. Offsets in findings and fields count from the first octet given.
@@ -245,7 +245,7 @@ class _Walk(Head):
         return self.table is not None and self.table.access_code in TEXT_BASED
 
     def extent(self, at: int, end: int, width: int) -> tuple[int, int]:
-        """Where the value of the tuple at ``at`` begins and ends; its Length has ``width`` octets."""
+        """Return where the value of the tuple at ``at`` begins and ends; its Length has ``width`` octets."""
         body = at + 1 + width
         if width == 1 and body <= end:
             return body, body + self.octets[at + 1]
@@ -257,7 +257,7 @@ class _Walk(Head):
         return _made((kind, spec.name, READERS[spec.kind](raw), raw, at, ()))
 
     def stopped(self, kind: int, at: int, body: int, size: int, end: int, fields: list[Field]) -> None:
-        """The walk cannot go on: a tuple runs past the end, or there are too many."""
+        """End the walk: a tuple runs past the end, or there are too many."""
         if self.left <= 0:
             self.find("error", "too-many", f"There are more than {MAX_TUPLES} tuples; the rest is not read.", at)
         elif self.access_code == AccessCode.END_USER:
@@ -294,7 +294,7 @@ class _Walk(Head):
                 )
 
     def special(self, kind: int, spec: FieldSpec | None, raw: bytes, at: int, body: int) -> Field:
-        """A field that is nested, of variable or wrong length, or not in the table."""
+        """Return a field that is nested, of variable or wrong length, or not in the table."""
         if spec is None:
             return self.stranger(kind, raw, at, body)
         if spec.kind == "units":
@@ -317,13 +317,13 @@ class _Walk(Head):
         return READERS[kind](raw)
 
     def wrong_length(self, spec: FieldSpec, raw: bytes, body: int) -> Value:
-        """An integer of another width is still one; of anything else no value comes."""
+        """Return the value of a wrong length: an integer of another width is still one; all else has no value."""
         tolerated = len(raw) in spec.also or not self.firm()
         self.length(spec, len(raw), spec.octets, body, "warning" if tolerated else "error")
         return int.from_bytes(raw, "big") if spec.kind in {"u8", "u16", "u32"} and 0 < len(raw) <= 8 else None
 
     def firm(self) -> bool:
-        """Whether a wrong length is an error: not where the table is unverified or the class belongs to somebody."""
+        """Return True if a wrong length is an error: not in an unverified table or a maker's own class."""
         return self.table is not None and self.table.verified and self.table.access_code != AccessCode.SECURITY
 
     def length(self, spec: FieldSpec, size: int, asked: tuple[object, ...], body: int, severity: Severity) -> None:
@@ -332,7 +332,7 @@ class _Walk(Head):
         self.find(severity, "length", message, body, spec.name, wanted, size)
 
     def stranger(self, kind: int, raw: bytes, at: int, body: int) -> Field:
-        """A type that the table of this class does not have at top level."""
+        """Return a field of a type that the table of this class does not have at top level."""
         known = self.table
         if known is None or not known.by_type:
             return Field(kind, "", None, raw, at)
@@ -383,7 +383,7 @@ class _Walk(Head):
         return Field(spec.type, spec.name, units_of(bytes(packed)), raw, at, children)
 
     def nested(self, parent: FieldSpec, start: int, end: int) -> tuple[Field, ...]:
-        """Tuples inside a structure, only those of its own table."""
+        """Return the tuples inside a structure, only those of its own table."""
         octets, width, by_type = self.octets, self.width, parent.by_type
         fields: list[Field] = []
         seen: set[int] = set()
@@ -437,5 +437,5 @@ class _Walk(Head):
         return Field(kind, "", None, raw, at)
 
     def text_area(self, fields: list[Field], at: int, end: int) -> None:
-        """What stands behind the directory of a text-based TEDS."""
+        """Decode what follows the directory of a text-based TEDS."""
         self.text = split_text(fields, self.octets[at:end], at, self.find)

@@ -1,9 +1,9 @@
 """The general structure of every TEDS: Length ‖ data block of tuples ‖ Checksum (teds.md, "Frame, tuples, verdicts").
 
-:func:`shape_of` tells it from a bare data block and from a message, by the first octets alone.
+:func:`shape_of` distinguishes it from a bare data block and from a message, by the first octets alone.
 
 Everything is big-endian. ``Length`` counts the data block and the two checksum octets. The checksum is a plain sum and
-no security measure: it cannot see exchanged octets.
+no security measure: it cannot detect exchanged octets.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _TEDSIDS: Final = (bytes([TEDSID, 4]), bytes([TEDSID, 5]))
 
 
 class RawTuple(NamedTuple):
-    """One tuple as it stands: ``offset`` of its Type octet counted from the start of what was walked."""
+    """One tuple: ``offset`` of its Type octet counted from the start of the walk."""
 
     type: int
     value: bytes
@@ -83,7 +83,7 @@ def raw_tuple(kind: int, value: bytes, *, width: int = 1) -> bytes:
 
 
 def teds_class(block: bytes) -> int | None:
-    """Class (access code) that the TEDSID of a data block names, None where there is no readable TEDSID.
+    """Return the class (access code) in the TEDSID of a data block, None if there is no valid TEDSID.
 
     The TEDSID is 4 octets in the 2007 form and 5 in the 2024 form (teds.md, "Frame, tuples, verdicts").
     """
@@ -97,10 +97,10 @@ def teds_class(block: bytes) -> int | None:
 
 
 def shape_of(octets: bytes) -> Shape:
-    """What octets are: a TEDS with Length and checksum, a data block without, or a message around something.
+    """Return what octets are: a TEDS with Length and checksum, a data block without, or a message around something.
 
     A data block starts with a TEDSID (03 04 or 03 05). A message is recognised by a length in its header that fits to
-    the octet. Everything else is taken for a framed TEDS, however damaged.
+    the octet. Everything else counts as a framed TEDS, however damaged.
     """
     if int.from_bytes(octets[:4], "big") == len(octets) - 4:
         return "framed"
@@ -119,15 +119,15 @@ def _is_message(octets: bytes) -> bool:
 
 
 def _counts(octets: bytes, at: int) -> bool:
-    """Whether the u16 at ``at`` counts what follows it to the octet."""
+    """True if the u16 at ``at`` counts what follows it to the octet."""
     return len(octets) >= at + 2 and int.from_bytes(octets[at : at + 2], "big") == len(octets) - at - 2
 
 
 def _is_service(octets: bytes) -> bool:
-    """A network service of 2024: type 1 to 9, id, message type 1 to 5, length."""
+    """True for a network service of 2024: type 1 to 9, id, message type 1 to 5, length."""
     return _counts(octets, 3) and 1 <= octets[0] <= 9 and 1 <= octets[2] <= 5
 
 
 def _is_command(octets: bytes) -> bool:
-    """A command of 2007: channel u16, class 1 to 7 or a maker's, function, length."""
+    """True for a command of 2007: channel u16, class 1 to 7 or a maker's, function, length."""
     return _counts(octets, 4) and octets[3] != 0 and (1 <= octets[2] <= 7 or octets[2] >= 128)

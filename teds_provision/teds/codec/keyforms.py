@@ -1,6 +1,6 @@
-"""Keys and signatures in other people's Security TEDS: PEM, hex, base64, DER or raw, told apart without cryptography.
+"""Keys and signatures in foreign Security TEDS: PEM, hex, base64, DER or raw, recognised without cryptography.
 
-Only the wrapping is taken off; whether a point lies on the curve or a signature is good is not looked at.
+Only the wrapping is removed; neither points nor signatures are verified.
 """
 
 from __future__ import annotations

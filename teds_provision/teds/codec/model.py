@@ -65,7 +65,7 @@ MALFORMED_CODES: Final = frozenset({"not-closed", "too-short", "too-large", "too
 
 
 class Conformity(StrEnum):
-    """How far octets keep to the standard; framed TEDS, bare data blocks and messages are told apart."""
+    """How far octets follow the standard; framed TEDS, bare data blocks and messages are distinguished."""
 
     CLEAN = "clean"
     FRAME_BAD = "frame-bad"
@@ -98,7 +98,7 @@ class Conformity(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One deviation: where it stands, what the standard asks, what stands there.
+    """One deviation: its place, the rule, and the actual content.
 
     ``offset`` counts octets from the first octet given to the decoder; ``field`` is the field's name or ''.
     """

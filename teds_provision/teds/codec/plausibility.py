@@ -1,4 +1,4 @@
-"""What is wrong with values that are well formed: enumerations, limits, swapped octets, weak algorithms."""
+"""Faults in well-formed values: enumerations, limits, swapped octets, weak algorithms."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def _sampling(field: Field, find: Find) -> None:
 
 
 def _security(fields: tuple[Field, ...], find: Find, octets: bytes, framed: bool) -> None:
-    """A Security TEDS with field 105 is canonical or in error; other people's are shown as they are."""
+    """Check that a Security TEDS with field 105 is canonical; foreign ones are only shown."""
     if not any(field.type == PROFILE_VERSION for field in fields):
         find("note", "foreign", "This Security TEDS is not of our profile (no field 105).", None)
         return

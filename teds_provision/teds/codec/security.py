@@ -64,7 +64,7 @@ class SecurityTeds:
 
     @property
     def signed(self) -> bool:
-        """Whether it holds the signature and the keys that a signed one must hold."""
+        """True if it holds the signature and the keys that a signed one must hold."""
         return None not in (self.signature, self.station_key, self.station_key_signature)
 
     def block(self) -> bytes:
@@ -100,7 +100,7 @@ def initial(node_key: bytes, node_key_signature: bytes, *, sequence: int, key_ep
 
 
 def other_wire(shown: SecurityTeds) -> str:
-    """Which ProfileVersion, SessionSuite or KeyAgreement it names that is not spoken here; empty where all are."""
+    """Name the unsupported ProfileVersion, SessionSuite or KeyAgreement; empty if all are supported."""
     named = {PROFILE_VERSION: "ProfileVersion", SESSION_SUITE: "SessionSuite", KEY_AGREEMENT: "KeyAgreement"}
     for number, name in named.items():
         if shown.values[number] != OUR_VALUES[number]:
@@ -109,11 +109,11 @@ def other_wire(shown: SecurityTeds) -> str:
 
 
 def require_our_wire(image: Image) -> Image:
-    """Give an image back.
+    """Return an image of a supported wire.
 
-    Raises BadDataError, by name, for one whose Security TEDS is of a wire that is not spoken here.
+    Raises BadDataError, by name, for one whose Security TEDS needs an unsupported one.
 
-    One without, or with another owner's kind of Security TEDS, is left to whoever judges it.
+    An image without, or with a foreign kind of Security TEDS, is left to the caller to judge.
     """
     octets = image.security
     try:
@@ -136,9 +136,9 @@ def ca_hint(name: str, ca_fingerprint: str) -> str:
 
 @lru_cache(maxsize=16)
 def decode(teds: bytes) -> SecurityTeds:
-    """Read a framed Security TEDS in canonical form; raises NotCanonicalError with the rule that it breaks.
+    """Decode a framed Security TEDS in canonical form; raises NotCanonicalError with the rule that it breaks.
 
-    Every step of a provisioning asks what the same octets say, so the last ones are remembered: nobody changes them.
+    Every step of a provisioning decodes the same octets, so the last results are cached: they are immutable.
     """
     try:
         block = unframe(teds)
@@ -188,7 +188,7 @@ def _read(block: bytes, parts: list[tuple[int, int, int]]) -> SecurityTeds:
 
 
 def tbs(uuid: bytes, teds: bytes) -> bytes:
-    """What field 100 signs: label ‖ UUID ‖ the data block without the tuple of type 100, cut from the octets."""
+    """Return what field 100 signs: label ‖ UUID ‖ the data block without the tuple of type 100, cut from the octets."""
     block = unframe(teds)
     return _without_signature(uuid, block, _places(block))
 
@@ -203,7 +203,7 @@ def _without_signature(uuid: bytes, block: bytes, places: list[tuple[int, int, i
 
 
 def has_profile_version(teds: bytes) -> bool:
-    """Say whether the tuples close and field 105 is there: such a TEDS is canonical or refused."""
+    """True if the tuples close and field 105 is there: such a TEDS is canonical or refused."""
     try:
         return any(number == PROFILE_VERSION for number, _, _ in _places(unframe(teds)))
     except BadDataError:
@@ -211,9 +211,9 @@ def has_profile_version(teds: bytes) -> bool:
 
 
 def _places(block: bytes) -> list[tuple[int, int, int]]:
-    """Type, start and end of the value of every tuple (one length octet each); raises BadDataError where one runs out.
+    """Return type, start and end of every tuple's value (one length octet each); raises BadDataError for a cut one.
 
-    Walked twice for each datasheet (what does it say, what is signed), so this loop does no more.
+    Walked twice for each datasheet (its content, and what is signed), so this loop does no more.
     """
     places, at, size = [], 0, len(block)
     try:
@@ -231,9 +231,9 @@ def _places(block: bytes) -> list[tuple[int, int, int]]:
 
 
 def _ascending(block: bytes, parts: list[tuple[int, int, int]]) -> tuple[dict[int, bytes], list[bytes]]:
-    """Values by field, and those of every SignedBlock.
+    """Return values by field, and those of every SignedBlock.
 
-    Raises NotCanonicalError for an order, field or length of its own.
+    Raises NotCanonicalError for a wrong order, field or length.
     """
     values: dict[int, bytes] = {}
     blocks: list[bytes] = []

@@ -1,7 +1,7 @@
 """Field tables of every TEDS class, one per access code, open to inspection (teds.md, "Access codes").
 
-The rows stand here, but for those of the Calibration TEDS: the data file ``calibration_fields.toml`` has them, whose
-numbers nobody has checked against the standard.
+The rows are here, but for those of the Calibration TEDS: the data file ``calibration_fields.toml`` has them, as their
+numbers were not checked against the standard.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class FieldSpec:
 
 @dataclass(frozen=True)
 class Table:
-    """All rows of one TEDS class; ``verified`` is False where rows come from memory or from one weak source."""
+    """All rows of one TEDS class; ``verified`` is False if rows come from memory or from one weak source."""
 
     access_code: int
     name: str
@@ -130,7 +130,10 @@ class Table:
 
 
 def name_of(access_code: int) -> str:
-    """Name of a TEDS class, e.g. 3 -> ``ChanTEDS``; 'reserved' or 'manufacturer' where the standard names none."""
+    """Return the name of a TEDS class, e.g. 3 -> ``ChanTEDS``.
+
+    'reserved' or 'manufacturer' if the standard names none.
+    """
     known = NAMES.get(access_code)
     if known is not None:
         return known
@@ -486,7 +489,7 @@ __all__ = ["MANUFACTURER", "NAMES", "OCTETS", "ONLY_2024", "TEXT_BASED", "FieldS
 
 @cache
 def table(access_code: int) -> Table:
-    """Field table of a TEDS class; one without rows where no fields are known (their tuples stay raw)."""
+    """Return the field table of a TEDS class; one without rows if no fields are known (their tuples stay raw)."""
     name = name_of(access_code)
     if access_code == AccessCode.CALIBRATION:
         return calibration_table()

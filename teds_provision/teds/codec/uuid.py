@@ -3,8 +3,8 @@
 2007, 10 octets: north 1 bit, latitude 20 bits in arc seconds, east 1, longitude 20, manufacturer 4, year 12, time 22
 bits in units of 10 s since the start of that year (TAI). 2024, 16 octets: location 48 bits (1 + 23 + 1 + 23),
 manufacturer 24, year 16, time 40 bits; the unit of the location is open, that of the time (milliseconds) a guess from
-two examples. Many UUIDs in the field are random octets: whatever comes in is unpacked, and ``plausible`` says whether
-it can be meant.
+two examples. Many UUIDs in the field are random octets: all are unpacked, and ``plausible`` is True if the result makes
+sense.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class UuidParts:
 
     @property
     def moment(self) -> datetime | None:
-        """Time of manufacture (TAI, without time zone), None where year and time give no moment in that year."""
+        """Time of manufacture (TAI, without time zone), None if year and time give no moment in that year."""
         if not 1 <= self.year <= 9998:
             return None
         elapsed = timedelta(seconds=10 * self.time) if self.edition == 2007 else timedelta(milliseconds=self.time)
@@ -75,7 +75,7 @@ class UuidParts:
 
     @property
     def plausible(self) -> bool:
-        """Whether place, year and time can be meant: random octets rarely are."""
+        """True if place, year and time make sense: random octets rarely do."""
         degrees = self.degrees
         placed = degrees is None or (abs(degrees[0]) <= 90 and abs(degrees[1]) <= 180)
         return placed and self.year in _YEARS and self.moment is not None

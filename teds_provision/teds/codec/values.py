@@ -21,7 +21,7 @@ NOT_AVAILABLE: Final = bytes.fromhex("7fffffff")
 _INTEGERS: Final = {"u8": 1, "u16": 2, "u32": 4}
 _F32 = struct.Struct(">f")
 NO_EXTENSION: Final = (0x00, 0x80)
-"""What peers write where no Units Extension TEDS exists."""
+"""Value that peers write if no Units Extension TEDS exists."""
 
 
 # --- reading -----------------------------------------------------------------------------------------------------
@@ -51,7 +51,7 @@ def read_u16s(raw: bytes) -> Value:
 
 
 def read_text(raw: bytes) -> Value:
-    """UTF-8 text, or the octets where it is none."""
+    """Return UTF-8 text, or the octets if it is none."""
     try:
         return raw.decode()
     except UnicodeDecodeError:
@@ -59,7 +59,7 @@ def read_text(raw: bytes) -> Value:
 
 
 def read_key(raw: bytes) -> Value:
-    """Text of a key or signature (base64, PEM, hex), or the octets where it is raw or DER."""
+    """Return the text of a key or signature (base64, PEM, hex), or the octets if it is raw or DER."""
     try:
         text = raw.decode("ascii")
     except UnicodeDecodeError:
@@ -68,7 +68,7 @@ def read_key(raw: bytes) -> Value:
 
 
 def read_octets(raw: bytes) -> Value:
-    """The octets themselves."""
+    """Return the octets themselves."""
     return raw
 
 
@@ -108,7 +108,7 @@ def units_of(packed: bytes) -> Units:
 
 
 def is_packed_units(raw: bytes) -> bool:
-    """Whether a UNITS value is packed (10 or 11 octets, interpretation first) rather than a run of tuples."""
+    """True if a UNITS value is packed (10 or 11 octets, interpretation first) rather than a run of tuples."""
     return len(raw) in (10, 11) and raw[0] <= 5
 
 
@@ -257,7 +257,7 @@ def pack_units(spec: FieldSpec, units: Units) -> bytes:
 
 
 def write_fixed(spec: FieldSpec, value: object) -> bytes:
-    """Octets or text of exactly the number that the table says."""
+    """Return octets or text of exactly the number in the table."""
     octets = write_text(spec, value)
     if len(octets) not in spec.octets:
         raise _refuse(spec.name, f"has {spec.octets[0]} octets, not {len(octets)}")
@@ -289,7 +289,10 @@ Fields = Mapping[str, object] | Pairs
 
 
 def pairs_of(name: str, fields: object) -> list[tuple[str, object]]:
-    """Mapping or sequence of pairs -> list of (field name, value); a list of values in a mapping is not spread."""
+    """Return a mapping or sequence of pairs as a list of (field name, value).
+
+    A list of values in a mapping is not spread.
+    """
     if isinstance(fields, Mapping):
         return [(str(key), value) for key, value in fields.items()]
     if isinstance(fields, Sequence) and not isinstance(fields, str | bytes):
@@ -313,7 +316,7 @@ _BY_NAME = {row.name: row for row in TEXT}
 
 
 def compose_text(head: bytes, pairs: list[tuple[str, object]], encode: Tuples, width: int) -> bytes:
-    """Data block of a text-based TEDS from pairs ("Text", {"LangCode", "Text", "Compress"})."""
+    """Return the data block of a text-based TEDS from pairs ("Text", {"LangCode", "Text", "Compress"})."""
     texts = [_text(value) for name, value in pairs if name == "Text"]
     others = [pair for pair in pairs if pair[0] != "Text"]
     if not texts:

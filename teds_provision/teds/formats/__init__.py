@@ -56,7 +56,7 @@ _CONTROL: Final = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
 
 
 def detect(octets: bytes) -> Kind:
-    """What a file holds, by its content alone; whatever is no text is binary. Raises BadDataError for an empty file."""
+    """Return what a file holds, by its content alone; non-text is binary. Raises BadDataError for an empty file."""
     if not octets:
         raise BadDataError("The file is empty.")
     text = _text(octets)
@@ -76,7 +76,7 @@ def detect(octets: bytes) -> Kind:
 
 
 def _text(octets: bytes) -> str | None:
-    """Text of a file, None where it holds control characters or is no UTF-8."""
+    """Return the text of a file, None if it holds control characters or is no UTF-8."""
     try:
         text = octets[: LIMITS.teds_file].decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -95,11 +95,11 @@ def _json_kind(text: str) -> Kind:
 
 
 def read_blocks(octets: bytes, kind: Kind | None = None, *, path: Path | None = None) -> list[TedsBlock]:
-    """TEDS of a file as (channel or None, access code or None, octets).
+    """Return the TEDS of a file as (channel or None, access code or None, octets).
 
-    ``path`` is where a profile lies, so that what it extends is found beside it. Raises BadDataError for a file that
-    does not hold what its kind says, with the place of the fault. Octets that make no TEDS are no fault here: decoding
-    them gives the findings.
+    ``path`` is the path of a profile, so that what it extends is found beside it. Raises BadDataError for a file that
+    does not match its kind, with the place of the fault. Octets that make no TEDS are no fault here: decoding them
+    gives the findings.
     """
     check_size(len(octets), LIMITS.teds_file, "the file")
     blocks = _read(octets, kind or detect(octets), path)
@@ -135,9 +135,9 @@ def _read_text(text: str, kind: Kind, path: Path | None) -> list[TedsBlock]:
 
 
 def write_blocks(blocks: Sequence[TedsBlock], format: Format) -> bytes | str:
-    """Write TEDS: octets for binary, text for every other format; :func:`lost` says what the format cannot hold.
+    """Write TEDS: octets for binary, text for every other format; :func:`lost` lists what the format cannot hold.
 
-    Raises BadDataError where nothing sensible can be written: several TEDS that would run into each other in a binary
+    Raises BadDataError if nothing sensible can be written: several TEDS that would run into each other in a binary
     file, an image of a node without UUID.
     """
     if format == "binary":
@@ -162,7 +162,7 @@ def write_blocks(blocks: Sequence[TedsBlock], format: Format) -> bytes | str:
 
 
 def lost(blocks: Sequence[TedsBlock], format: Format) -> tuple[str, ...]:
-    """What the format cannot hold of these TEDS, one sentence each; empty where writing loses nothing."""
+    """Return what the format cannot hold of these TEDS, one sentence each; empty if writing loses nothing."""
     if format == "toml":
         return write_profile(blocks)[1]
     if format in {"binary", "ihex"} and any(block.channel is not None for block in blocks):
@@ -195,10 +195,10 @@ _OF_A_CHANNEL: Final = frozenset({AccessCode.CHANNEL, AccessCode.CALIBRATION})
 
 
 def placed(octets: bytes, kind: Kind | None = None, *, path: Path | None = None) -> dict[BlockId, bytes]:
-    """TEDS of a document by channel and access code, without the Security TEDS; channel TEDS alone are of channel 1.
+    """Return the TEDS of a document by channel and access code, without the Security TEDS.
 
-    ``path`` is where a profile lies, for what it extends. Raises BadDataError for what holds no TEDS, or two of one
-    place.
+    TEDS of a channel alone are of channel 1. ``path`` is the path of a profile, for what it extends. Raises
+    BadDataError for a file without TEDS, or two of one place.
     """
     found: dict[BlockId, bytes] = {}
     for channel, code, teds in read_blocks(octets, kind or detect(octets), path=path):
@@ -218,13 +218,13 @@ def placed(octets: bytes, kind: Kind | None = None, *, path: Path | None = None)
 
 
 def stated_uuid(blocks: Mapping[BlockId, bytes]) -> bytes | None:
-    """The UUID that the Meta-TEDS states, 10 octets; None where it states none, or zeros."""
+    """Return the UUID in the Meta-TEDS, 10 octets; None if it has none, or zeros."""
     stated = Sheet.from_blocks(blocks).meta.uuid
     return stated if stated and len(stated) == UUID_OCTETS and any(stated) else None
 
 
 def under(blocks: Mapping[BlockId, bytes], uuid: bytes) -> dict[BlockId, bytes]:
-    """The same TEDS of another node: field 4 of a Meta-TEDS of the 2007 form says its UUID."""
+    """Return the same TEDS with another UUID in field 4 of a Meta-TEDS of the 2007 form."""
     meta = blocks.get(_META)
     if meta is None or stated_uuid(blocks) == uuid:
         return dict(blocks)

@@ -27,7 +27,7 @@ _LINE_DIGITS: Final = 64
 
 
 def looks_like_hex(text: str) -> bool:
-    """Whether a text holds hex digits and nothing else, comments aside."""
+    """True if a text holds hex digits and nothing else, comments aside."""
     some = False
     for line in text.splitlines():
         digits = _digits(line)
@@ -102,7 +102,7 @@ def read_intel_hex(text: str) -> list[TedsBlock]:
 
 
 def stretches(text: str) -> list[tuple[int, bytes]]:
-    """Runs of octets without a gap as (address, octets), ascending; raises BadDataError where records overlap."""
+    """Return runs of octets without a gap as (address, octets), ascending; raises BadDataError if records overlap."""
     pieces: list[tuple[int, bytes]] = []
     check_count(text.count(":"), LIMITS.hex_records, "records in the Intel HEX text")
     base = 0
@@ -166,7 +166,7 @@ def _joined(pieces: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
 
 
 def write_intel_hex(blocks: Sequence[TedsBlock], *, address: int = 0) -> str:
-    """Write each TEDS as a stretch of its own, from ``address`` on; channels are lost."""
+    """Write each TEDS as a separate stretch, from ``address`` on; channels are lost."""
     lines: list[str] = []
     at, high = address, 0
     for block in blocks:

@@ -1,9 +1,9 @@
-"""A lab's own datasheet XML read as a profile, by a small file that says where each key stands and in which unit.
+"""A lab's own datasheet XML read as a profile, by a small file with the place and the unit of each key.
 
 The mapping is TOML (docs/formats.md, "A datasheet XML of your own"): ``channel`` is the path of the elements that are
 channels, ``[keys]`` and ``[channel-keys]`` name a place for each key of a profile, ``[values]`` and
-``[channel-values]`` give what the XML does not say. A place is a path of element names below the root (the
-channel), with ``@attribute`` at its end or alone. What comes out is the text of a profile, checked like any other.
+``[channel-values]`` give values that the XML lacks. A place is a path of element names below the root (the channel),
+with ``@attribute`` at its end or alone. The result is the text of a profile, checked like any other.
 
 Read with defusedxml: no DTD, no entities, nothing external; elements and attributes are counted before.
 """
@@ -30,9 +30,9 @@ _MOST_CHANNELS: Final = 255
 
 
 def profile_from_xml(octets: bytes, mapping: str, *, name: str, file: str = "the XML", by: str = "the mapping") -> str:
-    """The text of a profile that says what the XML says.
+    """Return the text of a profile with the content of the XML.
 
-    Raises BadDataError for a file, or a place that is not there.
+    Raises BadDataError for a file, or a place that does not exist.
     """
     rules = load_toml(mapping, by)
     if unknown := sorted(set(rules) - _TABLES):

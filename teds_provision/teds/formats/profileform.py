@@ -1,7 +1,7 @@
 """TEDS as a TOML profile, and a profile as TEDS.
 
-A profile says less than TEDS do: it has no calibration, no signatures, no fields that it has no key for. What it
-cannot hold is found by building the TEDS again from the text and comparing octet for octet.
+A profile holds less than TEDS do: it has no calibration, no signatures, no fields without a key. What it cannot hold is
+found by building the TEDS again from the text and comparing octet for octet.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def _keys(keys: Iterable[Key], fields: Iterable[Field]) -> Iterator[str]:
 
 
 def _value(key: Key, value: object) -> str | None:
-    """TOML of a value in SI units; None where there is none, or no TOML that the key takes."""
+    """Return TOML of a value in SI units; None if there is none, or none that the key takes."""
     if isinstance(value, tuple):
         return f"[{', '.join(_number(part) for part in value)}]" if all(map(_finite, value)) else None
     if key.kind is Kind.FLAG:
@@ -195,7 +195,7 @@ def _number(value: object) -> str:
 
 
 def spell(units: Units) -> str:
-    """Spell units in SI so that the profile reader understands the same; what it cannot say comes out as shown."""
+    """Spell units in SI so that the profile reader understands the same; others come out as shown."""
     factors = [
         f"{symbol}**{float(power):g}"
         for symbol, base in zip(_SPELLING, UNIT_PARTS, strict=True)
@@ -222,7 +222,7 @@ def _quoted(text: str) -> str:
 
 
 def _differences(body: str, placed: Placed, decoded: Mapping[tuple[int, int], DecodedTeds]) -> list[str]:
-    """What the TEDS built from the text lack or have otherwise."""
+    """Return what the TEDS built from the text lack or have otherwise."""
     built, why = _built(body, decoded)
     lost = [f"it does not load: {why}"] if why else []
     for (channel, code), octets in sorted(placed.items()):

@@ -1,7 +1,7 @@
 """The field tree that JSON and XML share: a TEDS by field names, lossless.
 
-An entry holds one value of a named kind, or further entries. Where the entries alone give back the octets exactly,
-the octets are left out; else they are kept beside the entries and count alone when the tree is read.
+An entry holds one value of a named kind, or further entries. If the entries alone give back the octets exactly, the
+octets are left out; else they are kept beside the entries and count alone when the tree is read.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class TreeEntry:
 
 @dataclass(frozen=True)
 class Tree:
-    """One TEDS as a tree: where it belongs, what its TEDSID says, its entries, and its octets where they are needed."""
+    """One TEDS as a tree: its place, its TEDSID, its entries, and its octets if they are needed."""
 
     channel: int | None
     access_code: int | None
@@ -64,7 +64,7 @@ class Tree:
 
 
 def to_tree(block: TedsBlock) -> Tree:
-    """Turn a block into a tree; the octets are kept where the entries would not give them back."""
+    """Turn a block into a tree; the octets are kept if the entries would not give them back."""
     decoded = decode(block.octets)
     tree = _described(block, decoded)
     try:
@@ -154,14 +154,14 @@ def _entry(field: Field, known: Mapping[int, FieldSpec]) -> TreeEntry:
 
 
 def _shortest_of(kind: Kind, value: EntryValue) -> EntryValue:
-    """The value with each float in it in the fewest digits."""
+    """Return the value with each float in it in the fewest digits."""
     if isinstance(value, float):
         return shortest(value)
     return tuple(map(shortest, value)) if kind == "numbers" and isinstance(value, tuple) else value
 
 
 def shortest(value: float) -> float:
-    """Number with the fewest decimal digits that is the same as a Float32: 233.15 for 233.14999389648438."""
+    """Return the fewest decimal digits that give the same Float32: 233.15 for 233.14999389648438."""
     if not math.isfinite(value) or abs(value) > _FLOAT32_MAXIMUM:
         return value
     wanted = _F32.pack(value)

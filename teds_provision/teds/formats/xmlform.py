@@ -101,7 +101,7 @@ def read_xml(octets: bytes) -> list[TedsBlock]:
 
 
 def parse(octets: bytes) -> ET.Element:
-    """Parse XML that a stranger wrote: no DTD, no entities, at most what ``limits`` says. Raises BadDataError."""
+    """Parse XML from a stranger: no DTD, no entities, at most what ``limits`` allows. Raises BadDataError."""
     from defusedxml import DefusedXmlException
     from defusedxml.ElementTree import fromstring
 

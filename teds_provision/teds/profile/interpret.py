@@ -35,7 +35,7 @@ _KEY: Final = Key("calibration-key", "CalKey", Kind.CHOICE, "who applies the cal
 
 
 def channels_of(top: Section, abstract: bool) -> tuple[ChannelProfile, ...]:
-    """Every channel of a profile; none where something about them is wrong, which is reported to the section."""
+    """Return every channel of a profile; none if something about them is wrong, which is reported to the section."""
     section = top.section("channel")
     tables = _selections(section) if section else {}
     if not tables:
@@ -125,7 +125,7 @@ def _unit(section: Section, key: str, *, required: bool = False) -> WrittenUnit 
 
 
 def parse_unit_or_report(section: Section, key: str, text: str, like: WrittenUnit) -> WrittenUnit | None:
-    """Read a unit that must be of the same kind as another; reports and gives None where it is not."""
+    """Parse a unit that must be of the same kind as another; reports and returns None if it is not."""
     try:
         unit = parse_unit(text)
     except BadDataError as error:
@@ -232,7 +232,7 @@ def _demand(section: Section, unit: WrittenUnit | None) -> CalibrationDemand:
 
 
 def _interval(part: Section) -> float | None:
-    """Seconds between calibrations, None where it is not stated or wrong."""
+    """Return seconds between calibrations, None if it is not stated or wrong."""
     interval = part.item("interval")
     if interval is None:
         return None

@@ -34,7 +34,7 @@ class Kind(Enum):
 
 
 class Need(Enum):
-    """Whether a profile must say it; USUAL: carried by every complete datasheet, a warning when it is left out."""
+    """Need of a key in a profile; USUAL: present in every complete datasheet, a warning if it is left out."""
 
     REQUIRED = "required"
     USUAL = "usual"

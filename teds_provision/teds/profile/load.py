@@ -35,7 +35,7 @@ MAXIMUM_DEPTH: Final = 16
 
 @dataclass(frozen=True)
 class ListedProfile:
-    """A profile as it stands in a folder; ``error`` says why it cannot be used."""
+    """A profile in a folder; ``error`` is why it cannot be used."""
 
     name: str
     path: Path
@@ -52,10 +52,10 @@ def shipped_profiles() -> Path:
 
 
 def default_folders(home: Path | None = None) -> tuple[Path, ...]:
-    """Where profiles are looked for, the first wins: <home>/profiles, the shipped ones, ./profiles.
+    """Return where profiles are looked for, the first wins: <home>/profiles, the shipped ones, ./profiles.
 
-    So no file that lies about in the working folder stands in for a type that comes with the tool; one's own version
-    of such a type lies in the home, or is named by its path.
+    So a stray file in the working folder never replaces a type that comes with the tool; one's own version of such a
+    type is in the home, or is named by its path.
     """
     folders = [*([home / "profiles"] if home else []), shipped_profiles(), Path("profiles")]
     unique: dict[Path, Path] = {}
@@ -79,7 +79,7 @@ def load_profile(name_or_path: str | Path, folders: Sequence[Path] | None = None
 
 
 def parse_profile(text: str, name: str = "profile") -> Profile:
-    """A profile from text that stands in no file; what it extends is looked for in the default folders.
+    """Return a profile from text without a file; what it extends is looked for in the default folders.
 
     Raises NotFoundError and BadDataError as ``load_profile`` does; ``name`` is the file that messages show.
     """
@@ -94,7 +94,7 @@ def parse_profile(text: str, name: str = "profile") -> Profile:
 
 
 def is_profile_name(text: str) -> bool:
-    """Whether ``find_profile`` takes this for a name, looked for in the folders, and never for a path."""
+    """True if ``find_profile`` treats this as a name, looked for in the folders, and never as a path."""
     return _NAME.match(text) is not None and not text.endswith(".toml")
 
 
@@ -109,7 +109,7 @@ def passed_over(name: str, folders: Sequence[Path]) -> tuple[str, ...]:
 def check(
     name_or_path: str | Path, folders: Sequence[Path] | None = None
 ) -> tuple[Profile | None, list[ProfileProblem]]:
-    """All problems of a profile, errors and warnings; the profile itself where there is no error.
+    """Return all problems of a profile, errors and warnings; the profile itself if there is no error.
 
     Raises NotFoundError and, for a file that is not TOML or inherits in a circle, BadDataError.
     """
@@ -176,7 +176,7 @@ def _merged(path: Path, folders: Sequence[Path], chain: tuple[Path, ...]) -> tup
 def _laid_over(
     table: TomlTable, path: Path, folders: Sequence[Path], chain: tuple[Path, ...]
 ) -> tuple[TomlTable, tuple[str, ...]]:
-    """The same of a table that is read already; ``chain`` are the files so far, its own included."""
+    """Return the same of a parsed table; ``chain`` are the files so far, its own included."""
     entry = table.entries.get("extends")
     if entry is None:
         return table, (path.stem,)
@@ -221,7 +221,7 @@ def describe(profile: Profile) -> dict[str, Any]:
 
 
 def summary(profile: Profile) -> dict[str, Any]:
-    """The line of a profile in a list."""
+    """Return the line of a profile in a list."""
     return {
         "name": profile.name,
         "title": profile.title,
@@ -233,7 +233,7 @@ def summary(profile: Profile) -> dict[str, Any]:
 
 
 def listed(entry: ListedProfile) -> dict[str, Any]:
-    """The line of a file found in a folder, with its error where it cannot be read."""
+    """Return the line of a file found in a folder, with its error if it cannot be used."""
     if entry.profile is None:
         return {"name": entry.name, "file": str(entry.path), "error": entry.error}
     return summary(entry.profile)
@@ -270,7 +270,7 @@ def describe_channel(channel: ChannelProfile) -> dict[str, Any]:
 
 
 def template(name: str) -> str:
-    """Text of a new profile: what is needed is filled with examples, what is optional stands as a comment."""
+    """Return the text of a new profile: required keys have examples, optional ones are comments."""
     lines = [""]
     for key, (field, keys) in META_GROUPS.items():
         lines += [f"# [[meta.{key}]]  # {field}", *_lines(keys, comment=True), ""]

@@ -1,4 +1,4 @@
-"""What a profile says about one transducer type, checked and in SI units; and the TEDS of a node that it gives."""
+"""One transducer type from a profile, checked and in SI units; and the TEDS of a node that it gives."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ Pairs = tuple[tuple[str, object], ...]
 
 @dataclass(frozen=True)
 class CalibrationDemand:
-    """What the profile asks of a channel's calibration.
+    """A profile's requirements on a channel's calibration.
 
-    ``raw_range`` is what the channel's electronics can deliver where that is less than its data model allows;
-    ``interval`` is in seconds; ``zero_offset`` says whether the offset may be adjusted in use; ``standard_deviation``
-    (in the channel's unit, informative) is a figure that a TEDS has no field for.
+    ``raw_range`` is what the channel's electronics can deliver if that is less than its data model allows; ``interval``
+    is in seconds; ``zero_offset``: the offset may be adjusted in use; ``standard_deviation`` (in the channel's unit,
+    informative) is a figure that a TEDS has no field for.
     """
 
     required: bool = False
@@ -47,7 +47,7 @@ class CalibrationDemand:
 class ChannelProfile:
     """One TransducerChannel; ``fields`` by TEDS name are ready to be composed (SI units); CalKey is not in it.
 
-    ``frame`` is the coordinate frame of its values for robots, ``{node}`` in it stands for the node's name.
+    ``frame`` is the coordinate frame of its values for robots, ``{node}`` in it is replaced by the node's name.
     """
 
     number: int
@@ -139,10 +139,10 @@ class Profile:
     abstract: bool = False
     warnings: tuple[str, ...] = field(default=())
     composed: dict[tuple[object, ...], bytes] = field(init=False, default_factory=dict, repr=False, compare=False)
-    """What is alike for every node of this type, as it was made for the first one: TEDS, and the profile's digest."""
+    """Parts that are equal for every node of this type, made for the first one: TEDS, and the profile's digest."""
 
     def channel(self, number: int) -> ChannelProfile | None:
-        """Channel of that number, None where the type has none."""
+        """Return the channel of that number, None if the type has none."""
         return next((channel for channel in self.channels if channel.number == number), None)
 
     def build(
@@ -228,7 +228,7 @@ def _calibration_key(channel: ChannelProfile, given: Calibration | None) -> int:
 
 
 def _described(profile: Profile, channel: ChannelProfile, given: Calibration | None, edition: Edition) -> bytes:
-    """The TransducerChannel TEDS: one for all nodes of the type that are calibrated alike."""
+    """Return the TransducerChannel TEDS: one for all nodes of the type that are calibrated alike."""
     key = _calibration_key(channel, given)
     place = (channel.number, key, edition)
     if place not in profile.composed:

@@ -195,7 +195,7 @@ class ProfileProblem:
 
 
 def _shown(value: object) -> str:
-    """A value of the file as a message shows it."""
+    """Return a value of the file as a message shows it."""
     if isinstance(value, tuple):  # of Table
         return "a list of tables [[…]]"
     text = repr(value)
@@ -203,7 +203,7 @@ def _shown(value: object) -> str:
 
 
 class _BadValueError(Exception):
-    """A value cannot be read; the text says why."""
+    """A value is malformed; the text is the reason."""
 
 
 @dataclass
@@ -249,7 +249,7 @@ class Section:
         return f"{self.table.path}.{key}" if self.table.path else key
 
     def where(self, key: str) -> SourcePlace:
-        """Place of a key, or of the table where the key is missing."""
+        """Return the place of a key, or of the table if the key is missing."""
         entry = self.table.entries.get(key)
         return self.table.where if entry is None else entry.where
 
@@ -262,7 +262,7 @@ class Section:
         self.problems.warning(self.where(key), self.path(key), message)
 
     def item(self, key: str) -> object:
-        """Value of a key, None where it is absent; a table there is an error."""
+        """Return the value of a key, None if it is absent; a table there is an error."""
         self._known.add(key)
         entry = self.table.entries.get(key)
         if isinstance(entry, TomlTable):
@@ -301,7 +301,7 @@ class Section:
         return value
 
     def section(self, key: str) -> Section | None:
-        """The table under a key."""
+        """Return the table under a key."""
         self._known.add(key)
         entry = self.table.entries.get(key)
         if isinstance(entry, PlacedValue):
@@ -310,7 +310,7 @@ class Section:
         return None if entry is None else Section(entry, self.problems, self.unit)
 
     def sections(self, key: str) -> list[Section]:
-        """The tables of an array [[key]]."""
+        """Return the tables of an array [[key]]."""
         self._known.add(key)
         entry = self.table.entries.get(key)
         if entry is None:
@@ -323,7 +323,7 @@ class Section:
         return []
 
     def read(self, key: Key) -> object:
-        """Value of a key as its table says, converted to SI units; None where absent or wrong (reported)."""
+        """Return the value of a key by its table, converted to SI units; None if absent or wrong (reported)."""
         value = self.item(key.key)
         if value is None:
             if key.key not in self.table.entries:
@@ -343,14 +343,14 @@ class Section:
         return tuple((name, value) for name, value in values if value is not None)
 
     def name(self, key: str, default: str = "") -> str:
-        """A text of at most :data:`NAME_OCTETS`."""
+        """Return a text of at most :data:`NAME_OCTETS`."""
         name = self.text(key, default)
         if len(name.encode()) > NAME_OCTETS:
             self.error(key, f"a name has at most {NAME_OCTETS} octets, this one {len(name.encode())}.")
         return name
 
     def finish(self, also: Sequence[str] = ()) -> None:
-        """Refuse the keys nobody asked for, suggesting the nearest."""
+        """Refuse unknown keys, suggesting the nearest."""
         known = self._known | set(also)
         for key in self.table.entries:
             if key not in known:
