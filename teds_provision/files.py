@@ -9,7 +9,6 @@ removed by the next one; nothing else in the folder is ever touched.
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import re
 import secrets
@@ -23,6 +22,16 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 
 from teds_provision.errors import BadDataError, NotFoundError, StoreError, TedsProvisionError, UsageError
 from teds_provision.lazy import late
+from teds_provision.portable import (
+    CLOSING,
+    NOFOLLOW,
+    NONBLOCK,
+    OPENS_FOLDERS,
+    RENAMES_OPEN_FILES,
+    is_mine,
+    is_open_to,
+    lock,
+)
 
 if TYPE_CHECKING:
     import socket
@@ -63,14 +72,17 @@ def whole_draft(path: Path, *, replace: bool, mode: int = PRIVATE) -> Iterator[t
         raise OSError(errno.EINVAL, "it is a device, pipe or socket and cannot be replaced by a file", str(path))
     draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_SUFFIX}")
     _sweep(path)
-    descriptor = os.open(draft, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
+    descriptor = os.open(draft, os.O_CREAT | os.O_EXCL | os.O_RDWR | NOFOLLOW | CLOSING, mode)
     try:
         with open(descriptor, "w+b") as file:
             with suppress(OSError):  # some network folders have no locks: then only its age tells a left-over file
-                fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock(file.fileno())
             yield draft, file
             file.flush()
             os.fsync(file.fileno())
+            if RENAMES_OPEN_FILES:  # still locked: no other process takes the draft for a left-over
+                _publish(draft, path, replace=replace)
+        if not RENAMES_OPEN_FILES:
             _publish(draft, path, replace=replace)
         sync_folder(path.parent)
     finally:
@@ -103,7 +115,7 @@ def open_lock(path: Path) -> int:
     Raises StoreError if it cannot be made: the first thing that a read-only or full disk refuses.
     """
     try:
-        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
+        return os.open(path, os.O_RDWR | os.O_CREAT | NOFOLLOW | CLOSING, PRIVATE)
     except OSError as error:
         raise _cannot_write(path, error, StoreError) from error
 
@@ -154,7 +166,7 @@ def read_limited(
     BadDataError (larger than any ``what``).
     """
     with _failing_as(path, failure):
-        octets = _read(_opened(path, 0 if follow else os.O_NOFOLLOW), max_octets + 1)
+        octets = _read(_opened(path, 0 if follow else NOFOLLOW), max_octets + 1)
     if len(octets) > max_octets:
         raise BadDataError(f"{path} is larger than {max_octets} octets, which is too large for a {what}.")
     return octets
@@ -185,14 +197,15 @@ def _opened(path: Path, flags: int = 0) -> int:
     Opening a pipe without a writer waits for ever. The pipe of a shell's ``<(command)`` has no name but that of its
     descriptor, and has a writer.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | flags)
+    descriptor = os.open(path, os.O_RDONLY | CLOSING | NONBLOCK | flags)
     mode = os.fstat(descriptor).st_mode
     if stat.S_ISREG(mode):
         return descriptor
     if stat.S_ISFIFO(mode) and _is_named(path):
         os.close(descriptor)
         raise NotFoundError(f"{path} is a pipe, not a file.")
-    os.set_blocking(descriptor, True)
+    if NONBLOCK:
+        os.set_blocking(descriptor, True)
     return descriptor
 
 
@@ -289,7 +302,9 @@ def holds(path: Path, octets: bytes) -> bool:
 
 def sync_folder(folder: Path) -> None:
     """Bring a folder's names to the disk; file systems that cannot are left alone. Raises OSError."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    if not OPENS_FOLDERS:
+        return
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | CLOSING)
     try:
         os.fsync(descriptor)
     except OSError as error:
@@ -307,7 +322,7 @@ def private_folder(folder: Path) -> Path:
     with suppress(FileExistsError):
         folder.mkdir(mode=0o700)
     status = folder.lstat()
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o077:
+    if not stat.S_ISDIR(status.st_mode) or not is_mine(status) or is_open_to(0o077, status):
         raise PermissionError(errno.EPERM, "it is not a folder of this user alone", str(folder))
     return folder
 
@@ -318,7 +333,7 @@ def short_path(path: Path) -> Iterator[str]:
     if len(os.fsencode(path)) <= _LONGEST_SOCKET:
         yield str(path)
         return
-    folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | CLOSING)
     try:
         yield f"/proc/self/fd/{folder}/{path.name}"
     finally:
@@ -349,7 +364,7 @@ def _publish(draft: Path, path: Path, *, replace: bool) -> None:
         os.replace(draft, path)
         return
     try:
-        os.link(draft, path, follow_symlinks=False)
+        os.link(draft, path, follow_symlinks=os.link not in os.supports_follow_symlinks)
     except OSError as error:
         if error.errno not in _NO_HARD_LINKS:
             raise
@@ -368,11 +383,11 @@ def _sweep(path: Path) -> None:
 
 
 def _remove_if_left(left: Path) -> None:
-    with suppress(OSError), open(os.open(left, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+    with suppress(OSError), open(os.open(left, os.O_RDWR | NOFOLLOW | NONBLOCK | CLOSING), "rb") as file:
         status = os.fstat(file.fileno())
-        mine = stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid()
+        mine = stat.S_ISREG(status.st_mode) and is_mine(status)
         if mine and time.time() - status.st_mtime > _STALE_SECONDS:
-            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(file.fileno())
             left.unlink()
 
 

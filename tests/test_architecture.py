@@ -15,13 +15,15 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "teds_provision"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
-# Room: the rooms that it may import. All may import errors, lazy, limits, sanitize, itself, and all but protocol files.
-WITHOUT_FILES = {"errors", "sanitize", "lazy", "limits", "protocol"}
+# Room: the rooms that it may import. All may import errors, lazy, limits, sanitize, itself, and all but protocol also
+# files and portable.
+WITHOUT_FILES = {"errors", "sanitize", "lazy", "limits", "portable", "protocol"}
 _BELOW_TALK = {"station", "links", "vault", "store", "protocol", "teds"}
 ARROWS = {
     "api": set(),
     "errors": set(),
     "files": set(),
+    "portable": set(),
     "sanitize": set(),
     "lazy": set(),
     "limits": set(),
@@ -82,7 +84,7 @@ def parsed(path: Path) -> ast.Module:
 
 
 def may_import(room: str) -> set[str]:
-    files = set() if room in WITHOUT_FILES else {"files"}
+    files = set() if room in WITHOUT_FILES else {"files", "portable"}
     return ARROWS[room] | files | {room, "errors", "sanitize", "lazy", "limits", "__version__"}
 
 

@@ -191,6 +191,16 @@ def _incomplete(*packages: str) -> IncompleteInstallationError:
     )
 
 
+def _lacking(module: str) -> TedsProvisionError:
+    """Return the error for a module that could not be imported: of Python itself, or of a package."""
+    if module in sys.stdlib_module_names:  # fcntl outside Unix
+        return TedsProvisionError(
+            f"This command needs Linux: this system has no {module}.",
+            hint="docs/compatibility.md lists the commands that run on other systems.",
+        )
+    return _incomplete(package_of(module))
+
+
 def run(arguments: list[str]) -> int:
     """Run one command line; returns the exit code. Every error is told in at most three lines."""
     asked = os.environ.get(COMPLETE)
@@ -275,7 +285,7 @@ def _untold(arguments: list[str], error: OSError) -> int:
 def _bug(arguments: list[str], error: Exception) -> int:
     _traceback(arguments)
     if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("teds_provision"):
-        lacks = _incomplete(package_of(error.name))
+        lacks = _lacking(error.name)
         return _fail(arguments, lacks.exit_code, lacks.code, lacks.message, lacks.hint)
     hint = "This is a bug. Please report it with the output of --debug."
     return _fail(arguments, 1, "bug", f"Unexpected {type(error).__name__}.", hint)

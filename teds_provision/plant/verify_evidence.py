@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import multiprocessing
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from teds_provision.errors import BadDataError, NotAuthenticError, TedsProvisionError
 from teds_provision.files import read_limited
 from teds_provision.lazy import late
+from teds_provision.portable import cores_to_share
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant import evidence as codec
@@ -185,7 +185,7 @@ def verify_evidence(
     More than a few files are shared among ``processes`` (as many as there are cores).
     """
     work = _Work(grounds, tell, files)
-    workers = min(processes or len(os.sched_getaffinity(0)), (len(files) + _CHUNK - 1) // _CHUNK)
+    workers = min(processes or cores_to_share(), (len(files) + _CHUNK - 1) // _CHUNK)
     if len(files) <= _FEW or workers <= 1:
         yield from (work.judge(range(at, min(at + _CHUNK, len(files)))) for at in range(0, len(files), _CHUNK))
         return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import re
@@ -14,6 +13,7 @@ from typing import Final
 
 from teds_provision.errors import FrozenError, NotFoundError, UsageError
 from teds_provision.files import open_lock
+from teds_provision.portable import lock
 from teds_provision.station.plant import Plant
 from teds_provision.store import Store
 from teds_provision.store.records import Group
@@ -142,7 +142,7 @@ class Groups:
         descriptor = open_lock(place)
         try:
             try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock(descriptor)
             except BlockingIOError:
                 raise FrozenError(
                     f"Group {name!r} is being measured and cannot be changed now.", hint="End that measurement first."

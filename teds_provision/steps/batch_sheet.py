@@ -9,7 +9,6 @@ per sheet in the station's home, so the same command carries on after an interru
 from __future__ import annotations
 
 import csv
-import fcntl
 import hashlib
 import html
 import io
@@ -36,6 +35,7 @@ from teds_provision.errors import (
     UsageError,
 )
 from teds_provision.files import SHARED, open_lock, private_folder, read_limited, write_whole
+from teds_provision.portable import lock
 from teds_provision.station.label import read_label
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder, PreparedOrder, content_digests, prepare
@@ -462,7 +462,7 @@ class Progress:
         place = self._path.with_suffix(".lock")
         descriptor = open_lock(place)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)  # held for one small file
+            lock(descriptor, wait=True)  # held for one small file
             yield
         finally:
             os.close(descriptor)

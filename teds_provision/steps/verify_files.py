@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import multiprocessing
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from teds_provision import teds
 from teds_provision.errors import BadDataError, PolicyError, TedsProvisionError
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
+from teds_provision.portable import cores_to_share
 from teds_provision.station.station import Station
 from teds_provision.steps.verify import (
     Check,
@@ -100,7 +100,7 @@ def verify_files(
     A fault of one is its verdict and stops no other. More than a few files are shared among ``processes`` (as many as
     there are cores), which format them too: lines are quicker to send than verdicts with all their checks.
     """
-    workers = min(processes or len(os.sched_getaffinity(0)), (len(files) + _CHUNK - 1) // _CHUNK)
+    workers = min(processes or cores_to_share(), (len(files) + _CHUNK - 1) // _CHUNK)
     work = _Work(snapshot_trust(station), tell, files)
     if len(files) <= _FEW or workers <= 1:
         yield from (work.judge(range(at, at + 1)) for at in range(len(files)))

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+from teds_provision.portable import HAS_OWNERS, name_of_machine
 from teds_provision.store.database import Database
 from teds_provision.store.records import utc_now
 
@@ -281,6 +282,6 @@ def _who() -> str:
     """Return the user and the host of this process; neither changes while it runs."""
     try:
         user = getpass.getuser()
-    except (KeyError, OSError):  # no entry in the user database, as in a container
-        user = f"uid {os.getuid()}"
-    return f"{user}@{os.uname().nodename}"
+    except (KeyError, OSError, ImportError):  # no entry in the user database, as in a container, or no such database
+        user = f"uid {os.getuid()}" if HAS_OWNERS else "unknown"
+    return f"{user}@{name_of_machine()}"

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from teds_provision.errors import BadDataError, StoreError, StoreLockedError, TedsProvisionError
 from teds_provision.lazy import late
+from teds_provision.portable import CLOSING, NOFOLLOW, sync_content
 from teds_provision.store.background_writer import BackgroundWriter
 
 if TYPE_CHECKING:
@@ -251,9 +252,9 @@ class Connection:
             if (self.later if through is None else through) <= self._settled:
                 return
             try:
-                log = os.open(self.path.with_name(self.path.name + "-wal"), os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+                log = os.open(self.path.with_name(self.path.name + "-wal"), os.O_RDWR | NOFOLLOW | CLOSING)
                 try:
-                    os.fdatasync(log)  # of any descriptor: all that was written to the file
+                    sync_content(log)  # of any descriptor: all that was written to the file
                 finally:
                     os.close(log)
             except OSError as error:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from teds_provision.errors import StoreError, StoreLockedError
 from teds_provision.lazy import late
+from teds_provision.portable import NOFOLLOW, is_mine, is_open_to
 from teds_provision.store.connection import (
     BUSY_SECONDS,
     QUIET_SECONDS,
@@ -58,12 +59,12 @@ def prepare_home(home: Path, *, create: bool) -> None:
         raise StoreError(f"There is no store in {home}.", hint="Run teds-provision init.") from None
     if not stat.S_ISDIR(status.st_mode):
         raise StoreError(f"{home} is not a directory.", hint="Choose another --home.")
-    if status.st_uid != os.geteuid():
+    if not is_mine(status):
         raise StoreError(f"{home} belongs to another user.", hint="Run this as its owner, or choose another --home.")
-    private = not status.st_mode & 0o077
+    private = not is_open_to(0o077, status)
     if create and not private and not any(home.iterdir()):
         home.chmod(0o700)
-    elif status.st_mode & 0o022:
+    elif is_open_to(0o022, status):
         raise StoreError(f"Other users can write to {home}.", hint=f"Run: chmod 700 {home}, or choose another --home.")
 
 
@@ -71,12 +72,12 @@ def prepare_file(path: Path, *, create: bool) -> None:
     """Make the file with mode 0600 before SQLite would make it wider; its -wal and -shm follow its mode."""
     if create:
         with suppress(FileExistsError):
-            os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW, 0o600))
+            os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR | NOFOLLOW, 0o600))
     for file in (path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")):
         _require_own(file)
     if not path.exists():
         raise StoreError(f"There is no store in {path.parent}.", hint="Run teds-provision init.")
-    if path.stat().st_mode & 0o077:
+    if is_open_to(0o077, path.stat()):
         with suppress(OSError):  # a disk that is read-only: what is read stays as open as it was
             path.chmod(0o600)
 
@@ -87,7 +88,7 @@ def _require_own(file: Path) -> None:
         status = file.lstat()
     except FileNotFoundError:
         return
-    if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
+    if not stat.S_ISREG(status.st_mode) or not is_mine(status):
         what = "a link" if stat.S_ISLNK(status.st_mode) else "not owned by this user"
         raise StoreError(f"{file} is {what}.", hint="It was put there by somebody else: check it and move it away.")
 

@@ -1,6 +1,7 @@
 """Advisory locks: one command at a time changes a store, and one at a time works on a node.
 
-The store's (flock) names its holder; a node's is one octet of a file, taken by number.
+The store's (flock) names its holder; a node's is one octet of a file, taken by number. Without flock an empty SQLite
+file beside it is locked exclusively instead: the store relies on SQLite's locks on every system.
 
 The kernel releases it when the holder ends, however it ends; the holder's name in the file counts only while the lock
 is held.
@@ -8,7 +9,6 @@ is held.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -20,11 +20,19 @@ from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
-from teds_provision.errors import NodeBusyError, StoreLockedError
+from teds_provision.errors import NodeBusyError, StoreError, StoreLockedError
+from teds_provision.lazy import late
+from teds_provision.portable import CLOSING, HAS_LOCKS, NOFOLLOW, lock
 from teds_provision.store.connection import as_store_failure
 from teds_provision.store.records import utc_now
+
+if TYPE_CHECKING:
+    import fcntl
+    import sqlite3
+else:  # no such module on Windows, where no node is worked on
+    fcntl, sqlite3 = late("fcntl"), late("sqlite3")
 
 FILE_NAME = "store.lock"
 TURNS_NAME = "store.turns"
@@ -71,7 +79,7 @@ class _HeldFile(ABC):
 
     def _open(self) -> int:
         try:
-            return os.open(self._path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+            return os.open(self._path, os.O_CREAT | os.O_RDWR | NOFOLLOW | CLOSING, 0o600)
         except OSError as error:
             raise as_store_failure(error, self._path) from error
 
@@ -103,19 +111,32 @@ class StoreLock(_HeldFile):
         self._command = command
         self._wait = wait
         self._notice = notice
+        self._substitute: sqlite3.Connection | None = None
 
     def _acquire(self, descriptor: int) -> None:
         self._lock(descriptor)
         with suppress(OSError):  # a full disk must not hide the store's own, better message
             # over what the last holder left, which says nothing any more: cutting a file off costs more than a step
-            os.pwrite(descriptor, _signature(self._command).ljust(_SIGNATURE_OCTETS), 0)
+            _write_at_start(descriptor, _signature(self._command).ljust(_SIGNATURE_OCTETS))
+
+    def _try_to_lock(self, descriptor: int) -> None:
+        """Lock the file, or raise BlockingIOError or OSError."""
+        if HAS_LOCKS:
+            lock(descriptor)
+        else:
+            self._substitute = _locked_database(self._path)
+
+    def _release(self, descriptor: int) -> None:
+        if self._substitute is not None:
+            self._substitute.close()
+            self._substitute = None
 
     def _lock(self, descriptor: int) -> None:
         began = time.monotonic()
         told, pause = False, _FIRST_POLL_SECONDS
         while True:
             try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                self._try_to_lock(descriptor)
             except BlockingIOError:
                 pass
             except OSError as error:
@@ -156,24 +177,26 @@ class UsageLock(_HeldFile):
 
     def _acquire(self, descriptor: int) -> None:
         try:
-            fcntl.flock(descriptor, (fcntl.LOCK_SH if self._shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+            lock(descriptor, shared=self._shared)
         except BlockingIOError:
             holder = _holder(descriptor)
             raise UsageLockTakenError(f"It is locked by {holder}.", holder) from None
-        self.left_behind = bool(os.pread(descriptor, 1, 0))
+        except OSError as error:
+            raise as_store_failure(error, self._path) from error
+        self.left_behind = bool(_read_at_start(descriptor, 1))
         with suppress(OSError):  # as above
             os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, _signature(self._command), 0)
+            _write_at_start(descriptor, _signature(self._command))
 
     def _release(self, descriptor: int) -> None:
         if self._shared:  # the last one puts it away
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(descriptor)
         os.ftruncate(descriptor, 0)
 
     def share(self) -> None:
         """Go on holding it, beside others who share it; who wants it alone still finds it taken."""
         assert self._descriptor is not None, "share() inside the with"
-        fcntl.flock(self._descriptor, fcntl.LOCK_SH)
+        lock(self._descriptor, shared=True, wait=True)
         self._shared = True
 
     @property
@@ -200,6 +223,36 @@ class UsageLockTakenError(StoreLockedError):
         self.holder = holder
 
 
+def _locked_database(path: Path) -> sqlite3.Connection:
+    """Lock an empty SQLite file beside ``path``, for every process and thread; closing the connection releases it.
+
+    Raises BlockingIOError if it is locked, StoreError if it cannot be made.
+    """
+    connection = sqlite3.connect(
+        path.with_name(path.name + ".sqlite"), timeout=0, isolation_level=None, check_same_thread=False
+    )
+    try:
+        connection.execute("BEGIN EXCLUSIVE")
+    except sqlite3.OperationalError as error:
+        connection.close()
+        if error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY:
+            raise BlockingIOError from None
+        raise StoreError(f"{path} cannot be locked: {error}.", hint="Check its owner and mode.") from error
+    return connection
+
+
+def _read_at_start(descriptor: int, most: int) -> bytes:
+    """Return the first octets of a file; raises OSError."""
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    return os.read(descriptor, most)
+
+
+def _write_at_start(descriptor: int, octets: bytes) -> None:
+    """Write over the first octets of a file; raises OSError."""
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    os.write(descriptor, octets)
+
+
 def _signature(command: str) -> bytes:
     return f'{{"pid": {os.getpid()}, "command": {_quoted(command)}, "since": "{utc_now()}"}}'.encode()
 
@@ -211,13 +264,15 @@ def holder_of(home: Path) -> str | None:
 
 def _held_by(path: Path, *, shared: bool = False) -> str | None:
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+        descriptor = os.open(path, os.O_RDWR | NOFOLLOW | CLOSING)
     except OSError:
         return None
     try:
-        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        lock(descriptor, shared=shared)
     except BlockingIOError:
         return _holder(descriptor)
+    except OSError:  # no locks here, so none that is held
+        return None
     finally:
         os.close(descriptor)
     return None
@@ -225,7 +280,7 @@ def _held_by(path: Path, *, shared: bool = False) -> str | None:
 
 def _holder(descriptor: int) -> str:
     try:
-        said = json.loads(os.pread(descriptor, 4096, 0))
+        said = json.loads(_read_at_start(descriptor, 4096))
         return f"pid {int(said['pid'])} ({said['command']}) since {said['since']}"
     except (OSError, ValueError, KeyError, TypeError):
         return "another process"
@@ -246,7 +301,7 @@ class _LockedOctet(_HeldFile):
     def is_taken(self) -> bool:
         """True if the octet is locked now; takes nothing and waits for nothing."""
         try:
-            descriptor = os.open(self._path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+            descriptor = os.open(self._path, os.O_RDWR | NOFOLLOW | CLOSING)
         except OSError:
             return False  # no octet of this file was ever locked
         try:

@@ -6,7 +6,6 @@ swap, a suspended machine, and the administrator, who reads every memory.
 
 from __future__ import annotations
 
-import resource
 import sys
 from contextlib import suppress
 from typing import Final
@@ -16,7 +15,9 @@ _PR_SET_DUMPABLE: Final = 4
 
 def harden() -> None:
     """Forbid core dumps, and on Linux tracing by processes of the same user; a system that cannot is left as it is."""
-    with suppress(OSError, ValueError):
+    with suppress(OSError, ValueError, ModuleNotFoundError):
+        import resource  # Windows has none, and writes no core dumps
+
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if sys.platform == "linux":
         import ctypes  # some milliseconds that lists of nodes need not pay

@@ -9,7 +9,6 @@ they are used: nothing else is promised, whatever the token.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -22,6 +21,7 @@ from typing import Any
 
 from teds_provision.errors import BadDataError, NotFoundError, VaultChangedError, VaultError
 from teds_provision.files import private_folder, read_limited, write_new, write_whole
+from teds_provision.portable import lock
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, verify
 from teds_provision.vault.base import Ask
 from teds_provision.vault.master import MasterKeys, another_life
@@ -411,7 +411,7 @@ def _wait(descriptor: int) -> None:
     until = time.monotonic() + _WAIT_SECONDS
     while True:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(descriptor)
         except BlockingIOError:
             if time.monotonic() > until:
                 raise VaultError(

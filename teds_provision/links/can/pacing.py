@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import fcntl
 import hashlib
 import mmap
 import os
@@ -19,7 +18,14 @@ import threading
 import time
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+from teds_provision.lazy import late
+
+if TYPE_CHECKING:
+    import fcntl
+else:  # recordings are read through this room where there is none
+    fcntl = late("fcntl")
 
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 _POLYNOMIAL = 0x4599

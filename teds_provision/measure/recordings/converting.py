@@ -6,7 +6,6 @@ conversion to that name removes if a killed one left it. Nothing is overwritten.
 
 from __future__ import annotations
 
-import fcntl
 import math
 import os
 import re
@@ -32,6 +31,7 @@ from teds_provision.measure.recordings.summary import RecordingSummary
 from teds_provision.measure.sinks import FILES, TEXT, as_sink_failure
 from teds_provision.measure.sinks.files import FileSink
 from teds_provision.measure.sinks.wide import WideSink
+from teds_provision.portable import CLOSING, NOFOLLOW, OPENS_FOLDERS, is_mine, lock
 
 PARQUET: Final = ".parquet"
 _PATIENCE: Final = 5.0  # seconds beside two periods: then a stream that brings nothing is not waited for
@@ -104,7 +104,7 @@ def _as_parquet(path: Path, entries: Iterator[Entry], recording: Recording, *, w
     finally:
         writer.close()
     for made_path in made:
-        file = os.open(made_path, os.O_RDONLY | os.O_CLOEXEC)
+        file = os.open(made_path, os.O_RDWR | CLOSING)
         try:
             os.fsync(file)
         finally:
@@ -174,26 +174,30 @@ def _folder_for(target: Path) -> Iterator[Path]:
     _sweep(target)
     folder = target.with_name(f".{target.name}.{secrets.token_hex(8)}{_SUFFIX}")
     folder.mkdir(mode=0o700)
-    held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | CLOSING) if OPENS_FOLDERS else None
     try:
-        with suppress(OSError):
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if held is not None:
+            with suppress(OSError):
+                lock(held)
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-        os.close(held)
+        if held is not None:
+            os.close(held)
 
 
 def _sweep(target: Path) -> None:
     """Remove what a killed conversion to this name left: a folder of such a name, ours, without a lock."""
+    if not OPENS_FOLDERS:  # nothing shows whether a conversion still uses it
+        return
     name = re.compile(re.escape(f".{target.name}.") + "[0-9a-f]{16}" + re.escape(_SUFFIX))
     with suppress(OSError):
         for found in [file_name for file_name in os.listdir(target.parent) if name.fullmatch(file_name)]:
             folder = target.with_name(found)
-            held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | NOFOLLOW | CLOSING)
             try:
-                if os.fstat(held).st_uid == os.geteuid():
-                    fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if is_mine(os.fstat(held)):
+                    lock(held)
                     shutil.rmtree(folder)
             finally:
                 os.close(held)

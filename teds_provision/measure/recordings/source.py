@@ -6,7 +6,6 @@ the file contains, and malformed content raises BadDataError with the place.
 
 from __future__ import annotations
 
-import fcntl
 import math
 import os
 from abc import ABC, abstractmethod
@@ -17,6 +16,7 @@ from typing import Any, Final, get_args
 
 from teds_provision.errors import BadDataError
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, Kind, NodeReport, Note, StationFacts
+from teds_provision.portable import CLOSING, NONBLOCK, lock
 from teds_provision.teds import Units
 from teds_provision.teds.calibration.plain import calibration_from_json
 from teds_provision.teds.units import parse_units
@@ -103,11 +103,11 @@ def first_instants(entry: Entry, channels: Collection[int], most: float) -> Bloc
 def is_locked(path: Path) -> bool:
     """True if a recorder holds the file now."""
     try:
-        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        file = os.open(path, os.O_RDONLY | CLOSING | NONBLOCK)
     except OSError:
         return False
     try:
-        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        lock(file, shared=True)
     except BlockingIOError:
         return True
     except OSError:  # a file system without locks

@@ -9,7 +9,6 @@ begins too, and both contain a note.
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import time
 from collections.abc import Iterable
@@ -22,6 +21,7 @@ from teds_provision.files import sync_folder
 from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, NodeReport, Note, StationFacts
 from teds_provision.measure.sinks.base import Item, ThreadedSink, as_sink_failure
 from teds_provision.measure.sinks.lines import iso
+from teds_provision.portable import CLOSING, lock
 
 FLUSH = 0.1  # seconds that a piece may wait in this process
 SYNC = 1.0  # seconds that it may wait in the system's cache
@@ -38,9 +38,9 @@ class Part:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | CLOSING, 0o644)
         with suppress(OSError):  # some network folders have no locks
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(self._file)
         try:
             sync_folder(path.parent)
         except OSError:

@@ -8,7 +8,6 @@ length is no longer true.
 
 from __future__ import annotations
 
-import fcntl
 import mmap
 import os
 import stat
@@ -44,6 +43,7 @@ from teds_provision.measure.sinks.mcap.writer import (
     text,
 )
 from teds_provision.measure.sinks.mcap.zstandard_frames import ZstdError, decompress_frame
+from teds_provision.portable import CLOSING, NONBLOCK, lock
 
 LARGEST_RECORD: Final = 1 << 28  # a length beyond it is damage
 _PRIVATE: Final = 0x80  # op codes from here on are free for anybody
@@ -102,7 +102,7 @@ def recover(path: Path, output: Path | None = None) -> RecoveryResult:
 @contextmanager
 def _map_alone(path: Path) -> Iterator[tuple[int, mmap.mmap]]:
     """Map a file that no recorder writes; none begins to while this is open."""
-    file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    file = os.open(path, os.O_RDONLY | CLOSING | NONBLOCK)
     try:
         status = os.fstat(file)
         if stat.S_ISDIR(status.st_mode):
@@ -110,7 +110,7 @@ def _map_alone(path: Path) -> Iterator[tuple[int, mmap.mmap]]:
         if not stat.S_ISREG(status.st_mode) or status.st_size < len(MAGIC):
             raise _no_mcap(path)
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(file)
         except BlockingIOError:
             raise StoreLockedError(
                 f"{path} is being recorded right now.", hint="End that measurement, or wait until it is over."
