@@ -1,4 +1,4 @@
-"""A station among those of its owner: what it tells them, what it takes in, and what carries it."""
+"""A station among those of its owner: its statements, what it takes in, and the transports."""
 
 from typing import TYPE_CHECKING
 

@@ -1,7 +1,7 @@
 """Rosters and pages into the store, and what follows from them: the fold of ``protocol/plant`` over a store's rows.
 
 Every step is one transaction and leaves a state from which the next fold goes on: some pages with their claims; then, a
-few hundred at a time, the nodes that are to be judged anew (contract/plant.md sections 2 and 3).
+few hundred at a time, the nodes that are to be judged again (contract/plant.md sections 2 and 3).
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ EVENTS_AT_ONCE: Final = 2000
 
 
 def now() -> datetime:
-    """The clock of this station."""
+    """Return the time of this station's clock."""
     return datetime.now(UTC)
 
 
 def require_roster(station: Station) -> Roster:
-    """The roster that counts here; raises PolicyError where no registry was joined."""
+    """Return the current roster; raises PolicyError if no registry was joined."""
     roster = station.plant.roster
     if roster is None:
         raise PolicyError(
@@ -51,7 +51,7 @@ def require_roster(station: Station) -> Roster:
 
 
 def alarm(station: Station, code: str, about: str, n: int, why: str) -> None:
-    """Keep an alarm; one that is there already keeps its time. Other stations are told of a new one."""
+    """Keep an alarm; an existing one keeps its time. A new one is reported to other stations."""
     with station.transaction():
         if station.plant.tables.put_alarm(Alarm(code, about, n, why)):
             station.audit("registry", None, f"alarm: {code}", about=about[:16], n=n, why=why)
@@ -62,7 +62,7 @@ def alarm(station: Station, code: str, about: str, n: int, why: str) -> None:
 
 
 def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster, Taking, str]]:
-    """Take the best of the rosters that somebody carries; those that the CA did not sign are passed over.
+    """Take the best of the rosters in a transport; those that the CA did not sign are ignored.
 
     Everything that follows from a roster (who counts, up to which page) is brought in order in its transaction. Returns
     what was taken or refused, and why; two rosters of one version are an alarm.
@@ -141,12 +141,12 @@ def take_pages(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
 
 
 def row_of(page: Page) -> PageRow:
-    """A page as the store keeps it."""
+    """Return a page as the store keeps it."""
     return PageRow(page.number, page.hash, page.previous, page.created, page.home, *split(page.octets))
 
 
 def recount(station: Station, chain: Chain, roster: Roster) -> set[tuple[int, str]]:
-    """Say anew which pages of a chain count, and fold them; from the first one where what was folded counts no more.
+    """Determine again which pages of a chain count, and fold them; from the first one if folded pages no longer count.
 
     Returns the pages that were folded now.
     """
@@ -222,12 +222,12 @@ def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object])
 
 
 def _number(id: str) -> int:
-    """An event's id as SQLite keeps it: a signed integer of 64 bits."""
+    """Return an event's id as SQLite keeps it: a signed integer of 64 bits."""
     return int.from_bytes(bytes.fromhex(id), "big", signed=True)
 
 
 def seal_of_digest(station: Station, chain: Chain, n: int, stated: Event) -> bytes:
-    """The seal of the row of a digest that was signed, or vouched for, on page ``n``."""
+    """Return the MAC of the row of a digest that was signed, or vouched for, on page ``n``."""
     return station.row_macs.note("digest", f"{stated.members['teds_sha256']} {chain.station} {n} {stated.act}")
 
 
@@ -242,13 +242,13 @@ def _keep_bans(station: Station, chain: Chain, values: Iterable[object], *, coun
 
 
 def counted_places(station: Station, roster: Roster, chain: Chain) -> frozenset[tuple[int, str]]:
-    """Number and H of the pages of a chain that count; of another history none above where the two part."""
+    """Return number and H of the pages of a chain that count; of another history none above where the two part."""
     names = station.plant.tables.page_names(chain.chain)
     return frozenset(counting(names, last=_last(roster, chain.station), accepted=chain.accepted).pages)
 
 
 def octets_of(row: PageRow) -> bytes:
-    """The octets of a page, as they came."""
+    """Return the octets of a page, as they came."""
     return join(row.header, row.content, row.signature)
 
 
@@ -256,7 +256,7 @@ def octets_of(row: PageRow) -> bytes:
 
 
 class _LocalRows(NamedTuple):
-    """What this station's own store says of a page of nodes."""
+    """The station's own rows about a batch of nodes."""
 
     entries: dict[bytes, WhitelistEntry]
     nodes: dict[bytes, NodeRecord]
@@ -293,7 +293,7 @@ class _LocalRows(NamedTuple):
 
 
 def merged_views(station: Station, roster: Roster, uuids: Sequence[bytes]) -> dict[bytes, MergedClaims]:
-    """What the plant says of nodes, at most a page of them, by today's rows; nothing is written."""
+    """Return the plant's view of nodes, at most a batch of them, by today's rows; writes nothing."""
     return {uuid: seen for uuid, (seen, _) in _judged(station, roster, uuids, _LocalRows.read(station, uuids)).items()}
 
 
@@ -326,9 +326,10 @@ def _lifters(station: Station, hash: str) -> set[str]:
 
 
 def apply_claims(station: Station) -> int:
-    """Bring whitelist, deny list and conflicts in order for every node of which something new was said; how many.
+    """Update whitelist, deny list and conflicts for every node with new statements; return how many.
 
-    Rule 2: no pin, key or right of this station's own goes; what the registry pinned, or a page banned, comes and goes.
+    Rule 2: no pin, key or right of this station's own goes; only what the registry pinned, or a page banned, comes and
+    goes.
     """
     done = 0
     while uuids := station.plant.tables.to_judge(AT_ONCE):
@@ -347,7 +348,7 @@ def apply_claims(station: Station) -> int:
 
 
 def _pin(station: Station, judged: dict[bytes, tuple[MergedClaims, list[BanStatement]]], here: _LocalRows) -> None:
-    """Have what all keepers pin on the whitelist, where there is nothing of one's own; and off it when they do not."""
+    """Whitelist what all keepers pin, if there is no own entry; and remove it when they no longer do."""
     put: list[WhitelistEntry] = []
     for uuid, (seen, _) in judged.items():
         entry, node = here.entries.get(uuid), here.nodes.get(uuid)
@@ -364,7 +365,7 @@ def _pin(station: Station, judged: dict[bytes, tuple[MergedClaims, list[BanState
 
 
 def _ban(station: Station, uuid: bytes, seen: MergedClaims, statements: Sequence[BanStatement]) -> None:
-    """Have one row on the deny list where any statement bans the node, and none where those of pages do no more."""
+    """Keep one row on the deny list if any statement bans the node, and none if those of pages no longer do."""
     entry = station.policy.revocation(uuid)
     if entry is not None and entry.statement:
         hash = event.hash_of_statement(entry.statement)
@@ -379,7 +380,7 @@ def _ban(station: Station, uuid: bytes, seen: MergedClaims, statements: Sequence
 
 
 def _is_lifted(station: Station, statement: str, hash: str) -> bool:
-    """Whether a ban that came in a bundle, or was made here, was lifted in a page by a keeper or by its own signer."""
+    """True if a ban of a bundle, or of this station, was lifted in a page by a keeper or by its own signer."""
     roster = require_roster(station)
     try:
         signer = open_revocation(statement, lambda kid: roster.point_of(kid) or _own(station, kid)).sender

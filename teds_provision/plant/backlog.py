@@ -1,7 +1,7 @@
-"""Joining with a past: what a station's store says already, as events (contract/plant.md section 2).
+"""Joining with a past: the existing facts of a station's store, as events (contract/plant.md section 2).
 
 Nodes that were provisioned before the plant was made stay authentic at every member: what this station signed, and
-still remembers, is told in its first pages.
+still has a record of, is in its first pages.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Told = tuple[str, bytes | None, dict[str, Any]]
 
 
 def backlog(station: Station) -> Iterator[Told]:
-    """What this station would have told had it been a member: act, node, members; nothing is written."""
+    """Yield the events that this station would have recorded as a member: act, node, members; writes nothing."""
     for entry in station.pins.all_entries():
         if is_whole(entry.fingerprint) and entry.assurance != "registry":
             yield "pinned", entry.uuid, {"fingerprint": entry.fingerprint, "assurance": entry.assurance}

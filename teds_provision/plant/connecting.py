@@ -1,4 +1,4 @@
-"""Where a station's registry is, and the connection to it: a folder, or PostgreSQL."""
+"""A station's registry, and the connection to it: a folder, or PostgreSQL."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from teds_provision.station.station import Station
 
 
 def open_transport(station: Station) -> Transport | None:
-    """What carries for this station, by what it joined; None where nothing is known that does. Opens no connection."""
+    """Return the transport of the joined registry; None if it is unknown. Opens no connection."""
     record = station.plant.joined
     if record is None or record.url is None:
         return None
@@ -24,7 +24,7 @@ def open_transport(station: Station) -> Transport | None:
 
 
 def database(station: Station, url: str) -> postgres.PostgresTransport:
-    """The registry at a URL, by the login that this station's request named (the vault opens); not connected yet.
+    """Return the registry at a URL, with the login of this station's request (the vault opens); not connected yet.
 
     Raises UsageError (the URL, the driver), NotMemberError (no request was ever made).
     """
@@ -34,7 +34,7 @@ def database(station: Station, url: str) -> postgres.PostgresTransport:
 
 
 def listener(station: Station) -> postgres.Registry | None:
-    """A second connection that is told when somebody did something; None where a folder carries."""
+    """Return a second connection that is notified of changes; None for a folder."""
     record = station.plant.joined
     if record is None or record.url is None or record.url.startswith(FILES):
         return None
@@ -56,7 +56,7 @@ def check_database(station: Station, post: Transport) -> list[str]:
 
 
 def absolute(url: str) -> str:
-    """A URL whose root certificate is found from any folder."""
+    """Return a URL whose root certificate is found from any folder."""
     parts = urlsplit(url)
     words = [
         (name, str(Path(value).absolute()) if name == "sslrootcert" and value != "system" else value)
@@ -66,7 +66,7 @@ def absolute(url: str) -> str:
 
 
 def require_registry(post: Transport, registry: str) -> None:
-    """Raise PolicyError where a database is of another registry than the roster that is to be joined."""
+    """Raise PolicyError if a database is of another registry than the roster that is to be joined."""
     there = post.registry()
     if there != registry:
         raise PolicyError(f"{post.where} belongs to another registry ({there}) than the roster ({registry}).")

@@ -31,8 +31,9 @@ def sign_evidence(
 ) -> bytes:
     """Have the board sign the facts of ``claim``, and return the envelope that the station signed over both.
 
-    A board that passed must answer: raises NotAuthenticError where its signature does not verify, LinkError. One whose
-    attempt failed may be gone; then the envelope holds the station's word alone. ``finished``: now, unless it is named.
+    A board that passed must answer: raises NotAuthenticError if its signature does not verify, LinkError. One whose
+    attempt failed may be gone; then the envelope holds the station's signature alone. ``finished``: now, unless it is
+    given.
     """
     nonce = os.urandom(NONCE_OCTETS)
     proof = b""
@@ -53,7 +54,7 @@ def sign_evidence(
 
 
 def prove_claim(node: Conversation, claim: EvidenceClaim, nonce: bytes) -> bytes:
-    """The board's signature over the facts (128.8); raises NotAuthenticError where it is not that of field 101."""
+    """Return the board's signature over the facts (128.8); raises NotAuthenticError if it is not that of field 101."""
     asked = claim.challenge(nonce)
     proof = node.request_idempotent(security_command(Function.PROVE, asked), "to sign the evidence")
     if not verify(security.decode(claim.teds).node_key, prove_message(claim.uuid, asked), proof):
@@ -62,10 +63,10 @@ def prove_claim(node: Conversation, claim: EvidenceClaim, nonce: bytes) -> bytes
 
 
 def export(tables: LineTables, rows: Iterable[EvidenceRow], folder: Path, *, write: bool = True) -> dict[Path, bool]:
-    """Write documents as ``UUID.N.json``; returns every file, and whether it was not there before.
+    """Write documents as ``UUID.N.json``; return every file, and True for each new one.
 
     N counts all documents of a board that are kept here, whichever are chosen. Each file is written whole; raises
-    StoreError where one cannot be.
+    StoreError if one cannot be.
     """
     files: dict[Path, bool] = {}
     numbers: dict[bytes, dict[str, int]] = {}

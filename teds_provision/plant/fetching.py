@@ -1,4 +1,4 @@
-"""Take in the pages that others wrote (contract/plant.md section 2): whoever carries them, the signature decides."""
+"""Take in the pages of other stations (contract/plant.md section 2): whatever the transport, the signature decides."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ def read_pages(carried: Iterable[CarriedPage], roster: Roster, station: str) -> 
 
 
 def fetch(station: Station, post: Transport, roster: Roster) -> int:
-    """Take in what others say, station by station, and return how many pages came.
+    """Take in other stations' pages, station by station, and return how many came.
 
-    Whatever is wrong with the pages of one station holds up no other's.
+    Faults in the pages of one station delay no other's.
     """
     heads, fetched = post.heads(), 0
     for fingerprint in roster.by_key:

@@ -1,7 +1,8 @@
 """Transfer folder: a stick or a share. ``roster/VERSION.jws``, ``FINGERPRINT/N.jws``, ``to/FINGERPRINT/ID``.
 
-Pages of everybody travel in it. A file is written whole, or not at all, and never over another: a roster or page that
-is there with other content gets a second file beside it, named by the first 16 digits of its H, and readers take both.
+It carries the pages of all stations. A file is written whole, or not at all, and never over another: a roster or page
+that exists with other content gets a second file beside it, named by the first 16 digits of its H, and readers take
+both.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ LARGEST_PARCEL: Final = 64 << 20
 
 
 class FolderTransport:
-    """A folder as a post; a name that is none of its own is left alone and not read."""
+    """A folder as a transport; files with other names are neither changed nor read."""
 
     everybody = True
     returned: Returned | None = None
@@ -37,11 +38,11 @@ class FolderTransport:
         self.where = str(folder)
 
     def registry(self) -> str | None:
-        """A folder does not say; its rosters do."""
+        """Return None: a folder does not name its registry; its rosters do."""
         return None
 
     def rosters(self) -> Iterator[bytes]:
-        """Every roster that lies there."""
+        """Yield every roster in it."""
         for _, path in self._numbered(self._folder / "roster"):
             octets = self._read(path, ROSTER.most)
             if octets is not None:
@@ -52,7 +53,7 @@ class FolderTransport:
         self._put(self._folder / "roster", version, hash, octets)
 
     def heads(self) -> Mapping[str, int]:
-        """The greatest number of a page that is there, by station."""
+        """Return the greatest number of a page in it, by station."""
         found = {}
         for folder in self._listed(self._folder):
             if _STATION.fullmatch(folder.name) and (numbers := [n for n, _ in self._numbered(folder)]):
@@ -71,11 +72,11 @@ class FolderTransport:
         self._put(self._folder / station, n, hash, octets)
 
     def parcels(self, to: str) -> Iterator[Parcel]:
-        """What lies there for a station; when it is thrown away stands in what is sealed."""
+        """Yield the parcels for a station; their expiry is inside the sealed part."""
         return self._parcels(to, (), LARGEST_PARCEL)
 
     def new_parcels(self, to: str, known: Collection[str]) -> Iterator[Parcel]:
-        """What lies there for a station that it does not know."""
+        """Yield the parcels for a station, skipping known ids."""
         return islice(self._parcels(to, known, SMALL), AT_ONCE)
 
     def _parcels(self, to: str, known: Collection[str], most: int) -> Iterator[Parcel]:
@@ -139,7 +140,7 @@ class FolderTransport:
         return names
 
     def _read(self, path: Path, most: int) -> bytes | None:
-        """A file, None where it is gone, a link, or larger than any of its kind: not what a station put there."""
+        """Return a file, None if it is gone, a link, or larger than any of its kind: no station wrote it."""
         try:
             return read_limited(path, most + 64, "document of a plant", failure=LinkError, follow=False)
         except (BadDataError, NotFoundError):

@@ -1,4 +1,4 @@
-"""Jobs at a station: who may give one, which one an id means, and what stands in the way of working on it."""
+"""Jobs at a station: who may give one, which one an id means, and what prevents work on it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MAX_PROFILE_OCTETS: Final = 1 << 20
 
 
 def roster_of(station: Station) -> Roster:
-    """The roster that counts; raises PolicyError where none was joined, RosterExpiredError."""
+    """Return the current roster; raises PolicyError if none was joined, RosterExpiredError."""
     roster = station.plant.roster
     if roster is None:
         raise PolicyError(
@@ -39,7 +39,7 @@ def roster_of(station: Station) -> Roster:
 
 
 def now_of(roster: Roster) -> datetime:
-    """The time here, never before the roster was made: a clock that was put back opens no job again."""
+    """Return the time here, never before the roster was made: a clock that was put back opens no job again."""
     return max(datetime.now(UTC), roster.created)
 
 
@@ -57,14 +57,17 @@ def read_job(station: Station, octets: bytes) -> Job:
 
 
 def kept_job(station: Station, row: JobRow) -> Job:
-    """A job that was taken, whoever is a keeper today; NotAuthenticError where the roster knows its signer no more."""
+    """Return a job that was taken, also if its signer is no keeper today.
+
+    Raises NotAuthenticError if the roster does not know its signer any more.
+    """
     roster = station.plant.roster
     job = open_job(row.octets, roster.point_of if roster is not None else lambda kid: None)
     return replace(job, hash=row.hash)
 
 
 def take_job(station: Station, octets: bytes) -> Job:
-    """Read a job and keep it: its id means this document from now on. Raises PolicyError where it means another."""
+    """Read a job and keep it: its id means this document from now on. Raises PolicyError if it means another."""
     job = read_job(station, octets)
     with station.durable("job"):
         station.plant.line.add_job(JobRow(job.id, job.hash, job.octets))
@@ -78,7 +81,7 @@ def take_job(station: Station, octets: bytes) -> Job:
 
 
 def find_job(station: Station, text: str) -> Job:
-    """The job of a file, or one that is kept here, by its id or the first digits of it.
+    """Return the job of a file, or one that is kept here, by its id or the first digits of it.
 
     Raises NotFoundError, and what :func:`take_job` raises.
     """
@@ -89,7 +92,7 @@ def find_job(station: Station, text: str) -> Job:
 
 
 def take_received(station: Station) -> None:
-    """Take the jobs that a sync brought; one that is no keeper's is thrown away, and told."""
+    """Take the jobs that a sync brought; one that is no keeper's is dropped, and reported."""
     for row, octets in parcels.received(station, "job"):
         try:
             take_job(station, octets)
@@ -102,12 +105,12 @@ def take_received(station: Station) -> None:
 
 
 def job_id(station: Station, text: str) -> str:
-    """The whole id of a job that is kept here, from its first digits; raises NotFoundError."""
+    """Return the whole id of a job that is kept here, from its first digits; raises NotFoundError."""
     return job_row(station, text).id
 
 
 def job_row(station: Station, text: str) -> JobRow:
-    """A job that is kept here, by its id or the first digits of it; raises NotFoundError."""
+    """Return a job that is kept here, by its id or the first digits of it; raises NotFoundError."""
     take_received(station)
     if is_form("random_id", text.lower()):
         rows = [row for row in [station.plant.line.job(text.lower())] if row is not None]
@@ -124,9 +127,9 @@ def job_row(station: Station, text: str) -> JobRow:
 
 
 def require_open(station: Station, job: Job, *, for_station: str | None = None) -> None:
-    """Raise PolicyError where a station may not work on the job now: too early, over, closed here, not for it.
+    """Raise PolicyError if a station may not work on the job now: too early, over, closed here, not for it.
 
-    ``for_station``: its fingerprint, this one's where None is named.
+    ``for_station``: its fingerprint, by default this one's.
     """
     row = station.plant.line.job(job.id)
     why = "it is closed here" if row is not None and row.state == CLOSED else None
@@ -136,7 +139,7 @@ def require_open(station: Station, job: Job, *, for_station: str | None = None) 
 
 
 def require_adopted(station: Station) -> None:
-    """Raise PolicyError where a backup rebuilt this home and it does not know yet which units it gave since."""
+    """Raise PolicyError if a backup rebuilt this home and it does not know yet which units it gave since."""
     if station.plant.restored:
         raise PolicyError(
             "This home was restored from a backup, and only its own pages show which units it has assigned since.",
@@ -145,7 +148,7 @@ def require_adopted(station: Station) -> None:
 
 
 def close_job(station: Station, job: Job) -> None:
-    """Take no further board of a job here, and tell the others."""
+    """Take no further board of a job here, and report that to other stations."""
     with station.durable("job"):
         row = station.plant.line.job(job.id)
         if row is not None and row.state != CLOSED:
@@ -155,7 +158,10 @@ def close_job(station: Station, job: Job) -> None:
 
 
 def profile_file(station: Station, job: Job) -> Path:
-    """The file of the job's profile; raises NotFoundError, and PolicyError if it is not the one that the job names."""
+    """Return the file of the job's profile.
+
+    Raises NotFoundError, and PolicyError if it is not the one that the job names.
+    """
     path = find_profile(job.profile, default_folders(station.home))
     if digest_of_file(path) != job.profile_sha256:
         raise PolicyError(

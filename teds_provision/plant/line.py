@@ -41,9 +41,9 @@ _NO_CALIBRATION: Final = BuildOrder(drop_calibration=True)
 
 @dataclass
 class LineRun:
-    """What all boards of a run belong to: a job, or (``job`` None) nothing but the wish for evidence.
+    """What all boards of a run share: a job, or (``job`` None) only the request for evidence.
 
-    ``order``: what every board gets where there is no job. ``calibrations`` is a folder with a file ``UUID.*`` for each
+    ``order``: what every board gets if there is no job. ``calibrations`` is a folder with a file ``UUID.*`` for each
     board, or one file for a job whose rule is ``one``. Everything that can be refused before a tap is refused when this
     is made: raises PolicyError, NotFoundError, BadDataError.
     """
@@ -102,21 +102,21 @@ class LineRun:
         return self.station.plant.line.count_units(self.job.id)[1] if self.job is not None else 0
 
     def unit_to_json(self, uuid: bytes) -> dict[str, Any]:
-        """What is told of a board beside its steps: job, unit, of how many, attempt, SHA-256 of its evidence."""
+        """Return a board's members beside its steps: job, unit, of how many, attempt, SHA-256 of its evidence."""
         return self._units_as_json.get(uuid, {})
 
     def is_listed(self, uuid: bytes) -> bool:
-        """Whether the job names this UUID."""
+        """True if the job names this UUID."""
         return self.job is not None and uuid in self.job.boards
 
     def lists(self, who: IdentifiedNode) -> bool:
-        """Whether the job names this very board: that is a keeper's word for it."""
+        """True if the job names this very board: that is a keeper's confirmation of it."""
         return self.is_listed(who.uuid) and self.job is not None and self.job.boards[who.uuid] == who.fingerprint
 
     # -- what a board gets -----------------------------------------------------------------------------------------
 
     def order(self, who: IdentifiedNode) -> PreparedOrder:
-        """What this board gets; raises PolicyError (not in the job, its calibration), KeyMismatchError."""
+        """Return what this board gets; raises PolicyError (not in the job, its calibration), KeyMismatchError."""
         job = self.job
         if self.scans is not None:
             self.scans.require(who)
@@ -151,9 +151,9 @@ class LineRun:
         return prepared
 
     def _with_digest(self, calibration: Path | None, uuid: bytes, read: Callable[[], PreparedOrder]) -> PreparedOrder:
-        """What ``read`` gives, and note the digest of the calibration's file that evidence of this board names.
+        """Return the result of ``read``, and record the digest of the calibration's file for the evidence.
 
-        Raises PolicyError where the file changed meanwhile: a bench writes calibrations beside the line.
+        Raises PolicyError if the file changed meanwhile: a bench writes calibrations beside the line.
         """
         digest = digest_of_file(calibration) if calibration is not None and calibration.is_file() else None
         prepared = read()
@@ -167,14 +167,14 @@ class LineRun:
         return prepared
 
     def _prepared(self, calibration: str | None, order: BuildOrder) -> PreparedOrder:
-        """What all boards get alike, read and guarded once a run; ``calibration`` is the SHA-256 of its file."""
+        """Return what all boards get alike, read and guarded once a run; ``calibration`` is the SHA-256 of its file."""
         with self._turn:
             if calibration not in self._common:
                 self._common[calibration] = self._read(order)
             return self._common[calibration]
 
     def _read(self, order: BuildOrder, uuid: bytes | None = None) -> PreparedOrder:
-        """What an order names; raises PolicyError where the profile's file was changed since the run began.
+        """Read an order; raises PolicyError if the profile's file was changed since the run began.
 
         The digest that evidence names must be of what was read, and files are edited beside a run of many hours.
         """
@@ -204,7 +204,7 @@ class LineRun:
         return found[0]
 
     def _common_calibration(self) -> Path:
-        """The one file for all boards, found by its digest."""
+        """Return the one file for all boards, found by its digest."""
         assert self.job is not None
         place = self.calibrations
         files = [] if place is None else [place] if place.is_file() else sorted(place.glob("*"))
@@ -234,7 +234,7 @@ class LineRun:
     def allot_unit(
         self, node: Conversation, who: IdentifiedNode, prepared: PreparedOrder, entry: WhitelistEntry | None
     ) -> LineUnit:
-        """Take the board's unit, durably, or count a further attempt; raises PolicyError where none is left."""
+        """Take the board's unit, durably, or count a further attempt; raises PolicyError if none is left."""
         job, begun = self.job, utc_now()
         held = entry if entry is not None else who.whitelisted
         assurance = "tap" if node.tapped else held.assurance if held is not None else "uuid"
@@ -265,7 +265,7 @@ class LineRun:
         return LineUnit(self, named, row, row.attempts, assurance, begun)
 
     def _row(self, job: Job, uuid: bytes) -> UnitRow:
-        """The unit of this board with one more attempt; called in the transaction that keeps it."""
+        """Return the unit of this board with one more attempt; called in the transaction that keeps it."""
         tables = self.station.plant.line
         kept = tables.unit(job.id, uuid)
         if kept is not None:
@@ -330,12 +330,12 @@ class Scans:
         self._turn = threading.Lock()
 
     def listen(self) -> None:
-        """Take label after label until there are no more; for a thread of its own."""
+        """Take label after label until there are no more; for a separate thread."""
         for line in self._lines:
             self.add_label(line)
 
     def add_label(self, text: str) -> None:
-        """Take one label; what is none is told."""
+        """Take one label; report a malformed one."""
         found: tuple[bytes, str | None] | None = read_label(text)
         digits = text.strip().lower()
         if found is None and len(digits) == 20 and set(digits) <= set("0123456789abcdef"):
@@ -348,7 +348,7 @@ class Scans:
             self._notice(f"Waiting for board {found[0].hex()}.")
 
     def require(self, who: IdentifiedNode) -> None:
-        """Raise PolicyError where no label was scanned, WrongBoardError where another board's was."""
+        """Raise PolicyError if no label was scanned, WrongBoardError if another board's was."""
         with self._turn:
             expected = self._expected
         if expected is None:
@@ -381,7 +381,7 @@ class LineUnit:
     def sign(
         self, node: Conversation, keys: SignedNodeKey, proposal: Proposal, present: NodeSnapshot
     ) -> SignResult | None:
-        """The datasheet signed by the job's office; None where this station signs."""
+        """Return the datasheet signed by the job's office; None if this station signs."""
         job, station = self.run.job, self.run.station
         if job is None or job.office in (None, station.identity.fingerprint):
             return None
@@ -423,7 +423,7 @@ class LineUnit:
     def failed(
         self, node: Conversation, who: IdentifiedNode, steps: Sequence[StepResult], step: str, error: TedsProvisionError
     ) -> None:
-        """Leave evidence of the failure, with the board's signature where it still answers."""
+        """Record evidence of the failure, with the board's signature if it still answers."""
         if self._wanted:
             self._keep(node, who.uuid, who.security_teds, (*_step_facts(steps), (step, error.code, 0)))
 

@@ -1,4 +1,4 @@
-"""What a station does to belong: ask, join, leave; what a keeper vouches for (contract/plant.md section 8)."""
+"""A station's steps of membership: request, join, leave; what a keeper vouches for (contract/plant.md section 8)."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def request(station: Station) -> bytes:
 
 
 def found_roster(station: Station, post: Transport, octets: bytes | None) -> Roster:
-    """The best roster that names this station, of a file or of what carries; one that has expired is refused here.
+    """Return the best roster that names this station, of a file or of the transport; an expired one is refused here.
 
     Raises NotFoundError, PolicyError.
     """
@@ -89,9 +89,9 @@ def disconnect(station: Station) -> None:
 
 
 def vouchable(station: Station, uuids: Sequence[bytes] | None) -> list[tuple[bytes, str, str]]:
-    """Datasheets that this store knows as authentic and that nobody here may sign any more or ever could.
+    """Return datasheets that this store knows as authentic and whose signer may not or never could sign.
 
-    Gives UUID, digest and the first digits of the signer's fingerprint. ``uuids`` None: of every node.
+    Returns UUID, digest and the first digits of the signer's fingerprint. ``uuids`` None: of every node.
     """
     roster = require_roster(station)
     judging = replace(snapshot_trust(station), policy=replace(snapshot_trust(station).policy, rules=None))
@@ -116,7 +116,7 @@ def vouchable(station: Station, uuids: Sequence[bytes] | None) -> list[tuple[byt
 
 
 def vouch(station: Station, found: Sequence[tuple[bytes, str, str]]) -> int:
-    """Say as a keeper that these datasheets are good; returns how many were not said before."""
+    """Vouch as a keeper for these datasheets; return how many are new."""
     roster = require_roster(station)
     if not roster.has(station.fingerprint, "keeper"):
         raise PolicyError("Only a keeper can vouch for datasheets.", hint="See: registry status")

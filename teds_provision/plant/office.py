@@ -57,11 +57,12 @@ class _RefusedError(Exception):
 
 
 def answer(station: Station, octets: bytes, jobs: Collection[str] | None = None, *, jump: bool = False) -> bytes | None:
-    """Answer a request, signed by this office; None for what gets no answer (nobody's, another's, no request).
+    """Answer a request, signed by this office; None for requests without an answer (another office's, malformed).
 
-    ``jobs``: only these ids (None: every job that is kept here). ``jump``: a person takes any sequence. A datasheet,
-    its unit, its sequence and the ``signed`` event are durable before the answer is given; the same request (H) gets
-    the same answer again. Raises StoreError, VaultError and PolicyError (this station is no office now).
+    ``jobs``: only these ids (None: every job that is kept here). ``jump``: an operator accepts any sequence. A
+    datasheet, its unit, its sequence and the ``signed`` event are durable before the answer is returned; the same
+    request (H) gets the same answer again. Raises StoreError, VaultError and PolicyError (this station is no office
+    now).
     """
     roster = roster_of(station)
     if not roster.has(station.identity.fingerprint, "sign"):
@@ -126,7 +127,7 @@ class AnsweredRequest:
 
 
 def _signed(station: Station, request: SignRequest, jobs: Collection[str] | None, *, jump: bool) -> bytes:
-    """The answer to a good request; raises _Refused. The order of the checks is the contract's."""
+    """Return the answer to a good request; raises _Refused. The order of the checks is the contract's."""
     job = _job_of(station, request, jobs)
     revoked = station.policy.revocation(request.uuid)
     if revoked is not None:
@@ -203,7 +204,7 @@ def _require_its_key(station: Station, job: Job, request: SignRequest) -> None:
 
 
 def _require_room(station: Station, job: Job, request: SignRequest) -> UnitRow:
-    """The unit that the board has or gets, with one more answer; raises _Refused where there is none."""
+    """Return the unit that the board has or gets, with one more answer; raises _Refused if there is none."""
     tables = station.plant.line
     kept = tables.unit(job.id, request.uuid)
     if kept is None:
@@ -220,7 +221,7 @@ def _require_room(station: Station, job: Job, request: SignRequest) -> UnitRow:
 
 
 def _built(station: Station, job: Job, request: SignRequest) -> Image:
-    """The datasheet as this office makes it, with the read-only TEDS that the job lists; raises _Refused."""
+    """Return the datasheet as this office makes it, with the read-only TEDS that the job lists; raises _Refused."""
     try:
         profile = _profile(station, job)
         calibrations = _calibrations(job, request, profile)
@@ -278,7 +279,7 @@ def _calibrations(job: Job, request: SignRequest, profile: Profile) -> dict[int,
 
 
 def _text_of(octets: bytes) -> tuple[str, str]:
-    """The text of a calibration file, and a name that says what kind it is: JSON, TOML, else CSV."""
+    """Return the text of a calibration file, and a name with its kind: JSON, TOML, else CSV."""
     try:
         text = octets.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -304,5 +305,5 @@ def _profile(station: Station, job: Job) -> Profile:
 
 @lru_cache(maxsize=16)
 def _loaded(path: str, _state: tuple[int, ...], _second: int, home: Path) -> Profile:
-    """A profile that a job's boards are built from; read again each second, as those that it extends may change."""
+    """Return the profile of a job's boards; read again each second, as those that it extends may change."""
     return load_profile(Path(path), default_folders(home))

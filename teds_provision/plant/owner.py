@@ -1,6 +1,6 @@
-"""What the owner of the CA key does: the registry, and every version of its roster (contract/plant.md section 1).
+"""Actions of the owner of the CA key: the registry, and every version of its roster (contract/plant.md section 1).
 
-A version is made of the one that counts here. Where the CA key is elsewhere it is drafted here and signed there.
+A version is derived from the current one here. If the CA key is elsewhere it is drafted here and signed there.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def _to_the_second(moment: datetime) -> datetime:
 
 
 def draft_first(station: Station, name: str, days: timedelta = USUAL) -> Roster:
-    """Roster 1 of a new registry, with this station alone; raises PolicyError where one was joined."""
+    """Return roster 1 of a new registry, with this station alone; raises PolicyError if one was joined."""
     if station.plant.joined is not None:
         raise PolicyError("This station already belongs to a registry.", hint="See: teds-provision registry status")
     own = Member(station.name, station.point, station.identity.signature, frozenset(FIRST_ROLES))
@@ -53,7 +53,10 @@ def draft_first(station: Station, name: str, days: timedelta = USUAL) -> Roster:
 
 
 def signed(station: Station, draft: Roster) -> Roster:
-    """A draft, signed by the CA; raises NotFoundError if its key is not here, BadDataError for what no reader takes."""
+    """Return a draft, signed by the CA.
+
+    Raises NotFoundError if its key is not here, BadDataError for an invalid draft.
+    """
     ca = station.vault.ca()
     if ca is None or ca.point != station.ca:
         raise NotFoundError(
@@ -64,7 +67,7 @@ def signed(station: Station, draft: Roster) -> Roster:
 
 
 def join(station: Station, roster: Roster, *, url: str | None, told: Sequence[Told]) -> int:
-    """Belong to a registry from now on, and tell what the store says already; returns how many events that made."""
+    """Join a registry, and record the store's existing facts as events; return how many."""
     if roster.member(station.fingerprint) is None:
         raise PolicyError(
             f"The roster of {roster.name} does not name this station.",
@@ -97,7 +100,7 @@ def create(station: Station, name: str, days: timedelta = USUAL) -> tuple[Roster
 
 
 def following(station: Station, **change: Any) -> Roster:
-    """The version after the one that counts here, not signed yet; dates as they are but for ``created``."""
+    """Return the version after the current one, not signed yet; dates unchanged but for ``created``."""
     own = require_roster(station)
     created = max(_to_the_second(now()), own.created)
     change.setdefault("expires", max(own.expires, created + timedelta(days=1)))
@@ -147,9 +150,9 @@ def with_roles(station: Station, name: str, roles: frozenset[Role], last: Place 
 
 
 def draft_removal(station: Station, name: str, why: Why, last: int | None) -> Roster:
-    """Draft a roster in which somebody is removed; ``last`` is the number of the last page that counts of it.
+    """Draft a roster in which a member is removed; ``last`` is the number of its last page that counts.
 
-    For a retired one that is the newest page here unless said; for a lost or stolen one it must be said.
+    For a retired one that is the newest page here by default; for a lost or stolen one it must be given.
     """
     own = require_roster(station)
     gone = own.named(name)
@@ -175,7 +178,7 @@ def draft_removal(station: Station, name: str, why: Why, last: int | None) -> Ro
 
 
 def page_place(station: Station, of: str, n: int) -> Place:
-    """Number and H of a page that counts here; raises NotFoundError."""
+    """Return number and H of a page that counts here; raises NotFoundError."""
     if n == 0:
         return NOWHERE
     chain = station.plant.tables.chain(of)
@@ -216,7 +219,7 @@ def renewed(station: Station, days: timedelta) -> Roster:
 
 
 def require_member(roster: Roster, name: str) -> Member:
-    """A member by name or fingerprint; raises NotFoundError."""
+    """Return a member by name or fingerprint; raises NotFoundError."""
     found = roster.named(name)
     if not isinstance(found, Member):
         known = ", ".join(member.name for member in roster.members)
@@ -225,19 +228,19 @@ def require_member(roster: Roster, name: str) -> Member:
 
 
 def says_the_same(before: Roster | None, after: Roster) -> bool:
-    """Whether a version would change nothing: who belongs, who left, what is shared, until when."""
+    """True if a version would change nothing: members, removed ones, shares, end date."""
     return before is not None and all(
         getattr(before, what) == getattr(after, what) for what in ("members", "removed", "share", "expires")
     )
 
 
 def write_draft(draft: Roster) -> bytes:
-    """A draft as a file."""
+    """Return a draft as a file."""
     return payload(draft.unsigned()) + b"\n"
 
 
 def read_draft(octets: bytes, ca: bytes) -> Roster:
-    """A draft out of a file; raises BadDataError."""
+    """Parse a draft of a file; raises BadDataError."""
     draft = read_roster(load_exact(octets, "The draft"), ca)
     if json.loads(payload(draft.unsigned())) != json.loads(octets):
         raise BadDataError(
@@ -247,7 +250,7 @@ def read_draft(octets: bytes, ca: bytes) -> Roster:
 
 
 def changes(before: Roster | None, after: Roster) -> list[str]:
-    """What a new version changes, in sentences; every key with all 64 digits."""
+    """Return the changes of a new version, in sentences; every key with all 64 digits."""
     said = [f"roster {after.version} of {after.name} ({after.registry}), until {after.expires:%Y-%m-%d}"]
     there = before.by_key if before is not None else {}
     for member in after.members:

@@ -1,9 +1,9 @@
-"""Keys that travel by themselves: copies by the roster's shares, receipts, and what waits for a person.
+"""Automatic handover of keys: copies by the roster's shares, receipts, and what waits for an operator.
 
 A parcel is a bundle as ``export-keys`` seals it, for one receiver; its receipt; or a document of a line, sealed the
-same way. What leaves lies in the store before it is sent, and what came before it is taken away, so a sync that is
-cut anywhere is followed by the same sync: a parcel of a known id is sent once more, a bundle that was taken in gives
-its receipt once more (contract/plant.md section 4).
+same way. An outgoing parcel is in the store before it is sent, and an incoming one before it is removed from the
+registry, so the same sync may follow an interrupted one: a parcel of a known id is sent once more, a bundle that was
+taken in gives its receipt once more (contract/plant.md section 4).
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ _DAYS_OF_A_LINE: Final = 31
 """So long a request or an answer waits here: no registry keeps one longer."""
 _COMMAND: Final = "registry sync"
 _KEPT: Final = 64
-"""So many parcels of one sender wait here for a person; the others stay where they are."""
+"""Limit of parcels of one sender that wait here for an operator; the others stay in the registry."""
 OF_A_LINE: Final[dict[str, ParcelKind]] = {JOB.typ: "job", SIGN_REQUEST.typ: "sign-request", SIGNED.typ: "signed"}
 _KINDS: Final = {JOB.typ: JOB, SIGN_REQUEST.typ: SIGN_REQUEST, SIGNED.typ: SIGNED}
 
 Views = Callable[[Sequence[bytes]], Mapping[bytes, MergedClaims]]
-"""What the plant says of some nodes, by UUID."""
+"""The plant's view of some nodes, by UUID."""
 
 
 # -- in ----------------------------------------------------------------------------------------------------------------
@@ -60,7 +60,7 @@ class ParcelCounts:
 
 
 def take_in(station: Station, post: Transport, views: Views, now: datetime) -> ParcelCounts:
-    """Take in what lies there for this station; what needs a person is kept for ``import-keys --received``."""
+    """Take in the parcels for this station; those that need an operator are kept for ``import-keys --received``."""
     roster = station.plant.roster
     if roster is None:
         return ParcelCounts(0, 0)
@@ -78,9 +78,10 @@ def take_in(station: Station, post: Transport, views: Views, now: datetime) -> P
 
 
 def _drop_outlived(station: Station, now: datetime) -> None:
-    """Drop what waits here and can be of no use: a bundle that has expired, an old request or answer.
+    """Drop waiting parcels that are useless: a bundle that has expired, an old request or answer.
 
-    A sender makes an expired copy anew, a line asks again; what stayed would take the room of what comes (64 of one).
+    A sender makes an expired copy again, a line repeats its request; what stayed would take the room of new ones (64 of
+    one).
     """
     tables, oldest = station.plant.parcels, time_text(now - timedelta(days=_DAYS_OF_A_LINE))
     for row in tables.parcels("in", "waiting", "later"):
@@ -102,7 +103,10 @@ class _Reader:
         self.quiet = silent_stations(station, roster, now)
 
     def again(self, row: ParcelRow) -> bool:
-        """Judge once more what came before its sender's pages did; whoever is still unheard of is for a person."""
+        """Judge once more what came before its sender's pages did.
+
+        A sender that is still unknown is for an operator.
+        """
         octets = self.station.plant.parcels.parcel_document(row.id, "in")
         with self.station.lock(_COMMAND):
             try:
@@ -120,7 +124,7 @@ class _Reader:
             return True
 
     def process_parcel(self, parcel: Parcel) -> bool | None:
-        """Deal with what lies there: True where it is done, False where it is kept here, None where it stays there."""
+        """Process a parcel: True if it is done, False if it is kept here, None if it stays in the registry."""
         tables = self.station.plant.parcels
         if tables.parcel(parcel.id, "in") is not None:
             return False
@@ -154,7 +158,7 @@ class _Reader:
             return self._keep(replace(row, state="later" if why == sharing.LATER else "waiting", detail=why), parcel)
 
     def _why_not(self, plan: incoming.ImportPlan) -> str:
-        """Why a bundle is not taken in without a question, "" where it is."""
+        """Return why a bundle needs an operator's confirmation, "" if it does not."""
         bundle, roster, me = plan.opened.bundle, self.roster, self.station.fingerprint
         if bundle.mode != "copy":
             return "a move needs confirmation"
@@ -214,9 +218,9 @@ class _Reader:
         return True
 
     def _keep_document(self, parcel: Parcel, typ: str, inner: bytes) -> bool | None:
-        """Keep a job, a request or an answer for the command that it is for; a member signed it.
+        """Keep a job, a request or an answer for its command; a member signed it.
 
-        An answer that came twice, or to what nobody asked, is for no command: it would wait here in vain.
+        A repeated answer, or one without a request, is for no command: it would wait here in vain.
         """
         document = open_document(inner, self._member, _KINDS[typ])
         if _KINDS[typ] is SIGNED:
@@ -240,7 +244,7 @@ class _Reader:
         return False
 
     def _refuse(self, error: incoming.NothingImportedError) -> None:
-        """Say on the next page that nothing of a bundle was taken: it is never sent again for these keys."""
+        """Record on the next page that a bundle was refused whole: it is never sent again for these keys."""
         with self.station.transaction():
             for planned in error.nodes:
                 told = {"bundle": error.bundle.id, "peer": error.bundle.sender, "why": planned.why}
@@ -248,7 +252,7 @@ class _Reader:
             self.station.audit("import", None, "refused", handover=error.bundle.id, why=error.message)
 
     def _junk(self, parcel: Parcel, error: TedsProvisionError) -> bool:
-        """What nobody can use is thrown away and told; it would lie there until it expires."""
+        """Drop and report a useless parcel; it would stay until it expires."""
         if not isinstance(error, (BadDataError, NotAuthenticError, NotFoundError, PolicyError)):
             raise error
         with self.station.durable(_COMMAND):
@@ -282,7 +286,7 @@ def import_parcel(
 
 
 def received(station: Station, kind: ParcelKind) -> list[tuple[ParcelRow, bytes]]:
-    """What came of a kind and waits, oldest first, each with its document."""
+    """Return the waiting parcels of a kind, oldest first, each with its document."""
     tables = station.plant.parcels
     return [(row, tables.parcel_document(row.id, "in")) for row in tables.parcels("in", "waiting") if row.kind == kind]
 
@@ -360,7 +364,7 @@ def _send(station: Station, roster: Roster, post: Transport) -> int:
 
 
 def _expire(station: Station, now: datetime) -> None:
-    """What nobody receipted in time is made anew: a copy as another one, a move under its old id."""
+    """Replace what was not receipted in time: a copy by another one, a move under its old id."""
     tables = station.plant.parcels
     for row in tables.parcels("out", "ready", "sent"):
         if row.expires > time_text(now):
@@ -380,7 +384,7 @@ def _expire(station: Station, now: datetime) -> None:
 
 
 def _note_refused(station: Station) -> None:
-    """Note which copies their receivers say, on a page, that they refused: they are not made again."""
+    """Record which copies their receivers report, on a page, as refused: they are not made again."""
     tables, me = station.plant.parcels, station.fingerprint
     for row in tables.parcels("out", "sent"):
         held = tables.shared_in(row.id) if row.kind == "bundle" else []
@@ -429,7 +433,7 @@ def _due(
 
 
 def _with_views(views: Views, rows: Sequence[tuple[bytes, int, str]]) -> Iterator[tuple[bytes, int, str, MergedClaims]]:
-    """Nodes with what the plant says of them, a page at a time."""
+    """Yield nodes with the plant's view of them, a batch at a time."""
     for page in chunks(rows):
         seen = views([uuid for uuid, _, _ in page])
         yield from ((uuid, epoch, key_id, seen[uuid]) for uuid, epoch, key_id in page)

@@ -1,12 +1,12 @@
 """The registry on PostgreSQL, as a member sees it: read rows, append pages, post a roster, send and take parcels.
 
-Nothing that comes from here is believed: whoever calls checks who signed it. A connection is TLS 1.3 to a server whose
-name is verified, and logs in by SCRAM bound to that channel; no password stands in a URL, a file or a variable. Each
-method is one round trip, but for :meth:`Registry.pages`, which takes one for every few pages.
+Nothing that comes from here is trusted: the callers check the signatures. A connection is TLS 1.3 to a server whose
+name is verified, and logs in by SCRAM bound to that channel; no password is in a URL, a file or a variable. Each method
+is one round trip, but for :meth:`Registry.pages`, which takes one for every few pages.
 
 No wait is endless: libpq's own keepalive is two hours, so ``tcp_user_timeout`` and short keepalives notice a connection
-that is half open, the server ends a statement after 60 s, and a watch of our own ends the connection where a server
-that hangs does not.
+that is half open, the server ends a statement after 60 s, and a watch of our own ends the connection if a server that
+hangs does not.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class WaitingParcel:
 
 @dataclass(frozen=True)
 class DatabaseState:
-    """What the database has at one moment, all of it unchecked.
+    """State of the database at one moment, unverified.
 
     ``rosters`` are those that members posted, each once; ``posted`` is this station's own. ``heads`` are number and H
     of each chain's newest page.
@@ -78,7 +78,7 @@ class DatabaseState:
     heads: Mapping[str, tuple[int, str]]
     parcels: tuple[WaitingParcel, ...]
     newest: tuple[int, bytes] | None = field(repr=False)
-    """This station's own newest page there, where it is a short one: each sync looks at it."""
+    """This station's own newest page there, if it is a short one: each sync looks at it."""
     open: frozenset[str] = frozenset()
     """The stations whose row is there and open: they append their pages themselves."""
     handed_in: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -132,10 +132,10 @@ select what from (values
 
 
 def parameters(url: str, fingerprint: str, secret: bytes) -> dict[str, Any]:
-    """What libpq is told for a registry's URL; raises UsageError (2) where the URL says more than where it is.
+    """Return libpq's parameters for a registry's URL; raises UsageError (2) if the URL has more than a location.
 
     ``postgresql://HOST[:PORT]/DATABASE[?sslrootcert=FILE]``; without the file libpq's own place for root certificates
-    counts. Whoever could write ``sslmode`` or a user into it would decide whom this station trusts.
+    counts. A ``sslmode`` or a user in it would decide whom this station trusts.
     """
     parts = urlsplit(url)
     if parts.scheme not in ("postgresql", "postgres"):
@@ -178,7 +178,7 @@ def parameters(url: str, fingerprint: str, secret: bytes) -> dict[str, Any]:
 
 
 def require_driver() -> None:
-    """Raise UsageError where psycopg is missing."""
+    """Raise UsageError if psycopg is missing."""
     try:
         _ = psycopg.conninfo
     except ImportError as error:
@@ -214,7 +214,7 @@ class Registry:
             _shut(connection)
 
     def look(self) -> DatabaseState:
-        """All that tells whether anything is new, in one round trip."""
+        """Return everything that shows whether anything is new, in one round trip."""
         try:
             rows = self._rows(_LOOK, ())
         except _NoSchemaError:  # of an older schema, or a newer one that has other tables, or none
@@ -259,12 +259,12 @@ class Registry:
                 more = len(rows) == PAGES_AT_ONCE
 
     def offers(self, station: str) -> list[Offer]:
-        """Every page of a station that is there, whoever put it there; one round trip."""
+        """Return every page of a station, whoever handed it in; one round trip."""
         author = bytes.fromhex(station)
         return [Offer(station, n, hash, octets, by or "") for n, hash, octets, by in self._rows(_OFFERS, (author,) * 2)]
 
     def offered(self, offers: Sequence[Offer]) -> list[CarriedPage]:
-        """The octets of some offers of one author, in one round trip."""
+        """Return the octets of some offers of one author, in one round trip."""
         asked: list[tuple[str, int, str, str]] = [(offer.station, offer.n, offer.hash, offer.by) for offer in offers]
         rows = self._rows(
             "select asked.place, coalesce(p.jws, f.jws) from"
@@ -307,7 +307,7 @@ class Registry:
                 connection.execute("select registry.append(%s, %s, %s)", asked)
 
     def post_roster(self, version: int, octets: bytes) -> None:
-        """Say which roster is the newest here."""
+        """Post the newest roster known here."""
         self._rows("select registry.post_roster(%s, %s)", (version, octets.decode()))
 
     def send(self, parcel: str, to: str, octets: bytes, until: datetime) -> None:
@@ -318,12 +318,12 @@ class Registry:
             return
 
     def parcel(self, parcel: str) -> bytes | None:
-        """A parcel's octets, None where it is there no more."""
+        """Return a parcel's octets, None if it is no longer there."""
         rows = self._rows("select document from registry.parcel where id = %s", (parcel,))
         return bytes(rows[0][0]) if rows else None
 
     def small_parcels(self, to: str, known: Collection[str]) -> list[Parcel]:
-        """The oldest parcels for this station (``to``) of which it knows no id."""
+        """Return the oldest parcels for this station (``to``), skipping known ids."""
         rows = self._rows(_SMALL_PARCELS, (SMALL, list(known), AT_ONCE))
         return [Parcel(id, to, octets, until.astimezone(UTC).isoformat(), by.hex()) for id, octets, until, by in rows]
 
@@ -332,7 +332,7 @@ class Registry:
         self._rows("delete from registry.parcel where id = any(%s::uuid[])", (list(parcels),))
 
     def open_doors(self) -> list[str]:
-        """What this login may do that no member should; empty where the schema was run by a superuser."""
+        """Return excessive rights of this login; empty if the schema was run by a superuser."""
         return [str(row[0]) for row in self._rows(_OPEN_DOORS, ())]
 
     def open_logins(self) -> list[str]:
@@ -350,11 +350,11 @@ class Registry:
             self._rows("select registry.sweep()", ())
 
     def listen(self) -> None:
-        """Be told from now on of what others do; on a connection that does nothing else."""
+        """Subscribe to notifications of changes; on a connection that does nothing else."""
         self._rows(f"listen {_CHANNEL}", ())
 
     def wait(self, seconds: float, *, parcel_to: str = "") -> bool:
-        """Wait until somebody did something, or left a parcel for a station; False where not in ``seconds``."""
+        """Wait for a notification, or a parcel for a station; False if none came in ``seconds``."""
         until = time.monotonic() + seconds
         with self._connected(seconds) as connection:
             while (left := until - time.monotonic()) > 0:
@@ -370,7 +370,7 @@ class Registry:
 
     @contextmanager
     def _connected(self, more: float = 0.0) -> Iterator[psycopg.Connection[tuple[Any, ...]]]:
-        """The connection, for what takes at most a statement's time and ``more``; failures are of ours."""
+        """Yield the connection, for at most a statement's time and ``more``; failures are translated."""
         require_driver()
         ended = threading.Event()
         with self._turn:
@@ -402,12 +402,12 @@ class PostgresTransport:
         self._seen: DatabaseState | None = None
 
     def registry(self) -> str | None:
-        """The registry that the database is of; looks anew, so a sync asks this first."""
+        """Return the registry that the database is of; looks again, so a sync calls this first."""
         self._seen = self._registry.look()
         return self._seen.registry
 
     def open_doors(self) -> list[str]:
-        """What this station's login may do there that no member should: after a pg_restore, for one."""
+        """Return excessive rights of this station's login: after a pg_restore, for one."""
         return self._registry.open_doors()
 
     def open_logins(self) -> list[str]:
@@ -419,20 +419,20 @@ class PostgresTransport:
         self._registry.sweep()
 
     def rosters(self) -> Iterator[bytes]:
-        """What members posted."""
+        """Yield the rosters that members posted."""
         yield from self._look.rosters
 
     def post_roster(self, version: int, hash: str, octets: bytes) -> None:
-        """Say which roster is the newest here, where the database does not know it of this station."""
+        """Post the newest roster known here, if the database does not have it from this station."""
         if self._look.posted != octets:
             self._registry.post_roster(version, octets)
 
     def heads(self) -> Mapping[str, int]:
-        """The greatest number of a page that is there, by station."""
+        """Return the greatest number of a page, by station."""
         return {station: n for station, (n, _) in self._look.heads.items() if n}
 
     def pages(self, station: str, after: int) -> Iterator[CarriedPage]:
-        """The pages of a station above a number."""
+        """Yield the pages of a station above a number."""
         look, there = self._look, self._look.heads.get(station, (0, ""))[0]
         if station == self._station and look.newest is not None and look.newest[0] == there == after + 1:
             yield CarriedPage(station, *look.newest)
@@ -445,14 +445,14 @@ class PostgresTransport:
         self._registry.append([(n, previous, octets)])
 
     def parcels(self, to: str) -> Iterator[Parcel]:
-        """What lies there for this station."""
+        """Yield the parcels for this station."""
         for waiting in self._look.parcels:
             octets = self._registry.parcel(waiting.id) if waiting.to == to else None
             if octets is not None:
                 yield Parcel(waiting.id, to, octets, waiting.expires.astimezone(UTC).isoformat(), waiting.sender)
 
     def new_parcels(self, to: str, known: Collection[str]) -> Iterator[Parcel]:
-        """What lies there for this station that it does not know, the oldest first, in one round trip."""
+        """Yield the parcels for this station, skipping known ids, the oldest first, in one round trip."""
         yield from self._registry.small_parcels(to, known)
 
     def send(self, parcel: Parcel) -> None:
@@ -492,9 +492,9 @@ class ReturnedPages:
         return self._post._look.schema >= _RETURNING
 
     def state(self, station: str) -> str:
-        """A text that changes with whatever changes about the pages of a station that others handed in, or may.
+        """Return a text that changes with any handed-in page of a station, or its state.
 
-        "" for an open member of which nothing was handed in.
+        "" for an open member without handed-in pages.
         """
         look = self._post._look
         handed_in = look.handed_in.get(station, ())
@@ -516,11 +516,11 @@ class ReturnedPages:
         return self._post._look.heads.get(station, (0, ""))[0]
 
     def offers(self, station: str) -> list[Offer]:
-        """Every page of a station that is there, whoever put it there."""
+        """Return every page of a station, whoever handed it in."""
         return self._post._registry.offers(station)
 
     def octets(self, offers: Sequence[Offer]) -> list[CarriedPage]:
-        """The pages that were offered; one that is gone is left out."""
+        """Return the offered pages; one that is gone is left out."""
         return self._post._registry.offered(offers)
 
     def restore(self, author: str, pages: Sequence[tuple[int, bytes]]) -> None:
@@ -537,14 +537,14 @@ def _handed_in(rows: Sequence[tuple[Any, ...]]) -> dict[str, tuple[str, ...]]:
 
 
 def where_of(url: str) -> str:
-    """A registry's URL as people are shown it: host and database."""
+    """Return a registry's URL for people: host and database."""
     parts = urlsplit(url)
     return f"postgresql://{parts.hostname or ''}{f':{parts.port}' if parts.port else ''}{parts.path}"
 
 
 @contextmanager
 def _cut_after(connection: psycopg.Connection[Any], seconds: float, ended: threading.Event) -> Iterator[None]:
-    """Cut the connection where the block takes longer: a server that hangs keeps TCP alive and answers nothing."""
+    """Cut the connection if the block takes longer: a server that hangs keeps TCP alive and answers nothing."""
 
     def cut() -> None:
         ended.set()
@@ -577,7 +577,7 @@ class _DuplicateParcelError(TedsProvisionError):
 
 
 def _failure(error: psycopg.Error, *, late: bool) -> TedsProvisionError:
-    """What a person has to know of an error of the database; its own words are made harmless."""
+    """Return the error for people of an error of the database; foreign text in it is sanitized."""
     state, words = error.sqlstate, _words(error)
     match state:
         case "TE001":
@@ -614,6 +614,6 @@ def _failure(error: psycopg.Error, *, late: bool) -> TedsProvisionError:
 
 
 def _words(error: BaseException) -> str:
-    """The first line of a foreign message, which a server may have written."""
+    """Return the first line of a foreign message, which a server may have written."""
     lines = [printable(line.strip()) for line in str(error).splitlines() if line.strip()]
     return lines[0][:300] if lines else type(error).__name__

@@ -1,7 +1,7 @@
-"""A station left: whose keys it had, which are rotated now, and what no roster can heal (contract/plant.md section 7).
+"""A removed station: whose keys it had, which are rotated now, and what no roster can repair (contract/plant.md, 7).
 
-Whoever had a key is taken from everybody's pages, its own beyond ``last`` too: what a thief says there counts for
-nothing else, but a key that he names he had.
+The holders of a key are taken from all stations' pages, the removed one's beyond ``last`` too: a thief's statements
+there count for nothing else, but it had a key that it names.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _COMMAND: Final = "registry sync"
 
 @dataclass(frozen=True)
 class RemovalReview:
-    """What was found when it was looked last: ``of`` nodes whose key is held here; ``alone`` had only who left."""
+    """Result of the last review: ``of`` nodes whose key is held here; ``alone`` had only the removed station."""
 
     at: str
     removed: str
@@ -42,9 +42,9 @@ class RemovalReview:
 
 
 def review(station: Station, roster: Roster, now: datetime) -> RemovalReview | None:
-    """Mark for rotation what somebody who left has had; None where nobody left.
+    """Mark for rotation the keys that a removed station had; None if none was removed.
 
-    A look at every key costs seconds in a large plant, so it is done when the roster removes somebody else, and each
+    A look at every key costs seconds in a large plant, so it is done when the roster removes another one, and each
     hour.
     """
     if not roster.removed:
@@ -67,13 +67,13 @@ def review(station: Station, roster: Roster, now: datetime) -> RemovalReview | N
 
 
 def last(station: Station) -> RemovalReview | None:
-    """What the last look found."""
+    """Return the result of the last review."""
     text = station.plant.parcels.review()
     return None if text is None else RemovalReview(**json.loads(text))
 
 
 def rotations_due(station: Station) -> int:
-    """How many nodes this station has to rotate because somebody left."""
+    """Return how many nodes this station has to rotate because of a removed station."""
     return sum(why.startswith(REMOVED) for why in station.keys.rotations_due().values())
 
 
@@ -92,7 +92,7 @@ def _pages(station: Station) -> Iterable[list[bytes]]:
 
 
 def _keys_held(station: Station, page: Sequence[bytes]) -> dict[bytes, KeyRecord]:
-    """The key of each node: the active one, or the newest of those that no session has proven yet (copies)."""
+    """Return the key of each node: the active one, or the newest of those that no session has proven yet (copies)."""
     found: dict[bytes, KeyRecord] = {}
     for key in station.keys.get_many(page):
         if key.uuid not in found or found[key.uuid].state != "active":
@@ -217,7 +217,7 @@ def _removed_in(octets: bytes, ca: bytes) -> frozenset[str]:
 
 
 def _alone(station: Station, roster: Roster) -> int:
-    """Nodes whose key nobody has any more but who left: only a tap gives them to anybody."""
+    """Return the number of nodes whose key only the removed station had: a tap is needed."""
     count, after = 0, b""
     while page := station.plant.tables.claimed_nodes(after, _PAGE):
         after = page[-1]

@@ -1,7 +1,7 @@
-"""The SQL that the keeper of a registry gives to PostgreSQL: schema, members, closing, mending (``registry sql``).
+"""The SQL that the keeper of a registry gives to PostgreSQL: schema, members, closing, repair (``registry sql``).
 
-A station never runs any of it: that takes a superuser. Whatever stands in it is printed for a person, who pipes it into
-``psql``; every value is a number, a UUID, hex digits or a verifier, and is held against its form here.
+A station never runs any of it: that takes a superuser. It is printed for an operator, who pipes it into ``psql``; every
+value is a number, a UUID, hex digits or a verifier, and is checked against its form here.
 """
 
 from __future__ import annotations
@@ -23,16 +23,18 @@ _FINGERPRINT = re.compile(r"[0-9a-f]{64}")
 
 
 def role_of(fingerprint: str) -> str:
-    """The login role of a station; raises BadDataError for what is no fingerprint of 64 digits."""
+    """Return the login role of a station; raises BadDataError for what is no fingerprint of 64 digits."""
     if not _FINGERPRINT.fullmatch(fingerprint):
         raise BadDataError("A station's login needs all 64 digits of its fingerprint.")
     return f"teds_{fingerprint[:16]}"
 
 
 def registry_sql(registry: str, removed: Iterable[str] = ()) -> str:
-    """The whole schema for one registry id, as one transaction; closes every station of ``removed`` (fingerprints).
+    """Return the whole schema for one registry id, as one transaction.
 
-    Running it again is harmless, and the cure after a pg_restore.
+    Closes every station of ``removed`` (fingerprints).
+
+    Running it again is harmless, and the remedy after a pg_restore.
     """
     text = (files("teds_provision.plant") / "registry.sql").read_text(encoding="utf-8")
     quiet = "set client_min_messages = warning;\n"  # run again, each table that is there would be a notice
@@ -40,7 +42,7 @@ def registry_sql(registry: str, removed: Iterable[str] = ()) -> str:
 
 
 def member_sql(fingerprint: str, verifier: str) -> str:
-    """The login of one station; run again it gives it the password of a newer request. Raises BadDataError."""
+    """Return the login of one station; run again it sets the password of a newer request. Raises BadDataError."""
     role = role_of(fingerprint)
     if not is_verifier(verifier):
         raise BadDataError(

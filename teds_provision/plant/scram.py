@@ -26,7 +26,7 @@ def password(secret: bytes) -> str:
 def verifier(secret: bytes) -> str:
     """Return the SCRAM-SHA-256 verifier of a secret; the same secret gives the same one, so a request can be repeated.
 
-    Nobody who has it can log in: that takes ClientKey, of which only the hash (StoredKey) is in it.
+    It is not enough to log in: that takes ClientKey, of which only the hash (StoredKey) is in it.
     """
     salt = hmac.digest(secret, _SALT_LABEL, "sha256")[:16]
     salted = hashlib.pbkdf2_hmac("sha256", password(secret).encode("ascii"), salt, _ITERATIONS)
@@ -37,5 +37,5 @@ def verifier(secret: bytes) -> str:
 
 
 def is_verifier(text: str) -> bool:
-    """Whether a text is a verifier of this form, and nothing that ends a quoted SQL literal."""
+    """True if a text is a verifier of this form, and nothing that ends a quoted SQL literal."""
     return _VERIFIER.fullmatch(text) is not None

@@ -67,7 +67,7 @@ _MOST_LOOK_SECONDS: Final = 1.0
 
 
 class OfficeRefusedError(PolicyError):
-    """The office signs nothing; its reason stands in the message."""
+    """The office signs nothing; the message has its reason."""
 
     code = "office-refused"
 
@@ -82,7 +82,7 @@ class OfficeSilentError(UnprovenError):
 
 
 def transport_for(station: Station, folder: Path | None) -> Transport:
-    """What carries between the stations: the folder, or the registry that this station is connected to."""
+    """Return the transport between the stations: the folder, or the registry that this station is connected to."""
     post = FolderTransport(folder) if folder is not None else connecting.open_transport(station)
     if post is None:
         raise PolicyError(
@@ -113,7 +113,7 @@ class Delivery:
 
 
 class Inbox:
-    """The documents of one kind that come for this station: those that a sync kept here, and those that lie there.
+    """The documents of one kind for this station: those that a sync kept here, and those in the registry.
 
     Each is given once until it is dropped, and nothing is read twice; anything else is left where it is. ``collect``
     and ``wait`` are for one thread at a time.
@@ -126,7 +126,7 @@ class Inbox:
         self._hears = isinstance(post, postgres.PostgresTransport)
 
     def collect(self) -> list[Delivery]:
-        """What came since; raises LinkError."""
+        """Return what came since; raises LinkError."""
         station, own = self._station, self._station.identity.fingerprint
         tables = station.plant.parcels
         found = []
@@ -146,7 +146,7 @@ class Inbox:
         self._known.discard(parcel)  # the same request, asked again, is the same parcel
 
     def wait(self, seconds: float, pause: float) -> None:
-        """Wait until a database says that a parcel came, ``seconds`` at most; ``pause`` where nobody says it."""
+        """Wait until a database notifies of a parcel, ``seconds`` at most; ``pause`` without notifications."""
         if self._hears:
             try:
                 if self._listener is None:  # what came before it listens, nobody says: look at once
@@ -185,18 +185,18 @@ class Inbox:
 
 
 def name_of(hash: str) -> str:
-    """The id of the parcel that carries the document of this H: a UUIDv4 made from it."""
+    """Return the id of the parcel that carries the document of this H: a UUIDv4 made from it."""
     return str(uuids.UUID(bytes=bytes.fromhex(hash)[:16], version=4))
 
 
 def receivers(station: Station, job: Job) -> list[str]:
-    """Fingerprints of everybody that a job is for, but this station."""
+    """Return fingerprints of all stations that a job is for, but this one."""
     named = [*job.stations, *([job.office] if job.office is not None else [])]
     return [fromkey for fromkey in dict.fromkeys(named) if fromkey != station.identity.fingerprint]
 
 
 def send_job(station: Station, post: Transport, job: Job) -> None:
-    """Send a job to everybody that it is for; the same again changes nothing."""
+    """Send a job to all stations that it is for; the same again changes nothing."""
     for receiver in receivers(station, job):
         send(station, post, receiver, job.octets, name_of(hashlib.sha256(f"{job.hash}{receiver}".encode()).hexdigest()))
 
@@ -208,7 +208,7 @@ class Office(Protocol):
     """How requests reach an office, and answers come back."""
 
     def request_signature(self, request: SignRequest) -> bytes | None:
-        """The answer to a request, None where none came in time; asked again it is the same request."""
+        """Return the answer to a request, None if none came in time; a repetition is the same request."""
 
 
 class RemoteOffice:
@@ -253,7 +253,7 @@ class RemoteOffice:
                 return None
 
     def _answered(self, document: bytes) -> tuple[str, str]:
-        """Who signed an answer, and the H of the request that it is to; "" where nobody here signed it."""
+        """Return who signed an answer, and the H of its request; "" for an unknown signer."""
         try:
             told = jose.verify_compact(
                 document.strip(), roster_of(self.station).point_of, typ=SIGNED.typ, max_octets=SIGNED.most
@@ -282,7 +282,7 @@ class FileOffice:
 
 @dataclass(frozen=True)
 class SignatureOrder:
-    """What an office is to sign: the image without its Security TEDS, for which job, with which name, from what."""
+    """What an office has to sign: the image without its Security TEDS, for which job, with which name, from what."""
 
     job: str
     office: str
@@ -301,11 +301,11 @@ def by_office(
     wanted: SignatureOrder,
     on_node: bytes | None,
 ) -> SignResult:
-    """Have the office sign. What it signed before, and what the node has, is not asked for again.
+    """Have the office sign. What it signed before, and what the node has, is not requested again.
 
-    ``on_node``: the node's Security TEDS where its other TEDS are those of the image. A request that was asked before
-    for the very same datasheet is asked again as it is, so that no second one is made. Raises OfficeSilentError (5),
-    Refused (6), NotAuthenticError (the answer is not the office's, or signs something else).
+    ``on_node``: the node's Security TEDS if its other TEDS are those of the image. An earlier request for the very same
+    datasheet is repeated unchanged, so that no second one is made. Raises OfficeSilentError (5), Refused (6),
+    NotAuthenticError (the answer is not the office's, or signs something else).
     """
     roster = roster_of(station)
     if on_node is not None and _says_the_same(station, roster, keys, wanted, on_node):
@@ -339,9 +339,9 @@ def by_office(
 
 @dataclass(frozen=True)
 class OfficeOrder:
-    """What ``sign --by`` is asked for: a node, the office by name, the job by id, the calibration; and what carries.
+    """A request to ``sign --by``: a node, the office by name, the job by id, the calibration; and the transport.
 
-    ``output``: the request is written there, and nobody is waited for.
+    ``output``: the request is written there, without a wait.
     """
 
     node: str
@@ -353,7 +353,7 @@ class OfficeOrder:
 
 
 def sign_by_office(station: Station, links: LinkSettings, order: OfficeOrder, reporter: Reporter) -> SignResult:
-    """Have an office sign the draft of the node that lies there, and keep it, signed, until it is written.
+    """Have an office sign the draft of the node at hand, and keep it, signed, until it is written.
 
     Raises UsageError (no job), NotFoundError (no draft), and what :func:`by_office` raises.
     """
@@ -411,7 +411,7 @@ def _earlier(station: Station, wanted: SignatureOrder) -> SignRequestRow | None:
 
 
 def _new_request(station: Station, node: Conversation, keys: SignedNodeKey, wanted: SignatureOrder) -> SignRequest:
-    """A new request, which the board signed; kept before anybody sees it."""
+    """Return a new request, signed by the board; kept before it leaves this station."""
     nonce, key = os.urandom(NONCE_OCTETS), station.credentials().key
     blocks = wanted.image.unsigned_blocks()
     asked = challenge(nonce, key.point, keys.uuid, wanted.epoch, wanted.sequence, blocks)
@@ -445,7 +445,10 @@ def _new_request(station: Station, node: Conversation, keys: SignedNodeKey, want
 def _taken(
     station: Station, roster: Roster, keys: SignedNodeKey, wanted: SignatureOrder, request: bytes, octets: bytes
 ) -> SignResult:
-    """The image with what the office signed; raises Refused, NotAuthenticError (not its word, or something else)."""
+    """Return the image with the office's signature.
+
+    Raises Refused, NotAuthenticError (not its answer, or something else).
+    """
     office = roster.point_of(wanted.office)
     answer = open_answer(octets, lambda kid: office if kid == wanted.office else None)
     if answer.of != hash_of(request):
@@ -481,7 +484,7 @@ def _says_the_same(
     *,
     by: str | None = None,
 ) -> bool:
-    """Whether a Security TEDS signs exactly this for this board and epoch, by a member with ``sign`` (or ``by``)."""
+    """True if a Security TEDS signs exactly this for this board and epoch, by a member with ``sign`` (or ``by``)."""
     try:
         shown = security.decode(octets)
     except BadDataError:

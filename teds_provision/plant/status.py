@@ -1,4 +1,4 @@
-"""What a person sees of the plant: where everybody stands, what is to be decided, what was said (section 8)."""
+"""The plant for people: the state of each station, decisions to take, events (section 8)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SHORTEST: Final = 4
 
 @dataclass(frozen=True)
 class StationStanding:
-    """Where a station stands: its newest page that counts, since when (seconds), and in a word."""
+    """State of a station: its newest page that counts, since when (seconds), and in a word."""
 
     name: str
     fingerprint: str
@@ -48,17 +48,17 @@ class PlantStatus:
 
     @property
     def expired(self) -> bool:
-        """Whether the roster's time is over."""
+        """True if the roster has expired."""
         return self.at >= self.roster.expires
 
     @property
     def expires_soon(self) -> bool:
-        """Whether its end is near enough to be said."""
+        """True if its end is near enough for a warning."""
         return self.at >= self.roster.expires - WARN_BEFORE
 
     @property
     def exit_code(self) -> int:
-        """0, 4 with alarms that nobody has seen, 6 where the roster has expired or this station was removed."""
+        """0, 4 with alarms that are not seen, 6 if the roster has expired or this station was removed."""
         removed = not any(standing.state == "here" for standing in self.standings)
         return 6 if self.expired or removed else 4 if any(not alarm.seen for alarm in self.alarms) else 0
 
@@ -109,7 +109,7 @@ def _standing(station: Station, member: Any, chain: Chain | None, at: datetime) 
 
 @dataclass(frozen=True)
 class StatedEvent:
-    """An event as a station said it, on page ``n``; ``counts``: whether the page does."""
+    """An event as a station stated it, on page ``n``; ``counts``: the page does."""
 
     station: str
     number: int
@@ -120,7 +120,7 @@ class StatedEvent:
 def log(
     station: Station, *, uuid: bytes | None = None, of: str | None = None, since: str | None = None
 ) -> Iterator[StatedEvent]:
-    """What stations said, chain by chain in the order of their pages: verified when the page came in."""
+    """Yield what stations stated, chain by chain in the order of their pages: verified when the page came in."""
     roster = require_roster(station)
     for fingerprint, chain in sorted(station.plant.tables.chains().items()):
         if of is not None and fingerprint != of:
@@ -172,7 +172,7 @@ def names(station: Station, roster: Roster, uuids: Sequence[bytes]) -> dict[byte
 
 
 def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator[dict[str, Any]]:
-    """What the plant says of every node of which anybody claims anything, by UUID, a page at a time.
+    """Yield the plant's view of every node with a claim, by UUID, a batch at a time.
 
     ``text`` is the beginning of a UUID, or a part of the name.
     """
@@ -208,6 +208,6 @@ def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator
 
 
 def page_list(station: Station, of: str, most: int = 20) -> list[tuple[int, str, str]]:
-    """Number, H and time of the newest pages of a station, newest first: to choose a last one from."""
+    """Return number, H and time of the newest pages of a station, newest first: to choose a last one from."""
     chain = station.plant.tables.chain(of)
     return [(n, hash, created) for n, hash, created, _ in station.plant.tables.page_times(chain.chain, most)]

@@ -1,8 +1,8 @@
-"""``registry sync``: what this station says goes out, what others say comes in (contract/plant.md section 6).
+"""``registry sync``: this station's statements go out, others' come in (contract/plant.md section 6).
 
-Every step can be cut anywhere; the same command carries on. Nothing here needs the other side to be honest: rosters
-count by the CA's signature, pages by their station's, and this station's own chain is looked at before anything is
-added to it, so that a copy of this home, or one that was put back, finds itself out.
+Every step can be interrupted; the same command carries on. Nothing here needs an honest other side: rosters count by
+the CA's signature, pages by their station's, and this station's own chain is checked before anything is added to it, so
+that a copy of this home, or one that was put back, detects itself.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _ROOM: Final = 20_000
 
 @dataclass
 class SyncResult:
-    """What a sync did: pages out and in, the sentences that a person should read, stations that were behind."""
+    """Result of a sync: pages out and in, sentences for people, stations that were behind."""
 
     pushed: int = 0
     fetched: int = 0
@@ -118,7 +118,7 @@ def _return_pages(station: Station, post: Transport, roster: Roster, done: SyncR
 
 
 def _rosters(station: Station, post: Transport, done: SyncResult) -> list[tuple[Roster, str, str]]:
-    """Take the best roster that lies there, and post one's own."""
+    """Take the best roster in the transport, and post one's own."""
     joined = station.plant.joined
     if joined is not None and post.registry() not in (None, joined.registry):
         raise PolicyError(
@@ -136,7 +136,7 @@ def _rosters(station: Station, post: Transport, done: SyncResult) -> list[tuple[
 
 
 def _parcels(station: Station, post: Transport, roster: Roster, done: SyncResult) -> None:
-    """Take in and send keys, once the pages are here that say whose they are."""
+    """Take in and send keys, after the pages that determine their holders."""
 
     def seen(uuids: Sequence[bytes]) -> Mapping[bytes, MergedClaims]:
         return merged_views(station, roster, uuids)
@@ -152,12 +152,12 @@ def _parcels(station: Station, post: Transport, roster: Roster, done: SyncResult
 
 
 def own_chain(station: Station) -> Chain:
-    """The chain of this station."""
+    """Return the chain of this station."""
     return station.plant.tables.chain(station.fingerprint)
 
 
 def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResult, *, connected: bool) -> None:
-    """Look at what lies there under this station's key before anything is added to it; the order is the contract's."""
+    """Check the pages under this station's key before anything is added to them; the order is the contract's."""
     chain, joined = own_chain(station), station.plant.joined
     assert joined is not None
     restored = station.plant.restored
@@ -195,7 +195,10 @@ def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResul
 
 
 def _own_pages(station: Station, post: Transport, roster: Roster, done: SyncResult, above: int) -> list[Page]:
-    """The pages under this station's key; where only members can write, what it did not sign stops everything."""
+    """Return the pages under this station's key.
+
+    If only members can write, one that it did not sign stops everything.
+    """
     found, junk = fetching.read_pages(post.pages(station.fingerprint, above), roster, station.fingerprint)
     if junk and not post.everybody:
         alarm(
@@ -246,7 +249,7 @@ def _require_resumed(station: Station) -> None:
 
 
 def _follows(chain: Chain, new: Sequence[Page]) -> bool:
-    """Whether pages go on, without a gap, from the newest page that counts here."""
+    """True if pages continue, without a gap, from the newest page that counts here."""
     place = chain.counted
     for page in sorted(new, key=lambda page: page.number):
         if (page.number - 1, page.previous) != place:
@@ -256,7 +259,7 @@ def _follows(chain: Chain, new: Sequence[Page]) -> bool:
 
 
 def adopt(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
-    """Take back pages that this station wrote: their events wait no more, what they say is known again."""
+    """Take back pages that this station wrote: their events wait no more, their content is known again."""
     with station.transaction():
         take_pages(station, roster, sorted(pages, key=lambda page: page.number))
         ids = [stated.get("id") for page in pages for stated in page.events if isinstance(stated, dict)]
@@ -303,9 +306,9 @@ def _know_again(station: Station, page: Page) -> None:
 
 
 def _know_unit(station: Station, uuid: bytes, said: event.Event, job: str, unit: int) -> None:
-    """The unit that an attempt or an office's signature was about, and one attempt more.
+    """Record the unit that an attempt or an office's signature was about, and one more attempt.
 
-    Where another board has that unit by now, this one has the next: an office counts what it gave, not its numbers.
+    If another board has that unit by now, this one has the next: an office counts what it gave, not its numbers.
     """
     tables = station.plant.line
     kept = tables.unit(job, uuid)
@@ -322,7 +325,10 @@ def _know_unit(station: Station, uuid: bytes, said: event.Event, job: str, unit:
 
 
 def _require_all_seen(station: Station, roster: Roster, there: set[int]) -> None:
-    """A home that a backup rebuilt goes on only when nobody has seen pages of it that are neither here nor there."""
+    """Let a home that a backup rebuilt go on only if no station has seen pages of it that are missing.
+
+    Missing are pages that are neither here nor in the registry.
+    """
     newest = max({own_chain(station).counted[0]} | there)
     for who, about, n, _ in station.plant.tables.heads():
         if about == station.fingerprint and n > newest and roster.member(who) is not None:
@@ -335,9 +341,9 @@ def _require_all_seen(station: Station, roster: Roster, there: set[int]) -> None
 
 
 def resume(station: Station, post: Transport) -> int:
-    """Go on after a fork, by a person's word: the pages that lie there are adopted, one's own unsent events stay.
+    """Go on after a fork, as an operator confirmed: existing pages are adopted, one's own unsent events stay.
 
-    A page of this home whose place another one took there is told again with what it said; returns how many were
+    A page of this home whose place another one took there is written again with its content; returns how many were
     adopted.
     """
     station.unlock()
@@ -367,7 +373,7 @@ def resume(station: Station, post: Transport) -> int:
 
 
 def strange(station: Station, post: Transport) -> list[Page]:
-    """The pages under this station's key that lie there and that it does not know: what :func:`resume` adopts."""
+    """Return the unknown pages under this station's key: what :func:`resume` adopts."""
     return _strange(station, _under_our_key(station, post, require_roster(station)))
 
 
@@ -392,7 +398,7 @@ def _tell_again(station: Station, chain: Chain, lost: Sequence[tuple[int, str]],
 
 
 def close_page(station: Station, roster: Roster, *, empty: bool = False) -> Page | None:
-    """Put what waits into the next page, in one transaction; None where nothing does (unless ``empty``)."""
+    """Put what waits into the next page, in one transaction; None if nothing does (unless ``empty``)."""
     tables = station.plant.tables
     with station.transaction():
         chain = own_chain(station)
@@ -419,7 +425,7 @@ def close_page(station: Station, roster: Roster, *, empty: bool = False) -> Page
 
 
 def _fresh_heads(station: Station, own: Chain) -> dict[str, tuple[int, str]]:
-    """What this station verified of others and did not say yet."""
+    """Return what this station verified of others and did not report yet."""
     said = {about: (n, hash) for who, about, n, hash in station.plant.tables.heads() if who == own.station}
     return {
         fingerprint: chain.counted
@@ -432,7 +438,7 @@ def _fresh_heads(station: Station, own: Chain) -> dict[str, tuple[int, str]]:
 
 
 def _push(station: Station, post: Transport, roster: Roster, done: SyncResult, *, connected: bool) -> None:
-    """Put there what is lacking: one's own pages, and in a folder everybody's."""
+    """Append missing pages: one's own, and in a folder those of all stations."""
     heads = post.heads()
     for fingerprint, chain in station.plant.tables.chains().items():
         own = fingerprint == station.fingerprint
@@ -454,7 +460,7 @@ def _push(station: Station, post: Transport, roster: Roster, done: SyncResult, *
 
 
 def unseen_heads(station: Station, roster: Roster, done: SyncResult) -> None:
-    """Tell what members say that they saw of others and nobody showed this station; it ends nothing."""
+    """Report heads that members claim to have seen of others and that no station showed this one; it ends nothing."""
     chains = station.plant.tables.chains()
     for who, about, n, hash in station.plant.tables.heads():
         chain = chains.get(about)

@@ -1,8 +1,8 @@
-"""How pages, rosters and parcels travel: a folder (a stick, a share), or PostgreSQL. A post office decides nothing.
+"""How pages, rosters and parcels travel: a folder (a stick, a share), or PostgreSQL. The transport is untrusted.
 
-Whoever carries can withhold, repeat and put in junk, and no more: what it gives is octets, and every reader checks who
-signed them. So a post never raises because of what lies there; it raises LinkError where it cannot be reached and
-PolicyError where it lets nobody in.
+A carrier can withhold, repeat and add junk, and no more: it gives octets, and every reader checks who signed them. So a
+transport never raises because of its content; it raises LinkError if it cannot be reached and PolicyError if it denies
+access.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ AT_ONCE: Final = 16
 
 @dataclass(frozen=True)
 class CarriedPage:
-    """A page as it lies there: whose, which number, its octets; none of it is checked.
+    """A page in a transport: whose, which number, its octets; unverified.
 
-    ``by``: the member that handed it in for its author; "" if the author put it there, or a folder holds it.
+    ``by``: the member that handed it in for its author; "" if the author appended it, or a folder holds it.
     """
 
     station: str
@@ -48,7 +48,10 @@ class Returned(Protocol):
         """False if the database cannot take such pages."""
 
     def state(self, station: str) -> str:
-        """A text that changes with what was handed in of a station; "" if it is an open member and nothing was."""
+        """Return a text that changes with what was handed in of a station.
+
+        "" if it is an open member and nothing was.
+        """
 
     def was_handed_in(self, station: str) -> bool:
         """True if a member handed in a page of this station."""
@@ -60,10 +63,10 @@ class Returned(Protocol):
         """The number of the newest page that the station appended itself."""
 
     def offers(self, station: str) -> list[Offer]:
-        """Every page of a station that is there, whoever put it there."""
+        """Return every page of a station, whoever handed it in."""
 
     def octets(self, offers: Sequence[Offer]) -> list[CarriedPage]:
-        """The pages that were offered; one that is gone is left out."""
+        """Return the offered pages; one that is gone is left out."""
 
     def restore(self, author: str, pages: Sequence[tuple[int, bytes]]) -> None:
         """Hand in pages (number, octets) of a station. Raises PolicyError."""
@@ -71,9 +74,9 @@ class Returned(Protocol):
 
 @dataclass(frozen=True)
 class Parcel:
-    """A document for one station (``to``), or from one: random id, octets, when it is thrown away (ISO 8601).
+    """A document for one station (``to``), or from one: random id, octets, when it expires (ISO 8601).
 
-    ``sender`` is "" where nobody wrote it down.
+    ``sender`` is "" if it is unknown.
     """
 
     id: str
@@ -84,46 +87,49 @@ class Parcel:
 
 
 class Transport(Protocol):
-    """What carries between the stations of one registry."""
+    """Transport between the stations of one registry."""
 
     everybody: bool
-    """Whether pages of others are brought there too: a folder has no other way to get them."""
+    """True if pages of others are brought there too: a folder has no other way to get them."""
 
     returned: Returned | None
-    """What members handed in for stations that left; None for a folder, which everybody fills."""
+    """Pages that members handed in for stations that left; None for a folder, which all stations fill."""
 
     where: str
     """For people: the folder, or the URL without anything secret."""
 
     def registry(self) -> str | None:
-        """The registry (UUID) that this is of; None where nothing says so: the rosters that lie there do then."""
+        """Return the registry (UUID) that this is of; None if only its rosters name it."""
 
     def rosters(self) -> Iterator[bytes]:
-        """Every roster that lies there."""
+        """Yield every roster in it."""
 
     def post_roster(self, version: int, hash: str, octets: bytes) -> None:
         """Put a roster there; the same again changes nothing, and another one of that version stays beside it."""
 
     def heads(self) -> Mapping[str, int]:
-        """The greatest number of a page that is there, by station."""
+        """Return the greatest number of a page, by station."""
 
     def pages(self, station: str, after: int) -> Iterator[CarriedPage]:
-        """The pages of a station above a number, ascending; a folder gives all that it has, several of one number."""
+        """Yield the pages of a station above a number, ascending.
+
+        A folder gives all that it has, several of one number.
+        """
 
     def append(self, station: str, n: int, previous: str, hash: str, octets: bytes) -> None:
-        """Put a page there; the same again changes nothing. Raises ForkError if another one has its place for good."""
+        """Append a page; the same again changes nothing. Raises ForkError if another one has its place."""
 
     def parcels(self, to: str) -> Iterator[Parcel]:
-        """What lies there for a station."""
+        """Yield the parcels for a station."""
 
     def new_parcels(self, to: str, known: Collection[str]) -> Iterator[Parcel]:
-        """What lies there now for a station, but for the ids that it knows and what is larger than ``SMALL``.
+        """Yield the parcels for a station, skipping known ids and those larger than ``SMALL``.
 
-        Looks anew; at most ``AT_ONCE``, the others at the next call.
+        Looks again; at most ``AT_ONCE``, the others at the next call.
         """
 
     def send(self, parcel: Parcel) -> None:
-        """Put a parcel there; the same id again changes nothing. Raises PolicyError where no more is taken."""
+        """Send a parcel; the same id again changes nothing. Raises PolicyError if no more is accepted."""
 
     def drop(self, parcel: str, to: str) -> None:
         """Throw a parcel away; one that is gone is no error."""

@@ -33,7 +33,7 @@ _CHUNK: Final = 64
 
 @dataclass(frozen=True)
 class EvidenceAnchors:
-    """What evidence is judged by: the owner's CA key (65 octets); who belongs; the key of each board."""
+    """Trust anchors of evidence: the owner's CA key (65 octets); the roster; the key of each board."""
 
     ca: bytes
     pins: Mapping[bytes, str] | None = None
@@ -54,12 +54,12 @@ class EvidenceAnchors:
         return cls(ca, listed, named)
 
     def faults(self, evidence: Evidence) -> list[str]:
-        """What is wrong with a document, a sentence each; empty for a good one."""
+        """Return the faults of a document, a sentence each; empty for a good one."""
         one = codec.ready(evidence)
         return self.faults_of(one, codec.check_signatures(one))
 
     def faults_of(self, checked: CheckedEvidence, signatures: Signatures) -> list[str]:
-        """As :meth:`faults`, where the signatures were checked already."""
+        """Return the same as :meth:`faults`, for signatures that were checked already."""
         evidence = checked.evidence
         found = codec.faults_of(checked, signatures, self.ca)
         if self.roster is not None:
@@ -74,7 +74,7 @@ class EvidenceAnchors:
 
 
 def _wrong_members(evidence: Evidence, roster: Roster) -> Iterator[str]:
-    """What a roster says against a document. When a lost or stolen station said it, no file can tell."""
+    """Yield a document's faults by the roster. A file cannot show when a lost or stolen station signed it."""
     station = evidence.facts.station
     yield from _gone(roster, station, "its station")
     if roster.by_key.get(station) is not None and not roster.roles_of(station) - {"audit"}:
@@ -103,7 +103,7 @@ def _gone(roster: Roster, station: str, what: str) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class JudgedEvidence:
-    """What became of one file: what it says, and what is wrong with it; ``exit_code`` as the command would end."""
+    """Result of one file: its content and faults; ``exit_code`` of a command for it alone."""
 
     path: Path
     evidence: Evidence | None = None
@@ -112,7 +112,7 @@ class JudgedEvidence:
 
     @property
     def good(self) -> bool:
-        """Whether everything holds, also of an attempt that failed."""
+        """True if everything is valid, also of an attempt that failed."""
         return self.evidence is not None and not self.faults
 
     @property
@@ -168,7 +168,7 @@ class EvidenceTotals:
         self.exit_code = max(self.exit_code, others.exit_code, key=_WORST.index)
 
     def to_json(self) -> dict[str, Any]:
-        """The last line."""
+        """Return the last line."""
         return {"totals": {"files": self.files, **dict(sorted(self.words.items()))}}
 
 
@@ -180,7 +180,9 @@ Tell = Callable[[JudgedEvidence], str]
 def verify_evidence(
     grounds: EvidenceAnchors, files: Sequence[str], tell: Tell, *, processes: int | None = None
 ) -> Iterator[tuple[list[str], EvidenceTotals]]:
-    """Judge every file, in order: what ``tell`` says of each, and their totals; a fault of one stops no other.
+    """Judge every file, in order: yield the lines of ``tell`` for each, and their totals.
+
+    A fault of one stops no other.
 
     More than a few files are shared among ``processes`` (as many as there are cores).
     """

@@ -1,6 +1,6 @@
-"""How a line does: first-pass yield, seconds per step, failures by code, per station (``job status``).
+"""Statistics of a line: first-pass yield, seconds per step, failures by code, per station (``job status``).
 
-From evidence where it is at hand; of other stations from their pages alone, which say no seconds.
+From evidence if it is at hand; of other stations from their pages alone, which contain no seconds.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ COLUMNS: Final = ("station", "name", "uuid", "unit", "attempt", "verdict", "code
 class Attempt:
     """One attempt at one board.
 
-    ``code`` is that of the error that ended it, None where it passed; ``steps`` are seconds, None where nobody says.
+    ``code`` is that of the error that ended it, None if it passed; ``steps`` are seconds, None if unknown.
     """
 
     station: str
@@ -43,7 +43,7 @@ class Attempt:
 
     @classmethod
     def from_evidence(cls, evidence: Evidence) -> Attempt:
-        """What evidence says of its attempt; a step that failed counts in ``code`` alone."""
+        """Return the attempt of an evidence document; a failed step counts in ``code`` alone."""
         facts = evidence.facts
         steps = {name: milliseconds / 1000 for name, result, milliseconds in facts.steps if result in GOOD_RESULTS}
         return cls(facts.station, evidence.uuid, facts.unit, facts.attempt, facts.failure, evidence.finished, steps)
@@ -67,7 +67,7 @@ class StationYield:
 
     @property
     def over(self) -> bool:
-        """Whether it took more units than the job allots to it."""
+        """True if it took more units than the job allots to it."""
         return self.units > self.allotment
 
     @property
@@ -140,7 +140,7 @@ def _of_pages(station: Station, job: str) -> Iterator[tuple[str, Attempt]]:
 
 
 def yield_stats(station: Station, job: Job, attempts: Iterable[Attempt]) -> list[StationYield]:
-    """What each station of a job did, those without any attempt included."""
+    """Return the result of each station of a job, those without any attempt included."""
     roster = station.plant.roster
     names = {key: roster.name_of(key) if roster is not None else key[:16] for key in job.stations}
     found = {key: StationYield(key, names[key], number) for key, number in job.stations.items()}
