@@ -139,7 +139,7 @@ def restore(
 
 
 def _summary(content: Content, keystore: str | None) -> str:
-    """Whose backup it is, how old, and where the keys shall lie: what a person has to compare."""
+    """Return whose backup it is, how old, and where the keys will be: what an operator has to compare."""
     days = content.age_days()
     age = f"{days} day{'' if days == 1 else 's'} ago" if days >= 0 else "in the future: check the clocks"
     return (
@@ -228,7 +228,7 @@ def _open(file: Path, recovery_key: Path | None, ask: Callable[[str, bool], str]
 
 
 def _asker(app: App, descriptor: int | None) -> Callable[[str, bool], str]:
-    """Who gives the backup's passphrase: its own file descriptor, else whoever gives the station's."""
+    """Return the source of the backup's passphrase: its file descriptor, else that of the station's."""
     if descriptor is None:
         return app.ask_secret
     return lambda prompt, confirm: read_line(descriptor)

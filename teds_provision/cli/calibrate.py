@@ -1,4 +1,4 @@
-"""``calibrate``: a sensor's zero where it is mounted, points from the running sensor, and how well a fit meets them."""
+"""``calibrate``: a mounted sensor's zero, points from the running sensor, and the quality of a fit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``node check``: the rules of the profile against somebody's board."""
+"""``node check``: the rules of the profile against a board."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def check(app: App, factory: bool, explain: bool, yes: bool, dry_run: bool, link
 
 
 def _explained(told: ExplainedRequest | str) -> dict[str, str | None]:
-    """The test agreement in hex; where none came about only ``problem``."""
+    """Return the test agreement in hex; without one only ``problem``."""
     if isinstance(told, str):
         return {"problem": told}
     reply = told.reply

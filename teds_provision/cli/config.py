@@ -1,4 +1,4 @@
-"""``config``: what is set, where, and to what, and how to set it; ``completion``: the lines that a shell wants."""
+"""``config``: show and change settings, with their origin; ``completion``: the lines for a shell."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def _check_value(root: click.Context, name: str, value: Any, place: Path) -> Non
 
 
 def _parameter(root: click.Context, name: str) -> tuple[str, click.Command, click.Parameter] | None:
-    """The first command that a setting serves, with its path and the option that is meant; None for a broker."""
+    """Return the first command that a setting serves, with its path and the option; None for a broker."""
     *words, option = name.replace("_", "-").split(".")
     for path, options in OPTIONS.items():
         if option in options and path.split()[: len(words)] == words:
@@ -187,7 +187,7 @@ def unset(app: App, name: str) -> None:
 
 
 def _typed(root: click.Context, name: str, value: str) -> Any:
-    """The value as the option reads it, typed as TOML has it; raises UsageError for a name or value that is none."""
+    """Return the value as the option parses it, typed as in TOML; raises UsageError for an invalid name or value."""
     *words, option = name.replace("_", "-").split(".")
     listed: Any = None
     if value.startswith("["):
@@ -211,7 +211,7 @@ def _typed(root: click.Context, name: str, value: str) -> Any:
 
 
 def _from_here(name: str, value: Any) -> Any:
-    """The value with its path as the person meant it, from the folder in which the command was typed."""
+    """Return the value with its path as the user meant it, from the folder in which the command was typed."""
     nested: dict[str, Any] = {}
     inner = nested
     *words, option = name.split(".")
@@ -225,10 +225,10 @@ def _from_here(name: str, value: Any) -> Any:
 
 
 def _edit(app: App, command: str, name: str, value: Any) -> bool:
-    """Set or (None) remove one setting under the store's lock; False where nothing had to change.
+    """Set or (None) remove one setting under the store's lock; False if nothing had to change.
 
-    TOML has more ways to say a thing than this edit knows (inline tables, dotted keys): what it made is read again, and
-    written only if it says exactly what was meant. Raises BadDataError where it does not, with nothing changed.
+    TOML has more spellings than this edit knows (inline tables, dotted keys): the result is parsed again, and written
+    only if it has exactly the wanted content. Otherwise raises BadDataError, with nothing changed.
     """
     place = config_path(app.home)
     *table, key = name.replace("_", "-").split(".")
@@ -254,7 +254,7 @@ def _edit(app: App, command: str, name: str, value: Any) -> bool:
 
 
 def _edited(text: str, table: list[str], key: str, value: Any) -> str:
-    """The text with one key of one table set, or (None) without its line; a comment behind the value stays."""
+    """Return the text with one key of one table set, or (None) without its line; a comment behind the value stays."""
     lines = text.splitlines()
     there = _lines_of(lines, table)
     start, end = there or (len(lines), len(lines))
@@ -279,7 +279,7 @@ def _edited(text: str, table: list[str], key: str, value: Any) -> str:
 
 
 def _lines_of(lines: list[str], table: list[str]) -> tuple[int, int] | None:
-    """Between which lines the keys of a table (the last of its name) stand, None where there is none of that name."""
+    """Return the lines between which the keys of a table (the last of its name) are, None without one."""
     found = None if table else (0, len(lines))
     inside = not table
     for number, line in enumerate(lines):
@@ -292,7 +292,7 @@ def _lines_of(lines: list[str], table: list[str]) -> tuple[int, int] | None:
 
 
 def _comment(rest: str) -> str:
-    """What stands behind the value of a line, with the blanks before it: "" where there is no comment."""
+    """Return what follows the value of a line, with the blanks before it: "" if there is no comment."""
     for at in (n for n, character in enumerate(rest) if character == "#"):
         with suppress(BadDataError):
             load_toml(f"x = {rest[:at]}", "")

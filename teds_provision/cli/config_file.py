@@ -1,7 +1,7 @@
 """``config.toml`` in the home: defaults for options, checked by name before anything runs.
 
-What stands outside of a table serves every command that has such an option; a table serves the command of its name, a
-table in it a command of that group. The names are those of the command line, with ``-`` or ``_``.
+Keys outside of a table serve every command that has such an option; a table serves the command of its name, a table in
+it a command of that group. The names are those of the command line, with ``-`` or ``_``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _MEND: Final = "Fix or remove the file."
 
 
 class Defaults(dict[str, Any]):
-    """Values of config.toml: what stands outside of a table serves every command, a table the command of its name.
+    """Values of config.toml: those outside of a table serve every command, a table the command of its name.
 
     The same word may be an option and a command (``profile``), so a command is given plain values, never tables, and of
     these the ones that it has options for, under the names of its parameters.
@@ -58,7 +58,7 @@ class Defaults(dict[str, Any]):
         return {name.replace("_", "-"): value for name, value in own.items()} if isinstance(own, dict) else {}
 
     def _of_command(self, path: str, own: dict[str, Any]) -> dict[str, Any]:
-        """What click is given for a command: by parameter, a list for what may be given several times."""
+        """Return click's defaults for a command: by parameter, a list for a repeatable one."""
         found = {}
         for name, value in {**_common(self._values), **own}.items():
             if name not in OPTIONS.get(path, ()) or isinstance(value, dict):
@@ -78,17 +78,17 @@ def _common(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_command(path: str) -> bool:
-    """Whether there is such a command, or a group of commands with options."""
+    """True if there is such a command, or a group of commands with options."""
     return path in OPTIONS or any(name.startswith(f"{path} ") for name in OPTIONS)
 
 
 def parameter_of(path: str, option: str) -> str:
-    """What the code of a command calls one of its options, as the command line spells that."""
+    """Return the parameter name of a command's option, as the command line spells it."""
     return PARAMETERS.get(path, {}).get(option, option.replace("-", "_"))
 
 
 def anchored(values: dict[str, Any], folder: Path, above: str = "") -> dict[str, Any]:
-    """The values with every path from the root on, relative ones from ``folder``: commands are typed anywhere."""
+    """Return the values with absolute paths, relative ones from ``folder``, as commands run in any folder."""
     return {
         name: anchored(value, folder, name) if isinstance(value, dict) else _anchored_value(name, value, folder, above)
         for name, value in values.items()
@@ -127,12 +127,12 @@ def home_of(home: Path | None) -> Path:
 
 
 def config_path(home: Path | None) -> Path:
-    """Where the file of a home lies."""
+    """Return the path of a home's file."""
     return home_of(home) / "config.toml"
 
 
 def read_config_text(path: Path) -> str | None:
-    """Return the text of the file, None where there is none; raises BadDataError."""
+    """Return the text of the file, None if there is none; raises BadDataError."""
     if not os.path.lexists(path):  # or a home that cannot be one: whoever opens it says so
         return None
     try:
@@ -142,7 +142,7 @@ def read_config_text(path: Path) -> str | None:
 
 
 def read_config(path: Path) -> dict[str, Any] | None:
-    """Return what the file says, None where there is none; raises BadDataError with the line of what is wrong."""
+    """Return the content of the file, None if there is none; raises BadDataError with the line of the fault."""
     text = read_config_text(path)
     if text is None:
         return None
@@ -156,7 +156,7 @@ def read_config(path: Path) -> dict[str, Any] | None:
 
 
 def problems(values: dict[str, Any], text: str) -> Iterator[str]:
-    """What is wrong with the names of a file, each with its line."""
+    """Yield faults in the names of a file, each with its line."""
     anywhere = {option for options in OPTIONS.values() for option in options} - NEVER_IN_FILE
     for name, value in values.items():
         plain = name.replace("_", "-")
@@ -192,7 +192,7 @@ def _problems_of_brokers(values: dict[str, Any], text: str) -> Iterator[str]:
 
 
 def brokers_of(path: Path) -> dict[str, str]:
-    """The brokers that requests may name, ``[ncap.brokers]``; raises BadDataError as :func:`read_config`."""
+    """Return the brokers that requests may name, ``[ncap.brokers]``; raises BadDataError as :func:`read_config`."""
     ncap = anchored(read_config(path) or {}, path.parent).get("ncap", {})
     return dict(ncap.get("brokers", {})) if isinstance(ncap, dict) else {}
 
@@ -208,7 +208,7 @@ def _near(name: str, known: Any) -> str:
 
 
 def _line(text: str, name: str) -> str:
-    """The line on which a name first stands as a key or a table."""
+    """Return the line with the first occurrence of a name as a key or a table."""
     for number, line in enumerate(text.splitlines(), 1):
         if re.match(rf"\s*(\[[^\]]*)?['\"]?{re.escape(name)}['\"]?\s*(=|\]|\.)", line):
             return f"line {number}"

@@ -1,4 +1,4 @@
-"""What every command gets: the global options, the way results are told, and the station's store and vault."""
+"""The context of every command: the global options, the output of results, and the station's store and vault."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ else:
 _BEHIND = " [y/N]: "
 _TELLING = threading.Lock()
 SOCKET: Final = "ncap.sock"
-"""``client.SOCKET``, which is loaded where it is there."""
+"""``client.SOCKET``; that module is loaded only if the socket exists."""
 
 
 class App:
@@ -68,7 +68,7 @@ class App:
         self._passphrase: str | None = None
         self._closers: list[Callable[[], None]] = []
         self.live_line: Callable[[], None] = lambda: None
-        """Takes a live progress line away; called before anything else is told or asked."""
+        """Removes a live progress line; called before any other output or question."""
         if verbose or debug:
             _log_to_stderr(logging_level=10 if debug or verbose > 1 else 20, libraries=debug)
         App.current = self
@@ -76,7 +76,7 @@ class App:
     # -- telling ---------------------------------------------------------------------------------------------------
 
     def emit(self, result: dict[str, Any], human: Callable[[Console], None] | RenderableType | None = None) -> None:
-        """Tell a command's result: one JSON object on one line with --json, else what ``human`` prints on stdout.
+        """Print a command's result: one JSON object on one line with --json, else ``human`` on stdout.
 
         ``human`` is a rich renderable (or a str), or a function that is given the console.
         """
@@ -89,7 +89,7 @@ class App:
                 sys.stdout.flush()
 
     def lines(self, lines: Sequence[str]) -> None:
-        """Tell a part of a result that has many lines, each of them as it is to be shown."""
+        """Print a part of a result that has many lines, each of them unchanged."""
         self.live_line()
         with self._answering():
             print("\n".join(lines), flush=True)
@@ -122,7 +122,7 @@ class App:
         human: Callable[[Console], None] | RenderableType | None,
         error: TedsProvisionError | None,
     ) -> None:
-        """Tell a result and the error that it ends with, if any: with --json both in the one object."""
+        """Print a result and the error that it ends with, if any: with --json both in the one object."""
         if error is None or not self.json:
             self.emit(result, human)
             if error is not None:
@@ -138,7 +138,7 @@ class App:
         return console.CleanConsole(stderr=stderr, highlight=False, soft_wrap=not stream.isatty())
 
     def note(self, text: str, *, level: int = 0) -> None:
-        """Say something on stderr, unless --quiet (or fewer ``-v`` than ``level``); not with --json."""
+        """Print a note on stderr, unless --quiet (or fewer ``-v`` than ``level``); not with --json."""
         if not self.quiet and not self.json and self.verbose >= level:
             self.live_line()
             print_message(text)
@@ -150,9 +150,9 @@ class App:
             print_message(f"Warning: {text}")
 
     def fail_line(self, error: TedsProvisionError, **of: object) -> None:
-        """Tell an error that does not end the command (``--watch``): one JSON object, or a line on stderr.
+        """Print an error that does not end the command (``--watch``): one JSON object, or a line on stderr.
 
-        ``of`` says whose it is: uuid, time, row of a sheet; what is None is left out.
+        ``of`` has its context: uuid, time, row of a sheet; None is left out.
         """
         self.live_line()
         known = {name: value for name, value in of.items() if value is not None}
@@ -169,14 +169,14 @@ class App:
 
     @property
     def interactive(self) -> bool:
-        """Whether a person can be asked: a terminal, and neither --no-input nor --json."""
+        """True if the user can be asked: a terminal, and neither --no-input nor --json."""
         return not self.no_input and sys.stdin.isatty()
 
     def confirm(self, question: str, *, yes: bool, named: str = "") -> None:
         """Ask before something that cannot be undone; ``yes`` is the command's --yes.
 
-        ``named`` is the option that must stand beside it. Raises PolicyError where the answer is no, or nobody can be
-        asked.
+        ``named`` is the option that must be given with it. Raises PolicyError if the answer is no, or there is no
+        terminal.
         """
         if yes:
             return
@@ -226,7 +226,7 @@ class App:
 
     @property
     def has_passphrase(self) -> bool:
-        """Whether a passphrase was given by --passphrase-fd, so that nobody has to be asked."""
+        """True if a passphrase was given by --passphrase-fd, so that no prompt is needed."""
         return self._passphrase_fd is not None
 
     def ask_secret(self, prompt: str, confirm: bool = False) -> str:
@@ -239,7 +239,7 @@ class App:
         return self._typed(prompt, confirm=confirm, instead="--passphrase-fd 3 3<FILE")
 
     def ask_new(self, prompt: str) -> str:
-        """Get a new passphrase where --passphrase-fd gives the old one: from the terminal, typed twice."""
+        """Get a new passphrase if --passphrase-fd gives the old one: from the terminal, typed twice."""
         return self._typed(prompt, confirm=True, instead="--new-passphrase-fd 4 4<FILE")
 
     def _typed(self, prompt: str, *, confirm: bool, instead: str) -> str:
@@ -255,7 +255,7 @@ class App:
     # -- the station -----------------------------------------------------------------------------------------------
 
     def station(self) -> Station:
-        """Open this base station (store now, vault when a key is first needed); NotFoundError says to run init."""
+        """Open this base station (store now, vault when a key is first needed); NotFoundError points to init."""
         station = station_room.station.Station.open(self.home, ask=self.ask_secret, tell=self.warn)
         station.notice = self.note
         station.use_agent = not self.has_passphrase
@@ -281,14 +281,14 @@ class App:
 
 
 def print_message(text: str) -> None:
-    """Say something on stderr; what others wrote steers no terminal, and no word is broken at its edge."""
+    """Print on stderr; foreign text in it steers no terminal, and no word is broken at its edge."""
     with _TELLING:  # one line at a time, whatever threads there are
         sys.stderr.write(f"{folded(sanitize(text), sys.stderr)}\n")
         sys.stderr.flush()
 
 
 def _as_question(question: str) -> str:
-    """A question as it is shown, with room for what click puts behind it."""
+    """Return a question as it is shown, with room for click's suffix."""
     return folded(sanitize(question), sys.stderr, spare=len(_BEHIND))
 
 
@@ -301,7 +301,7 @@ def nowhere(stream: TextIO) -> None:
 
 
 def to_json(value: object, *, indent: int | None = None) -> str:
-    """JSON for stdout: characters as they are where it takes UTF-8, escaped where it does not."""
+    """Return JSON for stdout: characters unchanged if it takes UTF-8, else escaped."""
     wide = (sys.stdout.encoding or "utf-8").lower().replace("-", "") == "utf8"
     return sanitize_json(json.dumps(value, ensure_ascii=not wide, indent=indent))
 
@@ -341,10 +341,10 @@ _HINT: Final = "→ "
 
 
 def folded(text: str, stream: TextIO, *, spare: int = 0) -> str:
-    """The text with no line longer than the terminal behind ``stream`` is wide, less ``spare`` columns.
+    """Return the text with no line longer than the terminal behind ``stream``, less ``spare`` columns.
 
-    A word that is longer than that stays whole (the terminal breaks it), and so does a command line at the end of a
-    sentence, which begins a line of its own: what is copied from there is what is to be run.
+    A longer word stays whole (the terminal breaks it), and so does a command line at the end of a sentence, which
+    begins a separate line: a copy of it can be run.
     """
     width = _columns(stream) - spare
     if width < _NARROWEST:
@@ -353,7 +353,7 @@ def folded(text: str, stream: TextIO, *, spare: int = 0) -> str:
 
 
 def _columns(stream: TextIO) -> int:
-    """Columns of the terminal, 0 where there is none, or none that says."""
+    """Return the columns of the terminal, 0 if unknown."""
     try:
         return os.get_terminal_size(stream.fileno()).columns if stream.isatty() else 0
     except (OSError, ValueError):

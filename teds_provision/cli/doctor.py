@@ -92,7 +92,7 @@ def _settings(app: App) -> Mapping[str, Any]:
 
 
 def _give_report(app: App, document: Mapping[str, Any], path: Path, result: Mapping[str, Any]) -> None:
-    """Print the report, or write it to a new file and say where; with --json it is the member ``report``."""
+    """Print the report, or write it to a new file and name it; with --json it is the member ``report``."""
     text = json.dumps(document, indent=2, ensure_ascii=False)
     if str(path) == "-":
         if app.json:
@@ -134,7 +134,7 @@ def _print(console: Console, findings: list[Finding]) -> None:
 
 
 def known_settings(group: click.Group) -> dict[str, frozenset[str]]:
-    """Names that may stand in config.toml: under "" outside of a table, under a command's name in its table.
+    """Return valid names of config.toml: under "" outside of a table, under a command's name in its table.
 
     A name is that of an option without its dashes, written with ``-`` or ``_``. Loads every command.
     """

@@ -201,7 +201,7 @@ def _node_lines(chosen: Sequence[LeavingNode], station: Station) -> list[str]:
 
 
 def require_same(same: bool) -> None:
-    """What a person was shown must still be so under the lock."""
+    """Raise unless what the user was shown is still true under the lock."""
     if not same:
         raise PolicyError("Another command changed the plan while this one was waiting.", hint="Run it again.")
 
@@ -288,7 +288,7 @@ def import_keys(
 
 
 def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> None:
-    """Show each parcel that waits, and why; take in those that a person says yes to."""
+    """Show each waiting parcel with its reason; take in those that the user confirms."""
     plant.apply_pages.require_roster(station)
     station.unlock()
     tables, told = station.plant.parcels, list[dict[str, Any]]()
@@ -331,7 +331,7 @@ def _bundle_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def _is_sealed(file: BinaryIO) -> bool:
-    """Whether a file looks like a JWE."""
+    """True if a file looks like a JWE."""
     file.seek(0)
     before = file.read(_PIECE)
     if before.lstrip()[:1] != b"{":
@@ -342,13 +342,13 @@ def _is_sealed(file: BinaryIO) -> bool:
 
 
 def _require_as_shown(plan: ImportPlan | ImportResult, shown: ImportPlan | ImportResult) -> None:
-    """Raise PolicyError where another command changed what becomes of a node; taken in meanwhile is fine."""
+    """Raise PolicyError if another command changed the outcome of a node; nodes imported meanwhile are fine."""
     if not isinstance(plan, handover_room.incoming.ImportResult):
         require_same(not isinstance(shown, handover_room.incoming.ImportResult) and plan.nodes == shown.nodes)
 
 
 def _import_plan(plan: ImportPlan | ImportResult) -> dict[str, Any]:
-    """The result as far as it is known before anything happens."""
+    """Return the result as far as it is known before anything happens."""
     if isinstance(plan, handover_room.incoming.ImportResult):
         return _taken_before(plan)
     bundle = plan.opened.bundle
@@ -368,7 +368,7 @@ def _taken_before(done: ImportResult) -> dict[str, Any]:
 
 
 def _import_text(station: Station, plan: ImportPlan | ImportResult) -> str:
-    """The plan for people."""
+    """Return the plan for people."""
     if isinstance(plan, handover_room.incoming.ImportResult):
         return f"This bundle was imported on {plan.row.created}; there is nothing to do."
     bundle, nodes = plan.opened.bundle, plan.nodes
@@ -523,7 +523,7 @@ def receipt(app: App, file: Path) -> None:
 def _close_all(
     app: App, station: Station, files: list[Path], *, go_on: bool
 ) -> tuple[list[CloseResult], TedsProvisionError | None]:
-    """Close what each receipt closes; what was closed, and the first error where one ends not all (``go_on``)."""
+    """Close by each receipt; return what was closed, and the first error if one does not end all (``go_on``)."""
     closed: list[CloseResult] = []
     failed: TedsProvisionError | None = None
     for path in files:

@@ -87,7 +87,7 @@ def _open_for(app: App) -> str:
 
 
 def _require_same(station: Station, name: str | None, keystore: str | None) -> None:
-    """Raise UsageError where there is a station already, and the command line asks for another one."""
+    """Raise UsageError if a station exists, and the command line differs from it."""
     for what, asked, has in (("name", name, station.name), ("keystore", keystore, station.identity.keystore)):
         if asked is not None and asked != has:
             raise UsageError(
@@ -121,7 +121,7 @@ def _request(app: App, name: str | None, keystore: str | None, path: Path) -> No
 
 
 def _is_request_of(path: Path, point: bytes) -> bool:
-    """Whether the file is a request of this very station already (a token signs it differently each time)."""
+    """True if the file is a request of this very station already (a token signs it differently each time)."""
     try:
         if not path.exists():
             return False

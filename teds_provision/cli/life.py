@@ -141,7 +141,7 @@ def _result(uuid: bytes, receipt: ResetReceipt | None) -> dict[str, Any]:
 
 
 def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, force: bool) -> ResetReceipt | None:
-    """Reset the node; None where it cannot be had and that is to be recorded as unconfirmed."""
+    """Reset the node; None if it is unreachable and that is to be recorded as unconfirmed."""
     try:
         with (
             talk.meeting.meet(station, links, uuid, reporter_for(app)) as node,
@@ -210,7 +210,7 @@ def replace(
 
 
 def _takeover(plan: TakeoverPlan) -> tuple[dict[str, Any], str]:
-    """What one node takes over from another, for scripts and in a sentence."""
+    """Return what one node takes over from another, for scripts and in a sentence."""
     taken = plan.new if plan.done else plan.old
     told = {
         "old": plan.old.uuid.hex(),

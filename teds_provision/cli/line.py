@@ -157,7 +157,7 @@ def _time(text: str) -> datetime:
 
 
 def _boards(path: Path) -> dict[bytes, str]:
-    """The boards of a whitelist file, each with its whole fingerprint."""
+    """Return the boards of a whitelist file, each with its whole fingerprint."""
     listed = steps.whitelist.read_whitelist(path)
     for node in listed:
         if node.fingerprint is None or len(node.fingerprint) != 64:
@@ -224,7 +224,7 @@ def _block(text: str) -> tuple[int, int]:
 
 
 def _to_json(station: Station, found: Job) -> dict[str, Any]:
-    """A job with what became of it here; its own members as they were signed."""
+    """Return a job with its state here; its own members as they were signed."""
     row = station.plant.line.job(found.id)
     given, passed, _ = station.plant.line.count_units(found.id)
     said = found.unsigned()

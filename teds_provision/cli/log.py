@@ -83,7 +83,7 @@ def log(
 
 
 class _CountedEntries:
-    """Entries one after the other, counted as they are told: a long log is never held in memory."""
+    """Entries one after the other, counted as they are printed: a long log is never held in memory."""
 
     def __init__(self, entries: Iterable[AuditEntry]) -> None:
         self._from = entries
@@ -99,7 +99,7 @@ class _CountedEntries:
 
 
 def _tell_json(entries: _CountedEntries, verdict: AuditVerdict, after: int) -> None:
-    """One object, written as it is read; exits 7 where the chain does not hold."""
+    """Print one object, written as it is read; exits 7 if the chain is broken."""
     out = sys.stdout
     out.write('{"entries": [')
     for number, entry in enumerate(entries):
@@ -120,7 +120,7 @@ def _tell_json(entries: _CountedEntries, verdict: AuditVerdict, after: int) -> N
 
 
 def _tell_lines(app: App, entries: _CountedEntries, verdict: AuditVerdict, after: int, *, narrowed: bool) -> None:
-    """A line for each entry; where not all of them were asked for (``narrowed``), how many came."""
+    """Print a line for each entry; if only some were requested (``narrowed``), how many came."""
     sys.stdout.writelines(_line(entry) + "\n" for entry in entries)
     sys.stdout.flush()
     _require_intact(verdict)

@@ -40,7 +40,7 @@ else:
 ENVIRONMENT_PREFIX = "TEDS_PROVISION"
 INTERRUPTED, BROKEN_PIPE = 130, 141
 _NO_NAMES: Final = frozenset({errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR})
-"""What the system says of a name that somebody gave, wherever it is first looked at."""
+"""Error numbers for names that the system rejects, wherever they are first used."""
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF})
 COMPLETE = "_TEDS_PROVISION_COMPLETE"
 _WIDEST, _NARROWEST = 100, 50
@@ -49,7 +49,7 @@ _WIDEST, _NARROWEST = 100, 50
 class LazyGroup(click.Group):
     """The top group: commands are imported when they are called, help comes from the table.
 
-    ``teachers`` get each command that is loaded: there is one where a shell completes a command line.
+    ``teachers`` get each command that is loaded: there is one if a shell completes a command line.
     """
 
     teachers: ClassVar[list[Callable[[click.Command], None]]] = []
@@ -74,7 +74,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Suggest the nearest command where there is none of that name."""
+        """Suggest the nearest command if there is none of that name."""
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
@@ -86,7 +86,7 @@ class LazyGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections of the table.
 
-        Lines that fit are written as they are: click would look at each letter of them for where to break it.
+        Lines that fit are written unchanged: click would look at each letter of them for where to break it.
         """
         width = max(map(len, COMMANDS))
         for title, entries in SECTIONS.items():
@@ -100,7 +100,7 @@ class LazyGroup(click.Group):
 
 
 def _read_by_name(command: click.Command, path: str) -> None:
-    """Have each option read TEDS_PROVISION_<NAME> where the code has another name for it than the command line."""
+    """Have each option read TEDS_PROVISION_<NAME> if the code has another name for it than the command line."""
     options = {parameter: option for option, parameter in PARAMETERS.get(path, {}).items()}
     for option in command.params:
         if option.name in options and isinstance(option, click.Option):
@@ -114,7 +114,7 @@ class _Folder(click.Path):
     """A folder's path, as ``click.Path(path_type=pathlib.Path)`` gives it."""
 
     def coerce_path_result(self, value: str | os.PathLike[str]) -> Path:
-        """The path of a name."""
+        """Return the path of a name."""
         return pathlib.Path(os.fsdecode(value))
 
 
@@ -202,7 +202,7 @@ def _lacking(module: str) -> TedsProvisionError:
 
 
 def run(arguments: list[str]) -> int:
-    """Run one command line; returns the exit code. Every error is told in at most three lines."""
+    """Run one command line; return the exit code. Every error is printed in at most three lines."""
     asked = os.environ.get(COMPLETE)
     if asked:
         # Answer a shell that completes a command line (``bash_source``, ``bash_complete``, zsh, fish alike)
@@ -263,7 +263,7 @@ def _misused(arguments: list[str], error: click.ClickException) -> int:
 
 
 def _untold(arguments: list[str], error: OSError) -> int:
-    """Whoever read has gone, or the disk behind stdout is full; the work was done before it was told."""
+    """Handle lost output: the reader has gone, or the disk is full; the work was done before."""
     if isinstance(error, BrokenPipeError):
         nowhere(sys.stdout)
         return BROKEN_PIPE
@@ -292,7 +292,7 @@ def _bug(arguments: list[str], error: Exception) -> int:
 
 
 def wants_json(arguments: list[str]) -> bool:
-    """Whether a run of these arguments tells its result as JSON."""
+    """True if a run of these arguments prints its result as JSON."""
     return _wants(arguments, "--json")
 
 
@@ -336,9 +336,11 @@ _WITH_VALUE: Final = frozenset({"--home", "--passphrase-fd"})
 
 
 def in_front(arguments: Sequence[str], command_of: Callable[[str], click.Command | None]) -> list[str]:
-    """The command line with every global option before the command; what belongs to the command stays in its order.
+    """Return the command line with every global option before the command.
 
-    ``command_of`` gives a command by its name (None: there is none); it is asked only where a global option comes after
+    The command's own arguments keep their order.
+
+    ``command_of`` returns a command by its name (None: there is none); it is called only if a global option comes after
     one, so that nothing is imported without need. An option that the command has itself, and the value of one of its
     options, are left alone; so is all that follows ``--``.
     """
@@ -360,7 +362,10 @@ def in_front(arguments: Sequence[str], command_of: Callable[[str], click.Command
 
 
 def _divided(word: str, words: Iterator[str]) -> tuple[list[str], list[str]]:
-    """What goes to the front and what stays, of a word that is none of the command's own options and its value."""
+    """Return which parts of a word go to the front and which stay.
+
+    The word is none of the command's own options and its value.
+    """
     if word == "--":
         return [], [word, *words]
     name = _name(word)
@@ -380,7 +385,7 @@ def _name(word: str) -> str:
 
 
 def _command_at(arguments: Sequence[str]) -> int | None:
-    """Where the command stands: the first word that is neither an option nor the value of one."""
+    """Return the index of the command: the first word that is neither an option nor the value of one."""
     skip = False
     for at, word in enumerate(arguments):
         if skip:

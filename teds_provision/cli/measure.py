@@ -135,7 +135,7 @@ def _require_streams(links: LinkSettings, *, trigger: bool) -> None:
 
 
 def _asked(group: str, uuids: Sequence[bytes], sinks: Sequence[str], wished: Mapping[str, Any]) -> KeptMeasurement:
-    """What the command line asks for, as a group keeps it."""
+    """Return the request of the command line, as a group keeps it."""
     return KeptMeasurement(
         "",
         group=group or None,
@@ -156,7 +156,7 @@ def _asked(group: str, uuids: Sequence[bytes], sinks: Sequence[str], wished: Map
 
 
 def _wide(files: Sequence[str]) -> list[str]:
-    """The words for files of text whose rows are one grid."""
+    """Return the strings for text files whose rows are one grid."""
     text = [Path(name).suffix.lower() in measure_room.sinks.TEXT for name in files]
     if not any(text):
         raise UsageError("--wide only works with text files.", hint="Add --to FILE.csv")
@@ -164,7 +164,7 @@ def _wide(files: Sequence[str]) -> list[str]:
 
 
 def _requirements(file: Path | None) -> str:
-    """What the task needs of the datasheets, "" if no file says so; raises BadDataError if it says nothing useful."""
+    """Return the task's requirements on the datasheets, "" without a file; raises BadDataError if it has none."""
     if file is None:
         return ""
     text = read_file(file).decode(errors="replace")
@@ -173,7 +173,7 @@ def _requirements(file: Path | None) -> str:
 
 
 def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
-    """The group's name ("" where nodes are named) and the UUIDs."""
+    """Return the group's name ("" if nodes are named) and the UUIDs."""
     if len(what) == 1 and (group := station.groups.find(what[0])) is not None:
         if not group.uuids:
             raise UsageError(f"Group {group.name!r} has no nodes.", hint=f"Add one: group add {quote(group.name)} UUID")
@@ -182,7 +182,7 @@ def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
 
 
 def _carried_on(app: App, station: Station, asked: KeptMeasurement) -> KeptMeasurement:
-    """What is kept of the group, where nothing else was asked for; else what was asked for."""
+    """Return what is kept of the group, if nothing else was requested; else the request."""
     kept = station.measurements.settings_to_continue(asked.group or "")
     plain = replace(KeptMeasurement("", group=asked.group, owner=COMMAND), created=asked.created)
     if kept is None or asked != plain:

@@ -1,4 +1,4 @@
-"""What ``measure`` shows while it runs: lines of JSON, a live table on a terminal, plain lines in a pipe."""
+"""Output of a running ``measure``: lines of JSON, a live table on a terminal, plain lines in a pipe."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def watcher_for(app: App, station: Station, sinks: Sequence[Sink], stop: threadi
 
 
 class StdoutEvents(ThreadedSink):
-    """Events on stdout, written by a thread of its own: a slow pipe stops no measurement. It drops nothing."""
+    """Events on stdout, written by a thread: a slow pipe stops no measurement. It drops nothing."""
 
     recorder = True
 
@@ -61,7 +61,7 @@ class StdoutEvents(ThreadedSink):
         self._guard = threading.Lock()
 
     def report_change(self, report: NodeReport) -> None:
-        """A state that changed becomes a line."""
+        """Print a changed state as a line."""
         with self._guard:
             before = self._last.get(report.uuid)
             self._last[report.uuid] = (report.state, report.why)
@@ -69,7 +69,7 @@ class StdoutEvents(ThreadedSink):
             self.report(report)
 
     def sink(self, sink: Sink) -> None:
-        """A sink that failed, waits for its consumers, or has them again."""
+        """Print a sink that failed, waits for its consumers, or has them again."""
         stats = sink.stats
         why = stats.error or stats.detail
         with self._guard:
@@ -116,13 +116,13 @@ class PlainLines:
         self._last: dict[str, tuple[str, str]] = {}
 
     def report(self, report: NodeReport) -> None:
-        """A state that changed."""
+        """Print a changed state."""
         if self._last.get(report.uuid) != (report.state, report.why):
             self._last[report.uuid] = (report.state, report.why)
             self._app.note(f"{report.uuid}: {report.state}{f': {report.why}' if report.why else ''}")
 
     def sink(self, sink: Sink) -> None:
-        """A sink that failed, waits for its consumers, or has them again."""
+        """Print a sink that failed, waits for its consumers, or has them again."""
         stats = sink.stats
         text = f"{stats.error} {stats.hint}" if stats.error else f"{sink.name}: {stats.state}, {stats.detail}"
         self._app.warn(text.strip())
@@ -159,7 +159,7 @@ class LiveTable:
             self._reports[report.uuid] = report
 
     def sink(self, sink: Sink) -> None:
-        """A sink that failed is a line that stays; the states of the others stand below the table."""
+        """Print a failed sink as a line that stays; the states of the others are below the table."""
         if sink.stats.error:
             self._app.warn(f"{sink.stats.error} {sink.stats.hint}".strip())
 
@@ -210,7 +210,7 @@ class LiveTable:
 
 
 def in_peoples_units(value: float | None, known: ChannelFacts) -> tuple[float | None, str]:
-    """A value in SI units as people see it."""
+    """Return a value in SI units in its display unit."""
     if value is None or known.units is None:
         return value, known.unit
     number, unit = units.in_display_units(value, known.units, known.shown_unit)

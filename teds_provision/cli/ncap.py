@@ -169,10 +169,10 @@ def run(
 
 
 class DaemonLog:
-    """The daemon's lines: JSON on stdout, or sentences on stderr; a thread of their own writes them.
+    """The daemon's lines: JSON on stdout, or sentences on stderr, written by a thread.
 
-    Whoever stops reading them, a script that wanted the first one or a terminal that is held by Ctrl-S, stops nothing:
-    of more than MOST that wait the oldest go, and the next line says how many.
+    A reader that stops, a script that wanted the first one or a terminal that is held by Ctrl-S, stops nothing: of more
+    than MOST that wait the oldest go, and the next line has their number.
     """
 
     def __init__(self, app: App) -> None:
@@ -194,7 +194,7 @@ class DaemonLog:
             self._news.notify()
 
     def end(self) -> bool:
-        """Write what waits; False where nobody takes it within LEAVING seconds."""
+        """Write what waits; False if it is not read within LEAVING seconds."""
         with self._news:
             self._ending = True
             self._news.notify()
@@ -225,7 +225,7 @@ class DaemonLog:
 
 
 def _dated(told: Any) -> Any:
-    """What the API tells, its moments as everywhere on the command line: ISO 8601 in place of unix seconds."""
+    """Return the API's answer with moments as everywhere on the command line: ISO 8601 in place of unix seconds."""
     if isinstance(told, list):
         return [_dated(element) for element in told]
     if not isinstance(told, dict):

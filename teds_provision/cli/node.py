@@ -249,7 +249,7 @@ def run(
 
 
 def _check_options(count: int, source: str, *, nfc: str | None, can: str | None, ble: str | None, **_: Any) -> None:
-    """Raise UsageError where the options do not go together."""
+    """Raise UsageError if the options do not go together."""
     if not nfc and not can and not ble:
         raise UsageError(
             "A node needs a link.", hint="Add --nfc udp:localhost:54321, --can udp_multicast:239.74.163.2, or both."
@@ -339,7 +339,7 @@ def _send(bus: CanServer, node: VirtualNode, frame: DataFrame) -> None:
 
 
 def _extras(node: VirtualNode, air: BleServer | None) -> ExtraRecords:
-    """What the initial message says beside: charge, and the address in the air; and what a reader's field does."""
+    """Return the extra records of the initial message: charge, and the address in the air; and the field's effect."""
     battery = node.board.battery if node.board is not None else None
     charging = nfc_room.tnep
 
@@ -364,7 +364,7 @@ _EVERY_SECONDS = 0.05
 
 
 class ActuatorLines:
-    """Prints states in a thread of its own, from :meth:`start` on; the first line says where each one stands."""
+    """Prints states in a thread, from :meth:`start` on; the first line has each one's present state."""
 
     def __init__(self, app: App) -> None:
         self._app = app
@@ -375,7 +375,7 @@ class ActuatorLines:
         self._thread = threading.Thread(target=self._run, name="actuators", daemon=True)
 
     def observer_of(self, uuid: str) -> Callable[[ActuatorReading], None]:
-        """Where the board of a node tells its states."""
+        """Return the receiver of a board's states."""
 
         def shown(state: ActuatorReading) -> None:
             with self._condition:

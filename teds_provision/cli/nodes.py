@@ -131,7 +131,7 @@ def _with_plant(station: Station, described: Iterable[dict[str, Any]]) -> Iterat
 
 
 def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) -> None:
-    """What the stations of the plant say of nodes, those too that this one never met."""
+    """Show the stations' claims about nodes, including those that this one never met."""
     described = plant.status.nodes(station, plant.apply_pages.require_roster(station), text)
     if as_json:
         print_json_list("nodes", described)
@@ -168,7 +168,7 @@ _COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str], int], ...] = (
 
 
 def _table(described: Iterator[dict[str, Any]]) -> None:
-    """A line per node as it is read. The first rows decide the widths; a narrow terminal gets fewer columns."""
+    """Print a line per node as it is read. The first rows decide the widths; a narrow terminal gets fewer columns."""
     head = list(islice(described, _FIRST))
     widths = [max(len(title), *(len(cell(node)) for node in head)) for title, cell, _ in _COLUMNS]
     kept = _fitting(widths)
@@ -221,7 +221,7 @@ def _remarks(node: dict[str, Any]) -> str:
 
 
 def _verdict(node: dict[str, Any]) -> str:
-    """The verdict, and what it rests on; why the node is out of service goes before it."""
+    """Return the verdict, and its basis; the reason for a retired node goes before it."""
     read, retired = node["reading"], node["retired"]
     if read is None:
         return retired or node["verdict"] or "never verified"
@@ -235,7 +235,7 @@ def _verdict(node: dict[str, Any]) -> str:
 
 
 def _charge(charging: dict[str, Any] | None) -> str:
-    """What the node last said of it; nobody vouches for that."""
+    """Return the node's last charge report; unauthenticated."""
     return f"{shown(charging['text'])} (reported by the node at {local_time(charging['at'])})" if charging else ""
 
 
@@ -306,7 +306,7 @@ def label(app: App, uuid: str, output: Path) -> None:
 
 
 def show_fits(app: App, station: Station, expression: str, uuids: list[bytes]) -> None:
-    """Tell for every channel of these nodes whether it meets ``expression``, and why not."""
+    """Print for every channel of these nodes whether it meets ``expression``, and why not."""
     try:
         requirement = teds.fits.parse_fits(expression)
     except BadDataError as error:

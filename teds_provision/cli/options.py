@@ -35,7 +35,7 @@ COMMAND_SETTINGS: dict[str, Any] = {"auto_envvar_prefix": "TEDS_PROVISION"}
 
 
 def examples(*lines: str) -> str:
-    """Epilog of a command's help: lines that were run as they stand."""
+    """Return the epilog of a command's help: lines that were run unchanged."""
     return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
 
 
@@ -57,7 +57,7 @@ class Number(click.FloatRange):
 
 
 class WholeNumber(click.IntRange):
-    """A whole number within bounds; says so where it is none."""
+    """A whole number within bounds, with a matching message."""
 
     means = "whole number"
 
@@ -69,9 +69,9 @@ class WholeNumber(click.IntRange):
 
 
 class FileToRead(click.Path):
-    """A file that is read: where a folder lies there is no such file (3); what is to be written has a usage error (2).
+    """A file that is read: if a folder is there, there is no such file (3); a file to be written has a usage error (2).
 
-    ``exists``: it must be there; else whoever reads it says so.
+    ``exists``: it must exist; else its reader raises the error.
     """
 
     def __init__(self, *, exists: bool = False) -> None:
@@ -92,7 +92,7 @@ class FileToRead(click.Path):
 
 
 class ChannelNumber(WholeNumber):
-    """The number of a TransducerChannel, 1 to 255; says so where it is none."""
+    """The number of a TransducerChannel, 1 to 255, with a matching message."""
 
     name = "channel"
     means = "channel number, 1 to 255"
@@ -102,7 +102,7 @@ class ChannelNumber(WholeNumber):
 
 
 class Seconds(Number):
-    """A time in seconds; says so where it is none."""
+    """A time in seconds, with a matching message."""
 
     name = "seconds"
 
@@ -117,7 +117,7 @@ class Seconds(Number):
 
 @contextmanager
 def readers_for(via: str) -> Iterator[None]:
-    """A running base station (`ncap run`) of this home lends its readers to a command that wants one."""
+    """Borrow the readers of a running base station (`ncap run`) of this home for a command that needs one."""
     app = App.current
     if via != "nfc" or app is None or not (app.home / SOCKET).exists():
         yield
@@ -201,12 +201,12 @@ def link_options(function: Function) -> Function:
 
 
 def links_given(ctx: click.Context) -> bool:
-    """Whether an option (or setting) of this run says over which link a node is to be met."""
+    """True if an option (or setting) of this run selects the link to a node."""
     return any(ctx.get_parameter_source(name) != ParameterSource.DEFAULT for name in ("via", "nfc", "can", "ble"))
 
 
 def said_here(*names: str) -> set[str]:
-    """Which of these options stand in the command line itself, and not in config.toml or a variable."""
+    """Return which of these options were given explicitly on the command line."""
     ctx = click.get_current_context()
     return {name for name in names if ctx.get_parameter_source(name) == ParameterSource.COMMANDLINE}
 
@@ -238,9 +238,9 @@ def dry_run_option(function: Function) -> Function:
 
 @contextmanager
 def tracing(path: Path | None) -> Iterator[Trace | None]:
-    """Give the trace that ``path`` names, None for none. A command whose trace is not whole, and all else well, is 7.
+    """Yield the trace that ``path`` names, None for none. A command with an incomplete trace, and all else well, is 7.
 
-    Raises UsageError where the file is there already, NotFoundError without its folder, StoreError.
+    Raises UsageError if the file exists already, NotFoundError without its folder, StoreError.
     """
     if path is None:
         yield None

@@ -179,7 +179,7 @@ def provision(
 
 
 def _check_line(request: ProvisionRequest, job: str | None, only: str | None) -> None:
-    """Raise UsageError where a job is named beside what a job says itself."""
+    """Raise UsageError if a job is named beside an option that the job determines."""
     order = request.order
     if only is not None and job is None:
         raise UsageError("--only verify requires --job.", hint="Add --job FILE.")
@@ -236,7 +236,7 @@ def _many(app: App, boards: BatchRun, questions: Questions, screen: Screen, *, t
 
 
 def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = False) -> Questions:
-    """Whom to ask; ``strangers`` False: a yes on the command line does not add nodes that nobody named."""
+    """Return the questions to ask; ``strangers`` False: --yes does not add nodes that were not named."""
     # A board comes onto the whitelist when it has its key: one that was lost before is not asked about twice.
     accepted: set[tuple[bytes, str]] = set()
     turn = threading.Lock()  # one question at a time, however many readers there are
@@ -299,7 +299,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
 
 
 def _show_brought(app: App, brought: FactoryDatasheet) -> None:
-    """What a board says of itself, a line for each channel, and what was found."""
+    """Show a board's own datasheet, a line for each channel, and its findings."""
     app.note(f"Node {brought.image.uuid.hex()} brought its own datasheet: {brought.name or '(no name)'}")
     for channel in brought.channels[:_CHANGES_SHOWN]:
         kind = channel.kind.word if channel.kind is not None else "of unknown kind"
@@ -334,7 +334,7 @@ def _tell_plan(app: App, plan: ProvisionPlan) -> None:
 
 
 def _tell_plans(app: App, boards: BatchRun) -> None:
-    """A plan for each node of the bus that is meant, at last how many they are; the worst refusal ends the command."""
+    """Print a plan for each selected node of the bus, and finally their number; the worst refusal ends the command."""
     planned = 0
     for plan in boards.plans():
         if isinstance(plan, steps_room.batch.ProvisionPlan):
@@ -349,7 +349,7 @@ def _tell_plans(app: App, boards: BatchRun) -> None:
 
 
 def _print_result(app: App, done: ProvisionResult, *, error: TedsProvisionError | None = None, **more: object) -> None:
-    """Tell one node's end; ``error`` ends the command, ``more`` stands on the line of one of many."""
+    """Print one node's result; ``error`` ends the command, ``more`` is on the line of one of many."""
     for warning in done.warnings:
         app.warn(warning)
     units = station.shown_units.shown_units(app.station(), done.who.uuid)
@@ -391,7 +391,10 @@ def _tell_board(app: App, board: BoardResult, **line: Any) -> None:
 
 
 def _tell_one_of(app: App, boards: BatchRun, board: BoardResult) -> None:
-    """One line for one of many on a bus: ``37 of 200  8d4d…  arm 3  authentic  1.2 s``; why, where it did not pass."""
+    """Print one line for one of many on a bus: ``37 of 200  8d4d…  arm 3  authentic  1.2 s``.
+
+    With the reason of a failure.
+    """
     name = station.summary.summarise(board.done.image).name if board.done is not None else None
     words = board.done.verified.verdict if board.result == "passed" and board.done is not None else board.result
     place = f"{boards.ended:>{len(str(boards.expected))}} of {boards.expected}"
@@ -500,17 +503,17 @@ class BatchState(Protocol):
 
     @property
     def of_a_job(self) -> bool:
-        """Whether a job counts them, and no sheet: any board may be the next one."""
+        """True if a job counts them, and no sheet: any board may be the next one."""
 
     def row(self, number: int) -> SheetRow:
-        """The row of that number."""
+        """Return the row of that number."""
 
     def board_of(self, row: SheetRow) -> str | None:
         """UUID of the board that had a row before."""
 
 
 class Screen(Protocol):
-    """Where the end of each board is shown; ``tells``: so that nothing else needs to be printed of it."""
+    """Display of each board's end; ``tells``: nothing else needs to be printed about it."""
 
     tells: bool
 
@@ -527,27 +530,27 @@ class _NoScreen:
     tells = False
 
     def ended(self, board: BoardResult) -> None:
-        """Lines were told already."""
+        """No-op: already printed."""
 
     def close(self) -> None:
         """Nothing to give back."""
 
 
 class BoardReporter:
-    """A reporter that also says when a board is begun: its first step is to identify it."""
+    """A reporter that also reports a new board: its first step is to identify it."""
 
     def __init__(self, inner: Reporter) -> None:
         self._inner = inner
         self.begun: Callable[[], None] = lambda: None
 
     def started(self, step: str) -> None:
-        """A step begins."""
+        """Report the start of a step."""
         if step == "identify":
             self.begun()
         self._inner.started(step)
 
     def finished(self, step: StepResult) -> None:
-        """A step ended well."""
+        """Report a step that ended well."""
         self._inner.finished(step)
 
     def notice(self, notice: Notice) -> None:
@@ -560,7 +563,7 @@ class BoardReporter:
 
 
 class OperatorScreen:
-    """Drawn anew when a board is begun and when it ends, on stderr; ``live_line`` takes away what runs below it."""
+    """Redrawn when a board is begun and when it ends, on stderr; ``live_line`` removes what runs below it."""
 
     def __init__(self, console: Console, boards: BatchState, live_line: Callable[[], None] = lambda: None) -> None:
         self.tells = sys.stdout.isatty()  # a file or a pipe gets its lines all the same
@@ -569,7 +572,7 @@ class OperatorScreen:
         self._draw(">>> ", self._next())
 
     def begun(self) -> None:
-        """A board lies on the reader: what stood there of the one before counts no more."""
+        """Clear the previous board's lines: a new board is on the reader."""
         self._draw(">>> ", "KEEP THE BOARD ON THE READER", word=("WAIT", "black on yellow"))
 
     def ended(self, board: BoardResult) -> None:
@@ -580,7 +583,7 @@ class OperatorScreen:
         self._draw(">>> TAKE IT OFF. ", self._next(), word=word, board=board)
 
     def close(self) -> None:
-        """Leave what stands there."""
+        """Leave the present display."""
 
     def _draw(
         self, mark: str, now: str, *, word: tuple[str, str] | None = None, board: BoardResult | None = None
@@ -620,7 +623,7 @@ class OperatorScreen:
             self._line(f"Warning: {board.done.warnings[0]}", style="yellow")
 
     def _line(self, text: str, *, style: str) -> None:
-        """One line, cut with an ellipsis where the terminal ends."""
+        """Print one line, cut with an ellipsis at the terminal's edge."""
         from rich.text import Text
 
         self._console.print(Text(sanitize(text).rstrip()), style=style, no_wrap=True, overflow="ellipsis")
@@ -644,13 +647,13 @@ class OperatorScreen:
 
 
 def _clock(moment: str) -> str:
-    """The time of day here, of a moment in UTC."""
+    """Return the local time of day of a moment in UTC."""
     return datetime.fromisoformat(moment).astimezone().strftime("%H:%M:%S")
 
 
 @contextmanager
 def screen_for(app: App, boards: BatchRun, reporter: BoardReporter | None = None) -> Iterator[Screen]:
-    """The operator's screen on a terminal with a sheet, else none; ``reporter`` tells it when a board is begun."""
+    """Yield the operator's screen on a terminal with a sheet, else none; ``reporter`` notifies it of each new board."""
     if app.json or app.quiet or not len(boards) or not sys.stderr.isatty():
         yield _NoScreen()
         return

@@ -154,7 +154,7 @@ def _events(shown: Block | GroupRows, summary: RecordingSummary) -> Iterator[str
 
 
 def _values(shown: Block | GroupRows, summary: RecordingSummary) -> Iterator[str]:
-    """A line for each instant, in the units for people."""
+    """Yield a line for each instant, in display units."""
     keys = shown.keys
     known = [summary.facts.get(key) or measure_room.blocks.ChannelFacts(key[0], "", key[1], "") for key in keys]
     names = [rendering.shown(f"{facts.node or facts.uuid}/{facts.label}") for facts in known]

@@ -1,4 +1,4 @@
-"""``registry``: the plant, that is many stations of one owner that tell each other what they did."""
+"""``registry``: the plant, that is many stations of one owner that exchange what they did."""
 
 from __future__ import annotations
 
@@ -462,7 +462,7 @@ def disconnect(app: App, yes: bool, dry_run: bool) -> None:
 
 
 def _post(station: Station, files: Path | None) -> tuple[Transport, bool]:
-    """What carries, and whether it is what this station joined by."""
+    """Return the transport, and True if it is the one by which this station joined."""
     joined = plant.connecting.open_transport(station)
     if files is not None:
         named = plant.folder_transport.FolderTransport(files)

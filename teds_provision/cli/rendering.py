@@ -34,24 +34,24 @@ def count_of(number: int) -> str:
 
 
 def first_lines(lines: list[str], most: int, count: int) -> list[str]:
-    """The first lines of a list of so many, and how many more there are."""
+    """Return the first lines of a list of so many, and how many more there are."""
     return [*lines[:most], f"  … and {count - most} more"] if count > most else lines
 
 
 def shown(text: str | None) -> str:
-    """A name or remark from outside, fit for a terminal: what cannot be printed becomes ``?``."""
+    """Return foreign text, fit for a terminal: unprintable characters become ``?``."""
     return "".join(character if character.isprintable() else "?" for character in text or "")
 
 
 def tidy(value: float, uncertainty: float | None) -> float:
-    """A measured value for people: no digits below a thousandth of its uncertainty, and a zero is 0."""
+    """Return a measured value for people: no digits below a thousandth of its uncertainty, and a zero is 0."""
     if uncertainty is None or not 0 < uncertainty < math.inf or not math.isfinite(value):
         return value
     return round(value, 3 - math.floor(math.log10(uncertainty))) + 0.0
 
 
 def local_time(text: str) -> str:
-    """A moment of the store (UTC) in local time with its offset; anything else as it is."""
+    """Return a moment of the store (UTC) in local time with its offset; anything else unchanged."""
     try:
         return datetime.fromisoformat(text).astimezone().isoformat(sep=" ", timespec="seconds")
     except (ValueError, OverflowError):  # a moment that a stranger wrote: the last day of 9999, east of Greenwich
@@ -59,9 +59,9 @@ def local_time(text: str) -> str:
 
 
 def print_json_list(name: str, entries: Iterable[dict[str, Any]]) -> None:
-    """One JSON object with one list, written to stdout as it is made: a long list takes no memory.
+    """Print one JSON object with one list to stdout as it is made: a long list takes no memory.
 
-    An error in the middle stands in the same object, behind what came before it; then raises Exit with its code.
+    An error in the middle is in the same object, behind what came before it; then raises Exit with its code.
     """
     out = sys.stdout
     wide = (out.encoding or "utf-8").lower().replace("-", "") == "utf8"
@@ -92,7 +92,7 @@ def print_table(console: Console, table: Table) -> None:
 
 
 def reporter_for(app: App, *, several: bool = False) -> Reporter:
-    """The reporter that suits this run: silent for --json and --quiet, lines in a pipe, live on a terminal.
+    """Return the reporter for this run: silent for --json and --quiet, lines in a pipe, live on a terminal.
 
     ``several`` nodes are worked on at once: their lines come between each other.
     """
@@ -113,21 +113,21 @@ class LineReporter:
         self._last = ""
 
     def started(self, step: str) -> None:
-        """Say nothing: a line comes when the step is done."""
+        """Do nothing: a line comes when the step is done."""
 
     def finished(self, step: StepResult) -> None:
-        """Tell the step in one line."""
+        """Print the step in one line."""
         self._app.note(line_of(step))
 
     def notice(self, notice: Notice) -> None:
-        """Tell a notice once."""
+        """Print a notice once."""
         if notice.text != self._last:
             self._last = notice.text
             until = f" (up to {notice.seconds:.0f} s)" if notice.seconds is not None else ""
             self._app.note(f"… {notice.text}{until}")
 
     def written(self, octets: int, total: int) -> None:
-        """Say nothing: too many lines."""
+        """Do nothing: too many lines."""
 
 
 def line_of(step: StepResult) -> str:

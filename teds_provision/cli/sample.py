@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 
 def over_the_bus(links: LinkSettings, *, streams: bool = False) -> LinkSettings:
-    """The links of a command for which a bus that is named is meant, also without ``--via can``.
+    """Return the links of a command for which a named bus is meant, also without ``--via can``.
 
-    What stands in this command line goes before a reader that is named in config.toml or a variable. ``streams``: so
-    does every bus that is named, as a reader carries none.
+    A bus on this command line takes precedence over a reader in config.toml or a variable. ``streams``: so does every
+    named bus, as a reader carries none.
     """
     said = said_here("via", "nfc", "can", "ble")
     bus = _bus_meant(links, said)
@@ -48,14 +48,14 @@ def over_the_bus(links: LinkSettings, *, streams: bool = False) -> LinkSettings:
 
 
 def _bus_meant(links: LinkSettings, said: set[str]) -> str | None:
-    """The bus, or the air, that is named; of both the one that stands in the command line, else the bus."""
+    """Return the bus, or the air, that is named; of both the one on the command line, else the bus."""
     named = [name for name, given in (("can", links.can), ("ble", links.ble)) if given]
     here = [name for name in named if name in said]
     return next(iter(here or named), None)
 
 
 def where_met(station: Station, links: LinkSettings, uuids: Sequence[bytes]) -> LinkSettings:
-    """The links with the bus where these nodes were met last, where nobody names one; all of them on the same kind."""
+    """Return the links with the bus of these nodes' last contact, if none is named; all of them on the same kind."""
     places = talk.meeting.likely_places(station, links, uuids)
     kinds = {place.partition(":")[0] for place in places}
     if len(kinds) != 1:
@@ -66,7 +66,7 @@ def where_met(station: Station, links: LinkSettings, uuids: Sequence[bytes]) -> 
 
 @contextmanager
 def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes, *, by: str) -> Iterator[VerifiedSession]:
-    """A node in a session, its datasheet verified for the command ``by``; left in order."""
+    """Yield a node in a session, its datasheet verified for the command ``by``; left in order."""
     reporter = reporter_for(app)
     with talk.meeting.meet(station, over_the_bus(links), uuid, reporter, before=lambda: station.unlock(uuid)) as node:
         try:
@@ -156,7 +156,7 @@ def words(state: int) -> list[str]:
 
 
 def _charging(station: Station, node: Conversation) -> dict[str, Any] | None:
-    """What it says of its charge where it was tapped, else what it last said, with the time; a hint."""
+    """Return the charge from a tap, else the last report, with the time; a hint."""
     if node.contact.charging is not None:
         return dict(node.contact.charging.to_json())
     known = station.nodes.get(node.uuid)
@@ -254,7 +254,7 @@ def set_value(
 
 
 def _require_unit(app: App, channel: Channel, value: float, unit: str | None) -> None:
-    """Refuse a bare number of a person where the unit that this channel is shown in is not SI: 45 would be radians."""
+    """Refuse a bare number if this channel's display unit is not SI: 45 would be radians."""
     if unit is None and app.interactive and channel.shown.text != channel.si_unit:
         raise UsageError(
             f"Without --unit, {value:g} means {value:g} {channel.si_unit}, but channel {channel.number} is shown in "
@@ -265,10 +265,10 @@ def _require_unit(app: App, channel: Channel, value: float, unit: str | None) ->
 
 @contextmanager
 def ending(stop: IdleStop) -> Iterator[None]:
-    """The first Ctrl-C or SIGTERM ends in order, a second one at once with 130.
+    """End in order at the first Ctrl-C or SIGTERM, at once with 130 at a second one.
 
-    So does a terminal that is closed (SIGHUP, twice where the shell passes it on), unless nohup has it ignored: a
-    recording gets its end, and nodes are let go at once.
+    So does a terminal that is closed (SIGHUP, twice if the shell passes it on), unless nohup has it ignored: a
+    recording gets its end, and nodes are released at once.
     """
 
     def end(*_: object) -> None:

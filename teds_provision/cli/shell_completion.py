@@ -1,7 +1,7 @@
-"""What a shell is offered where a node, a group, a profile, a station or a file is meant; quick however many there are.
+"""Completions for a node, a group, a profile, a station or a file; quick however many there are.
 
-Names come from nodes, bundles and sheets that others wrote. What a shell inserts is quoted by the shell itself: a name
-with spaces stays one word, and one with ``$(…)`` runs nothing.
+Names come from foreign nodes, bundles and sheets. The shell itself quotes what it inserts: a name with spaces stays one
+word, and one with ``$(…)`` runs nothing.
 """
 
 from __future__ import annotations
@@ -64,19 +64,19 @@ complete -o nosort -F %(complete_func)s %(prog_name)s
 
 
 class Bash(BashComplete):
-    """Bash, which inserts what it is offered as it stands: the script quotes it as the word was begun."""
+    """Bash, which inserts completions unchanged: the script quotes them as the word was begun."""
 
     name: ClassVar[str] = "bash"
     source_template: ClassVar[str] = _BASH
 
 
 class Zsh(ZshComplete):
-    """zsh, in whose lists a backslash in front of a character stands for that character."""
+    """zsh, in whose lists a backslash in front of a character means that character."""
 
     name: ClassVar[str] = "zsh"
 
     def format_completion(self, item: CompletionItem) -> str:
-        """One word with what it is; nothing is to be escaped where there is no description."""
+        """Return one word with its description; without a description nothing needs escaping."""
         if not item.help:
             return super().format_completion(item)
         return super().format_completion(CompletionItem(item.value.replace("\\", "\\\\"), item.type, item.help))
@@ -128,7 +128,7 @@ def _home(ctx: click.Context) -> Path:
 def _items(
     ctx: click.Context, found: Callable[[station_room.station.Station], Iterable[tuple[str, str]]]
 ) -> list[CompletionItem]:
-    """What the store knows, each word with what it is; nothing where there is no store, and no word of two lines."""
+    """Return completions from the store, each with a description; empty without a store, and no word of two lines."""
     try:
         station = station_room.station.Station.open(_home(ctx), ask=_nobody)
     except TedsProvisionError:
@@ -143,7 +143,7 @@ def _items(
 
 
 def _nodes(ctx: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """UUIDs and names of known nodes, groups where they are measured, and files where they are taken."""
+    """Return UUIDs and names of known nodes, groups where they are measured, and files where they are taken."""
     groups = _groups(ctx, parameter, incomplete) if parameter.name == "what" else []
     nodes = _items(ctx, lambda station: station.nodes.beginning_with(incomplete, _MOST))
     return [*groups, *nodes] or _files(ctx, parameter, incomplete)
@@ -166,7 +166,7 @@ def _stations(ctx: click.Context, _parameter: click.Parameter, incomplete: str) 
 
 
 def _named(ctx: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """An argument NAME: whose name it is says the command."""
+    """Return completions for an argument NAME; the command determines the kind of name."""
     path = ctx.command_path.partition(" ")[2]
     if path in ("group add", "group remove", "group delete"):
         return _groups(ctx, parameter, incomplete)

@@ -294,12 +294,12 @@ _OTHERS: Final = {
     b"\n\r\r\n": ("a trace (pcapng)", "teds-provision trace show {}"),
     b'{"format": "teds-trace/': ("a trace", "teds-provision trace show {}"),
 }
-"""What other files of this program begin with, what they are, and the command that reads them."""
+"""First characters of this program's other files, their kinds, and the command that reads them."""
 
 
 @dataclass(frozen=True)
 class ShownFile:
-    """One file: its TEDS, or the message or the bundle's header that it holds; ``notes`` are said on stderr."""
+    """One file: its TEDS, or the message or the bundle's header that it holds; ``notes`` go to stderr."""
 
     name: str
     kind: Kind
@@ -319,7 +319,7 @@ class ShownFile:
 
     @property
     def malformed(self) -> bool:
-        """Whether the tuples of a TEDS do not even close, or a message is none."""
+        """True if the tuples of a TEDS do not even close, or a message is malformed."""
         unreadable = self.message is not None and self.message.kind == "unknown"
         return unreadable or any(shown.decoded.verdict is Conformity.MALFORMED for shown in self.teds)
 
@@ -342,7 +342,7 @@ def read_file(name: str) -> bytes:
 
 
 def load(name: str, edition: Edition | None = None) -> ShownFile:
-    """Read one file and put it into words, converted to ``edition`` where one is asked."""
+    """Read and describe one file, converted to ``edition`` if one is given."""
     bundle = _long_bundle(name)
     if bundle is not None:
         return ShownFile(name, "bundle", bundle=bundle)
@@ -365,7 +365,7 @@ def load(name: str, edition: Edition | None = None) -> ShownFile:
 
 
 def _long_bundle(name: str) -> BundleHeader | None:
-    """The header of a bundle that is longer than any file of TEDS, read piece by piece; None for everything else."""
+    """Return the header of a bundle that is longer than any file of TEDS, read piece by piece; else None."""
     try:
         if name == STDIN or os.stat(name).st_size <= LIMITS.teds_file:  # a pipe has none, and is opened once
             return None
@@ -381,7 +381,7 @@ def _long_bundle(name: str) -> BundleHeader | None:
 
 
 def _no_teds(name: str, octets: bytes, why: str) -> BadDataError:
-    """The error for a file of another kind: what it is, and which command reads it, where its first octets tell."""
+    """Return the error for a file of another kind, with the command for it if its first octets show it."""
     for head, (what, reader) in _OTHERS.items():
         if octets.startswith(head):
             return BadDataError(f"{name} holds no TEDS: it is {what}.", hint=f"Read it with: {reader.format(name)}")
@@ -389,7 +389,7 @@ def _no_teds(name: str, octets: bytes, why: str) -> BadDataError:
 
 
 def _of_file(name: str, kind: Kind | None, error: BadDataError) -> BadDataError:
-    """What is wrong with a file, with its name before it."""
+    """Return the error of a file, with its name before it."""
     if kind == "hex" and "Line 1 holds" in error.message:  # whatever is text and nothing else is taken for hex
         return BadDataError(
             f"{name} holds no TEDS: it is neither binary nor hex (read as hex: {error.message[:1].lower()}"
@@ -412,7 +412,7 @@ def _described(name: str, kind: Kind, blocks: Sequence[TedsBlock], edition: Edit
 
 
 def is_message(octets: bytes) -> bool:
-    """Whether octets are a message rather than a TEDS."""
+    """True if octets are a message rather than a TEDS."""
     if looks_like_message(octets):
         return True
 
@@ -468,7 +468,7 @@ def guard_to_json(finding: GuardFinding) -> dict[str, Any]:
 
 
 def to_json(files: Sequence[ShownFile]) -> dict[str, Any]:
-    """Return ``{"format": "teds/1", "teds": […]}``; the keys of a lone TEDS (or message) stand on top as well."""
+    """Return ``{"format": "teds/1", "teds": […]}``; the keys of a lone TEDS (or message) are at the top as well."""
     entries = [entry for file in files for entry in _entries(file)]
     bundles = [{"file": file.name, **asdict(file.bundle)} for file in files if file.bundle is not None]
     out: dict[str, Any] = dict(entries[0]) if len(entries) == 1 else {}

@@ -46,7 +46,7 @@ def start(app: App, ctx: click.Context) -> None:
 
 
 def _named(ctx: click.Context) -> LinkSettings:
-    """The links that config.toml or the environment names for every command."""
+    """Return the links that config.toml or the environment names for every command."""
 
     def of(name: str) -> tuple[str, ...]:
         said = os.environ.get(f"TEDS_PROVISION_{name.upper()}") or (ctx.default_map or {}).get(name) or ()
@@ -66,7 +66,7 @@ def _station(station: Station) -> dict[str, Any]:
 
 
 def _of_links(station: Station, named: LinkSettings) -> dict[str, Any]:
-    """Ask on the links themselves: those that are named, else where nodes were met last, and readers that are there."""
+    """Ask on the links themselves: the named ones, else those of the last contacts, and present readers."""
     known = [node["uuid"] for node in steps.inventory.inventory(station, steps.inventory.search(station))]
     remembered = sorted(set(station.nodes.last_places([bytes.fromhex(uuid) for uuid in known]).values()))
     places = [place for place in named.places if named.nfc] + list(named.buses or remembered)
@@ -102,7 +102,7 @@ def _node(station: Station, place: str, address: int, who: Any) -> dict[str, Any
 
 
 def _of_service(app: App, station: Station) -> dict[str, Any] | None:
-    """What a running `ncap` of this home sees, which looks at its links all the time; None where none runs."""
+    """Return what a running `ncap` of this home sees, which watches its links all the time; None if none runs."""
     if not (app.home / SOCKET).exists():
         return None
     try:
@@ -145,7 +145,7 @@ def _of_service(app: App, station: Station) -> dict[str, Any] | None:
 
 
 def _next(found: dict[str, Any]) -> str:
-    """The one command that most likely comes next: a fault before new boards, new boards before work."""
+    """Return the command that most likely comes next: a fault before new boards, new boards before work."""
     mute = (
         [link for link in found["links"] if link["state"] == "up" and not link["nodes"]] if not found["nodes"] else []
     )

@@ -1,8 +1,8 @@
-"""stdout as it may be: closed, full, or a pipe whose reader went away. None of them may undo or hide what was done.
+"""stdout that may be closed, full, or a pipe without a reader. None of them may undo or hide what was done.
 
-A closed descriptor is taken by /dev/null before a file could get its number, and be written into. What a full disk
-does not take is dropped and remembered: the command goes on to its own end. A broken pipe raises, so that a command
-that would tell for hours ends at once.
+A closed descriptor is replaced by /dev/null before a file could get its number, and be written into. Output that a full
+disk refuses is dropped and recorded: the command goes on to its own end. A broken pipe raises, so that a command with
+hours of output ends at once.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _STEERING: Final = (
 
 
 class GuardedOutput(io.FileIO):
-    """Descriptor 1; ``failure`` is why something could not be told, "" as long as all was."""
+    """Descriptor 1; ``failure`` is why output was lost, "" as long as none was."""
 
     failure = ""
 
     def write(self, octets: Any, /) -> int:
-        """Write what has octets (bytes, a memoryview), or note why not; raises BrokenPipeError where nobody reads."""
+        """Write octets (bytes, a memoryview), or record why not; raises BrokenPipeError without a reader."""
         try:
             return super().write(octets)
         except BrokenPipeError:
@@ -40,9 +40,9 @@ class GuardedOutput(io.FileIO):
 
 
 class CleanText(io.TextIOWrapper):
-    """Text for stdout, with escapes in the place of what would steer a terminal or turn what people read.
+    """Text for stdout, with escapes in place of characters that steer a terminal or reverse text.
 
-    In JSON such an escape says the same. ESC itself stays, as colours need it: whoever prints names takes it out
+    In JSON such an escape means the same. ESC itself stays, as colours need it: code that prints names removes it
     (:mod:`teds_provision.sanitize`), and JSON never holds it.
     """
 
@@ -56,7 +56,7 @@ class CleanText(io.TextIOWrapper):
 
 
 def guard() -> GuardedOutput | None:
-    """Put guarded output in the place of ``sys.stdout``; None where it is not a plain descriptor (a test's own)."""
+    """Put guarded output in the place of ``sys.stdout``; None if it is not a plain descriptor (a test's own)."""
     for _ in range(3):  # the lowest free number is given first: 0, 1, 2, as far as they are closed
         descriptor = os.open(os.devnull, os.O_RDWR)
         if descriptor > 2:
@@ -83,8 +83,7 @@ def guard() -> GuardedOutput | None:
 def ended(code: int, output: GuardedOutput | None, *, as_json: bool) -> int:
     """Write out what is left and return the exit code: ``code``, or 141 for a broken pipe.
 
-    Where the one JSON object could not be told, and all else went well, 7: whoever reads it must not take silence for
-    a result.
+    If the one JSON object was lost, and all else went well, 7: a reader must not take silence for a result.
     """
     try:
         sys.stdout.flush()

@@ -1,4 +1,4 @@
-"""Every command of the tool: where its code lives and its line in ``--help``.
+"""Every command of the tool: its module and its line in ``--help``.
 
 The group's help is drawn from this table alone, so that ``--help`` imports no command and none of their libraries.
 """
@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 
 class Entry(NamedTuple):
-    """Where a command lives (module under ``teds_provision.cli``, attribute) and its one-line help."""
+    """Place of a command (module under ``teds_provision.cli``, attribute) and its one-line help."""
 
     module: str
     attribute: str
@@ -89,7 +89,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "node": Entry("node", "node", "Create and run virtual nodes; check a real board's firmware."),
     },
 }
-"""What ``--help`` lists; a name of two words is a line of help only: its first word stands below as a command."""
+"""Sections of ``--help``; a name of two words is a line of help only: its first word is below as a command."""
 
 COMMANDS: Final = {name: entry for section in SECTIONS.values() for name, entry in section.items() if " " not in name}
 GROUPS: Final = frozenset(

@@ -104,7 +104,7 @@ def _candidates(
     role: Literal["station", "ca"],
     fingerprint: str | None,
 ) -> list[Candidate]:
-    """The keys that are meant: NAME and FILE, held against ``fingerprint`` where one is given, or all of a folder."""
+    """Return the selected keys: NAME and FILE, compared with ``fingerprint`` if one is given, or all of a folder."""
     if folder is not None and (name is not None or fingerprint is not None):
         raise click.UsageError("--from DIR cannot be combined with NAME or --fingerprint.")
     if folder is not None:
@@ -187,7 +187,7 @@ def _ends(removal: Removal) -> dict[str, Any]:
 
 
 def _ended(removal: Removal) -> list[str]:
-    """What ends with it, for people."""
+    """Return what ends with it, for people."""
     lines = []
     if removal.shared:
         lines.append(f"  {count_of(len(removal.shared))} whose key it holds: to be rotated at the next contact")

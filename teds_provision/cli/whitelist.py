@@ -74,7 +74,7 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
 
 
 def _meant(station: Station, uuid: str) -> bytes:
-    """The UUID, or the one that stands for an EUI-64 of which no node is known by its first digits."""
+    """Return the UUID, or that of an EUI-64 if its first digits match no known node."""
     try:
         return plant.status.resolve(station, uuid)
     except NotFoundError:
@@ -200,6 +200,6 @@ def _emit_plan(app: App, station: Station, plan: WhitelistPlan, *, dry_run: bool
 
 
 def _emit(app: App, station: Station, text: str, **more: Any) -> None:
-    """Tell a change in one line; with --json the whole whitelist as it stands now."""
+    """Print a change in one line; with --json the whole whitelist as it is now."""
     listed = [steps.whitelist.as_dict(entry) for entry in station.pins.whitelist()] if app.json else []
     app.emit({"whitelist": listed, **more}, lambda console: console.print(text, markup=False))
