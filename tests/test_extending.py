@@ -44,7 +44,7 @@ def follow(page: str, folder: Path) -> list[str]:
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("house")
     for part in ("teds_provision", "tests", "scripts", "docs", "profiles"):
-        shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / part, folder / part)  # what is compiled as well
     for file in ("pyproject.toml", "Makefile"):
         shutil.copy(ROOT / file, folder)
     follow((ROOT / "docs" / "extending.md").read_text(), folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -62,6 +63,7 @@ PACKAGE = ROOT / "teds_provision"
 ROLE = re.compile(r":(mod|func|class|meth|data|attr|exc):`~?([^`]+)`")
 
 
+@cache
 def defined(path: Path) -> set[str]:
     """Functions, classes and constants that a file makes."""
     found = set()
@@ -121,10 +123,12 @@ def test_the_glossary_names_files_that_exist_and_defines_each_word_once() -> Non
 
 def unknown_roles(path: Path, text: str, every: set[str]) -> list[str]:
     """References such as :func:`name` to what neither the file knows nor, with a dot, the package."""
-    known = {node.id for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Name)} | defined(path)
+    if not ROLE.search(text):
+        return []
+    known = set(defined(path))
     for node in ast.walk(ast.parse(text)):
         match node:
-            case ast.Attribute(attr=name) | ast.arg(arg=name):
+            case ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name):
                 known.add(name)
             case ast.alias(name=name, asname=other):
                 known.add((other or name).rpartition(".")[2])

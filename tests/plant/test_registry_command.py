@@ -1,4 +1,7 @@
-"""``registry`` as its keepers use it: three stations, each command a process, and a stick between them."""
+"""``registry`` as its keepers use it: three stations and a stick between them.
+
+They join as users do, each command a process; after that a command is a call in this process.
+"""
 
 from __future__ import annotations
 
@@ -26,14 +29,20 @@ class Desk:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.stick = folder, folder / "stick"
-        self.stick.mkdir()
-        north = owner(folder / "north")
+        self.forks = False
+
+    def lay_out(self) -> None:
+        """Make the stick and three stations that have joined nothing."""
+        self.stick.mkdir(parents=True)
+        north = owner(self.folder / "north")
         for name in ("south", "west"):
-            certified(folder / name, name, north).close()
+            certified(self.folder / name, name, north).close()
         north.close()
 
     def run(self, station: str, *words: object) -> Outcome:
-        return spawn("--home", self.folder / station, *words, passphrase=PASSPHRASE)
+        if self.forks:
+            return spawn("--home", self.folder / station, *words, passphrase=PASSPHRASE)
+        return call(self.folder / station, *words)
 
     def ask(self, station: str, *words: object, code: int = 0) -> dict[str, object]:
         done = self.run(station, "--json", *words)
@@ -45,12 +54,40 @@ class Desk:
         return [self.ask(station, "registry", "sync", "--files", self.stick, code=code) for station in stations][-1]
 
 
+@pytest.fixture(scope="module")
+def as_made(tmp_path_factory: pytest.TempPathFactory) -> Desk:
+    """A desk as it is laid out, and beside it as it is when all have joined: what each test gets a copy of.
+
+    A station keeps the path of its stick, so that each copy is put into the same folder.
+    """
+    place = tmp_path_factory.mktemp("desks") / "desk"
+    made = Desk(place)
+    made.lay_out()
+    shutil.copytree(place, place.with_name("laid out"))
+    made.forks = True
+    join_all(made)
+    made.forks = False
+    shutil.copytree(place, place.with_name("joined"))
+    return made
+
+
+def put(made: Desk, state: str) -> None:
+    """Put the desk back into a state that was kept of it."""
+    shutil.rmtree(made.folder)
+    shutil.copytree(made.folder.with_name(state), made.folder)
+
+
 @pytest.fixture
-def desk(tmp_path: Path) -> Desk:
-    return Desk(tmp_path)
+def desk(as_made: Desk) -> Desk:
+    put(as_made, "laid out")
+    return as_made
 
 
 def joined(desk: Desk) -> None:
+    put(desk, "joined")
+
+
+def join_all(desk: Desk) -> None:
     made = desk.ask("north", "registry", "create", "--name", "plant Augsburg", "--yes")
     assert made["version"] == 1
     for name, roles in (("south", ["base"]), ("west", ["line", "sign"])):
@@ -182,10 +219,10 @@ def test_a_station_that_the_roster_does_not_name_cannot_join(desk: Desk) -> None
     assert "registry request" in done.err
 
 
-def test_a_station_of_another_ca_is_not_added(desk: Desk, tmp_path: Path) -> None:
-    owner(tmp_path / "stranger", "stranger").close()
+def test_a_station_of_another_ca_is_not_added(desk: Desk) -> None:
+    owner(desk.folder / "stranger", "stranger").close()
     desk.ask("north", "registry", "create", "--name", "plant", "--yes")
-    asked = tmp_path / "stranger.request"
+    asked = desk.folder / "stranger.request"
     desk.ask("stranger", "registry", "request", "--output", asked)
     done = desk.run("north", "registry", "add", asked, "--role", "base", "--yes")
     assert done.code == 6
