@@ -83,10 +83,10 @@ _EXIT_BY_STATUS: Final = {
 
 
 def _is_over(connection: http.client.HTTPConnection) -> bool:
-    """True if the base station has ended a connection that was kept open: after half a minute, or with its process.
+    """Return True if the base station has ended a connection that was kept open.
 
-    Between two requests only its end can arrive. A change that is sent on it would fail, and could not be sent again,
-    as it might have been done.
+    It does so after half a minute, or with its process. Between two requests only its end can arrive. A change that is
+    sent on it would fail, and could not be sent again, as it might have been done.
     """
     if connection.sock is None:
         return False

@@ -277,7 +277,10 @@ def _below(folder: str) -> Iterator[str]:
 
 
 def _is_folder(entry: os.DirEntry[str]) -> bool:
-    """True if it is a folder itself; the directory entry knows that already, so that most need no look at the disk."""
+    """Return True if it is a folder itself.
+
+    The directory entry knows that already, so that most need no look at the disk.
+    """
     try:
         return entry.is_dir(follow_symlinks=False)
     except OSError:
@@ -285,7 +288,7 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 
 def _is_file(entry: os.DirEntry[str]) -> bool:
-    """True if it is a file, or a link to one."""
+    """Return True if it is a file, or a link to one."""
     try:
         return entry.is_file()
     except OSError:
@@ -293,7 +296,10 @@ def _is_file(entry: os.DirEntry[str]) -> bool:
 
 
 def holds(path: Path, octets: bytes) -> bool:
-    """True if a regular file holds exactly these octets; reads no more of it than their length. Raises OSError."""
+    """Return True if a regular file holds exactly these octets; reads no more of it than their length.
+
+    Raises OSError.
+    """
     if not path.is_file():
         return False
     with open_to_read(path) as file:

@@ -78,7 +78,7 @@ def _common(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_command(path: str) -> bool:
-    """True if there is such a command, or a group of commands with options."""
+    """Return True if there is such a command, or a group of commands with options."""
     return path in OPTIONS or any(name.startswith(f"{path} ") for name in OPTIONS)
 
 

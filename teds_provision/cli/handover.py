@@ -331,7 +331,7 @@ def _bundle_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def _is_sealed(file: BinaryIO) -> bool:
-    """True if a file looks like a JWE."""
+    """Return True if a file looks like a JWE."""
     file.seek(0)
     before = file.read(_PIECE)
     if before.lstrip()[:1] != b"{":

@@ -121,7 +121,7 @@ def _request(app: App, name: str | None, keystore: str | None, path: Path) -> No
 
 
 def _is_request_of(path: Path, point: bytes) -> bool:
-    """True if the file is a request of this very station already (a token signs it differently each time)."""
+    """Return True if the file is a request of this very station already (a token signs it differently each time)."""
     try:
         if not path.exists():
             return False

@@ -292,7 +292,7 @@ def _bug(arguments: list[str], error: Exception) -> int:
 
 
 def wants_json(arguments: list[str]) -> bool:
-    """True if a run of these arguments prints its result as JSON."""
+    """Return True if a run of these arguments prints its result as JSON."""
     return _wants(arguments, "--json")
 
 

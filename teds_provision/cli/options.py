@@ -201,7 +201,7 @@ def link_options(function: Function) -> Function:
 
 
 def links_given(ctx: click.Context) -> bool:
-    """True if an option (or setting) of this run selects the link to a node."""
+    """Return True if an option (or setting) of this run selects the link to a node."""
     return any(ctx.get_parameter_source(name) != ParameterSource.DEFAULT for name in ("via", "nfc", "can", "ble"))
 
 

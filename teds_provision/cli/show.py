@@ -412,7 +412,7 @@ def _described(name: str, kind: Kind, blocks: Sequence[TedsBlock], edition: Edit
 
 
 def is_message(octets: bytes) -> bool:
-    """True if octets are a message rather than a TEDS."""
+    """Return True if octets are a message rather than a TEDS."""
     if looks_like_message(octets):
         return True
 

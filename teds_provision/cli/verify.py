@@ -83,7 +83,7 @@ def _table(console: Console, verified: Verification) -> None:
 
 
 def are_files(what: Sequence[str]) -> bool:
-    """True if these words name many images rather than one image or a node."""
+    """Return True if these words name many images rather than one image or a node."""
     return len(what) > 1 or (len(what) == 1 and Path(what[0]).is_dir())
 
 

@@ -216,7 +216,7 @@ def can_interfaces(system: System) -> Iterator[Finding]:
 
 
 def _kernel_can() -> bool:
-    """True if the kernel makes CAN sockets."""
+    """Return True if the kernel makes CAN sockets."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except (OSError, AttributeError):

@@ -215,7 +215,7 @@ def keys_folder(system: System) -> Iterator[Finding]:
 
 
 def holds_private_key(path: Path) -> bool:
-    """True if a file holds a private key in PEM, a private JWK, or a private key of SSH or PKCS #8 in DER."""
+    """Return True if a file holds a private key in PEM, a private JWK, or a private key of SSH or PKCS #8 in DER."""
     try:
         with open_to_read(path) as file:
             octets = file.read(_MAX_KEY_FILE)

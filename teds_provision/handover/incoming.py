@@ -257,7 +257,10 @@ def _new_revocations(station: Station, opened: OpenedBundle) -> tuple[tuple[Stat
 
 
 def _is_known_ca(station: Station, ca: bytes) -> bool:
-    """True if the CA is known without this bundle: it certified this station before, or an operator trusts it."""
+    """Return True if the CA is known without this bundle.
+
+    It certified this station before, or an operator trusts it.
+    """
     certified = station.identity.certificate(ca, station.point) is not None
     return station.policy.counts(ca) and (certified or ca in station.policy.trusted_cas())
 

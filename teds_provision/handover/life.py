@@ -63,12 +63,12 @@ def revoke(station: Station, uuid: bytes, why: str) -> RevokeResult:
 
 
 def is_retired(record: NodeRecord | None) -> bool:
-    """True if a node was taken out of service."""
+    """Return True if a node was taken out of service."""
     return record is not None and (record.retired or "").startswith((DECOMMISSIONED, REPLACED))
 
 
 def is_finished(station: Station, uuid: bytes) -> bool:
-    """True if a node was taken out of service and has signed that it is in factory state."""
+    """Return True if a node was taken out of service and has signed that it is in factory state."""
     record = station.nodes.get(uuid)
     return record is not None and is_retired(record) and not (record.retired or "").endswith(UNCONFIRMED)
 

@@ -154,7 +154,7 @@ class Selection:
         return ""
 
     def _is_cut(self, uuid: bytes) -> bool:
-        """True if this node rests because of a move to the same receiver that is still open."""
+        """Return True if this node rests because of a move to the same receiver that is still open."""
         tombstone = self.tombstones[uuid]
         return (
             self.order.mode == "move"

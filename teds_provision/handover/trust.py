@@ -278,7 +278,7 @@ def _refuse_in_roster(station: Station, fingerprint: str) -> None:
 
 
 def _is_listed(station: Station, wanted: TrustRecord) -> bool:
-    """True if this key is listed under this name already; raises PolicyError if another key has the name."""
+    """Return True if this key is listed under this name already; raises PolicyError if another key has the name."""
     named = [record for record in station.policy.listed() if record.name == wanted.name]
     for old in named:
         if (old.role, old.point) != (wanted.role, wanted.point):

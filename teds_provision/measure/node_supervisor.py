@@ -467,7 +467,7 @@ class NodeSupervisor:
                 raise LinkError(f"No message from the node for {silent:.1f} s.", hint="Check its power and the bus.")
 
     def _is_gone(self) -> bool:
-        """True if the node is silent or was seen on another bus, so that waiting for its answer is useless."""
+        """Return True if the node is silent or was seen on another bus, so that waiting for its answer is useless."""
         now, since = time.monotonic(), self._elsewhere
         if since and now - since > max(LOOK_FOR_DATA, self.streams.every() or 0.0):
             return not self.streams.heard_since(since)

@@ -123,7 +123,7 @@ class Presence:
             tell()
 
     def awaits(self, announce: Announce) -> bool:
-        """True if a thread waits for the node that this claims to be."""
+        """Return True if a thread waits for the node that this claims to be."""
         with self._turn:
             return any(uuid_crc(uuid) == announce.crc for uuid in self._missing)
 
@@ -132,7 +132,7 @@ class Presence:
         self._welcome = frozenset(map(uuid_crc, uuids))
 
     def is_welcome(self, announce: Announce) -> bool:
-        """True if this claims to be such a node."""
+        """Return True if this claims to be such a node."""
         return announce.crc in self._welcome
 
     def seen_at(self, uuid: bytes) -> Sighting | None:

@@ -168,7 +168,7 @@ class Measurement:
         return not self._open and not self.lent and all(keeper.done.is_set() for keeper in self.supervisors)
 
     def _gave_up(self) -> bool:
-        """True if no node ever ran and each has had its time."""
+        """Return True if no node ever ran and each has had its time."""
         return not self._open and all(
             not supervisor.ever_ran and isinstance(supervisor.error, NoNodeError) for supervisor in self.supervisors
         )

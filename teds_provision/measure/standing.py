@@ -28,7 +28,7 @@ SETTLING: Final = 0.5
 
 
 def is_listed(station: Station, uuid: bytes) -> bool:
-    """True if whitelist mode opens a session with a node: it is listed with the key that it has to show."""
+    """Return True if whitelist mode opens a session with a node: it is listed with the key that it has to show."""
     entry = station.pins.entry(uuid)
     return entry is not None and entry.fingerprint is not None
 

@@ -151,7 +151,7 @@ class DynamicMembership:
         return sum(self._directory.seen(uuid).present and self._elsewhere(uuid) for uuid in list(self._others))
 
     def _says_factory(self, uuid: str) -> bool:
-        """True if its Identify reports no key: a node that was refused here a moment ago is left to the adopter.
+        """Return True if its Identify reports no key: a node that was refused here a moment ago is left to the adopter.
 
         That is a hint, as any device may send it: it costs the half minute until a refused node is tried again anyway.
         """

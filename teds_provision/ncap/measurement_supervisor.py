@@ -327,7 +327,7 @@ class MeasurementSupervisor:
             return next((key for key, running in self._running.items() if uuid in running.uuids), None)
 
     def is_measured(self, uuid: str) -> bool:
-        """True if a node is in a session of a measurement now."""
+        """Return True if a node is in a session of a measurement now."""
         job = self._job_of(uuid)
         return job is not None and job.measurement is not None and self._node_locks.holder(uuid) is not None
 
@@ -512,7 +512,7 @@ class MeasurementSupervisor:
         return True
 
     def _has_other_members(self, running: RunningMeasurement, job: MeasurementJob) -> bool:
-        """True if `replace` or `decommission` changed the nodes of a measurement in the store."""
+        """Return True if `replace` or `decommission` changed the nodes of a measurement in the store."""
         if running.kept.match is not None or running.kept.frozen:
             return False
         kept = next((kept for kept in self._station.measurements.all() if kept.id == running.kept.id), None)
@@ -558,7 +558,7 @@ class MeasurementSupervisor:
         return NodeMatch.parse(kept.match or "")
 
     def _is_for(self, uuid: str, running: RunningMeasurement) -> bool:
-        """True if a node is another measurement's: unsigned nodes belong to the unverified one."""
+        """Return True if a node is another measurement's: unsigned nodes belong to the unverified one."""
         if self._unverified is None or running.kept.id == UnsignedNodes.text:
             return False
         return not self._unverified.why_not(self._station, bytes.fromhex(uuid))
@@ -733,7 +733,7 @@ class MeasurementSupervisor:
             self._publish_state(running, *_state_of(running, running.job))
 
     def _is_of(self, uuid: str, running: RunningMeasurement) -> bool:
-        """True if a node is this measurement's, or free: reports from one that it has left are obsolete."""
+        """Return True if a node is this measurement's, or free: reports from one that it has left are obsolete."""
         return self.measurement_of(uuid) in (None, running.kept.id)
 
     def _tell_who_comes(self, running: RunningMeasurement, said: NodeReport, before: str | None) -> None:

@@ -85,7 +85,10 @@ def parse_http(text: str) -> tuple[str, int]:
 
 
 def is_loopback(host: str) -> bool:
-    """True if only this machine reaches a server on this address; False for names that would have to be looked up."""
+    """Return True if only this machine reaches a server on this address.
+
+    False for names that would have to be looked up.
+    """
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

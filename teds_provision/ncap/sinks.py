@@ -93,7 +93,7 @@ class DaemonSinks:
         return [open_sink(spec, take) for spec in specs]
 
     def moves(self, kept: KeptMeasurement) -> bool:
-        """True if set points may come for this measurement: it and the daemon allow it, and it has a ROS sink."""
+        """Return True if set points may come for this measurement: it and the daemon allow it, with a ROS sink."""
         return self.actuators and kept.actuators and bool(_ROS & {*self._specs, *kept.sinks})
 
     @property

@@ -380,7 +380,7 @@ def _ban(station: Station, uuid: bytes, seen: MergedClaims, statements: Sequence
 
 
 def _is_lifted(station: Station, statement: str, hash: str) -> bool:
-    """True if a ban of a bundle, or of this station, was lifted in a page by a keeper or by its own signer."""
+    """Return True if a ban of a bundle, or of this station, was lifted in a page by a keeper or by its own signer."""
     roster = require_roster(station)
     try:
         signer = open_revocation(statement, lambda kid: roster.point_of(kid) or _own(station, kid)).sender

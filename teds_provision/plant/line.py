@@ -106,11 +106,11 @@ class LineRun:
         return self._units_as_json.get(uuid, {})
 
     def is_listed(self, uuid: bytes) -> bool:
-        """True if the job names this UUID."""
+        """Return True if the job names this UUID."""
         return self.job is not None and uuid in self.job.boards
 
     def lists(self, who: IdentifiedNode) -> bool:
-        """True if the job names this very board: that is a keeper's confirmation of it."""
+        """Return True if the job names this very board: that is a keeper's confirmation of it."""
         return self.is_listed(who.uuid) and self.job is not None and self.job.boards[who.uuid] == who.fingerprint
 
     # -- what a board gets -----------------------------------------------------------------------------------------

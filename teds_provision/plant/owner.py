@@ -228,7 +228,7 @@ def require_member(roster: Roster, name: str) -> Member:
 
 
 def says_the_same(before: Roster | None, after: Roster) -> bool:
-    """True if a version would change nothing: members, removed ones, shares, end date."""
+    """Return True if a version would change nothing: members, removed ones, shares, end date."""
     return before is not None and all(
         getattr(before, what) == getattr(after, what) for what in ("members", "removed", "share", "expires")
     )

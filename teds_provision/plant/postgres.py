@@ -504,15 +504,15 @@ class ReturnedPages:
         return " ".join((station, str(station in look.open), str(n), hash, *handed_in))
 
     def was_handed_in(self, station: str) -> bool:
-        """True if a member handed in a page of this station."""
+        """Return True if a member handed in a page of this station."""
         return station in self._post._look.handed_in
 
     def is_open(self, station: str) -> bool:
-        """True if the station appends its pages itself."""
+        """Return True if the station appends its pages itself."""
         return station in self._post._look.open
 
     def head(self, station: str) -> int:
-        """The number of the newest page that the station appended itself."""
+        """Return the number of the newest page that the station appended itself."""
         return self._post._look.heads.get(station, (0, ""))[0]
 
     def offers(self, station: str) -> list[Offer]:

@@ -137,7 +137,7 @@ def _mark(
 
 
 def _own_turn(station: Station, roster: Roster, uuid: bytes, key: KeyRecord) -> bool:
-    """True if this station rotates a key before others do.
+    """Return True if this station rotates a key before others do.
 
     It made the key; or no member that holds the key did, and of those this one has the lowest fingerprint.
     """

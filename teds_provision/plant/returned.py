@@ -29,7 +29,10 @@ _AT_ONCE: Final = 8
 
 
 def is_new(station: Station, database: Returned, roster: Roster) -> bool:
-    """True if there may be something to take or to hand in: since the last comparison, anything of it changed."""
+    """Return True if there may be something to take or to hand in.
+
+    That is after any change since the last comparison.
+    """
     digest = _digest(station, database, roster)
     return digest != "" and digest != station.plant.tables.returned_state()
 

@@ -37,5 +37,5 @@ def verifier(secret: bytes) -> str:
 
 
 def is_verifier(text: str) -> bool:
-    """True if a text is a verifier of this form, and nothing that ends a quoted SQL literal."""
+    """Return True if a text is a verifier of this form, and nothing that ends a quoted SQL literal."""
     return _VERIFIER.fullmatch(text) is not None

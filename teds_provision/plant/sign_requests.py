@@ -484,7 +484,10 @@ def _says_the_same(
     *,
     by: str | None = None,
 ) -> bool:
-    """True if a Security TEDS signs exactly this for this board and epoch, by a member with ``sign`` (or ``by``)."""
+    """Return True if a Security TEDS signs exactly this for this board and epoch.
+
+    Its signer must be a member with ``sign`` (or ``by``).
+    """
     try:
         shown = security.decode(octets)
     except BadDataError:

@@ -249,7 +249,7 @@ def _require_resumed(station: Station) -> None:
 
 
 def _follows(chain: Chain, new: Sequence[Page]) -> bool:
-    """True if pages continue, without a gap, from the newest page that counts here."""
+    """Return True if pages continue, without a gap, from the newest page that counts here."""
     place = chain.counted
     for page in sorted(new, key=lambda page: page.number):
         if (page.number - 1, page.previous) != place:

@@ -54,13 +54,13 @@ class Returned(Protocol):
         """
 
     def was_handed_in(self, station: str) -> bool:
-        """True if a member handed in a page of this station."""
+        """Return True if a member handed in a page of this station."""
 
     def is_open(self, station: str) -> bool:
-        """True if the station appends its pages itself."""
+        """Return True if the station appends its pages itself."""
 
     def head(self, station: str) -> int:
-        """The number of the newest page that the station appended itself."""
+        """Return the number of the newest page that the station appended itself."""
 
     def offers(self, station: str) -> list[Offer]:
         """Return every page of a station, whoever handed it in."""

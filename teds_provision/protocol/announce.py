@@ -71,7 +71,7 @@ class Announce:
 
 
 def is_announce(identifier: int) -> bool:
-    """True if a frame's identifier is that of an Announce."""
+    """Return True if a frame's identifier is that of an Announce."""
     return identifier & 0x1FFFFF00 == ANNOUNCE
 
 

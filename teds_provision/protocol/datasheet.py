@@ -31,7 +31,7 @@ class SignedNodeKey:
 
 
 def can_be_stored(block: BlockId) -> bool:
-    """True if a node may hold this TEDS: access codes 1 to 17 and 128 to 135, channels 0 to 255."""
+    """Return True if a node may hold this TEDS: access codes 1 to 17 and 128 to 135, channels 0 to 255."""
     return 0 <= block[0] <= LAST_CHANNEL and block[1] in STORED_CODES
 
 
@@ -69,12 +69,12 @@ def passes_own_check(block: BlockId, teds: bytes) -> bool:
 
 
 def own_values(teds: SecurityTeds) -> bool:
-    """True if fields 1 to 4, 105, 109 and 110 have the values of this profile."""
+    """Return True if fields 1 to 4, 105, 109 and 110 have the values of this profile."""
     return teds.values == security.OUR_VALUES
 
 
 def station_signature_good(teds: SecurityTeds, ca: bytes, verify: Verify | None = None) -> bool:
-    """True if 104 is the CA's signature over 103, and 103 a point; a node passes its chip's ``verify``."""
+    """Return True if 104 is the CA's signature over 103, and 103 a point; a node passes its chip's ``verify``."""
     if verify is None:
         return is_certified(ca, teds.station_key, teds.station_key_signature)
     if teds.station_key is None or teds.station_key_signature is None or not is_point(teds.station_key):
@@ -83,7 +83,7 @@ def station_signature_good(teds: SecurityTeds, ca: bytes, verify: Verify | None 
 
 
 def is_certified(ca: bytes, station: bytes | None, signature: bytes | None) -> bool:
-    """True if ``signature`` (field 104) is that of ``ca`` over ``station`` (field 103), and that a point."""
+    """Return True if ``signature`` (field 104) is that of ``ca`` over ``station`` (field 103), and that a point."""
     return station is not None and signature is not None and is_point(station) and _certified(ca, station, signature)
 
 
@@ -94,7 +94,7 @@ def _certified(ca: bytes, station: bytes, signature: bytes) -> bool:
 
 
 def signature_good(teds: SecurityTeds, octets: bytes, uuid: bytes, check: Verify | None = None) -> bool:
-    """True if 100 verifies under 103 over the octets as they are; a node passes its chip's ``check``."""
+    """Return True if 100 verifies under 103 over the octets as they are; a node passes its chip's ``check``."""
     if teds.station_key is None or teds.signature is None:
         return False
     asked = teds.station_key, security.tbs(uuid, octets), teds.signature
@@ -108,7 +108,7 @@ def _signed(station: bytes, message: bytes, signature: bytes) -> bool:
 
 
 def meta_names(teds: bytes, uuid: bytes) -> bool:
-    """True if field 4 of a Meta-TEDS of the 2007 form is ``uuid``; other forms are not compared (True)."""
+    """Return True if field 4 of a Meta-TEDS of the 2007 form is ``uuid``; other forms are not compared (True)."""
     try:
         block = frame.unframe(teds)
         if block[:2] != b"\x03\x04":

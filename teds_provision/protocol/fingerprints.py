@@ -17,12 +17,12 @@ def read_fingerprint(text: str) -> str | None:
 
 
 def same_key(one: str, other: str) -> bool:
-    """True if two fingerprints, each whole or its first digits, are of the same key."""
+    """Return True if two fingerprints, each whole or its first digits, are of the same key."""
     if len(one) > len(other):
         one, other = other, one
     return len(one) >= LEAST_DIGITS and other.startswith(one)
 
 
 def is_whole(fingerprint: str | None) -> bool:
-    """True if all 64 digits are known."""
+    """Return True if all 64 digits are known."""
     return fingerprint is not None and len(fingerprint) == DIGITS

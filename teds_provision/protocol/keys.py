@@ -110,7 +110,7 @@ def public_key(point: bytes) -> ec.EllipticCurvePublicKey:
 
 
 def is_point(point: bytes) -> bool:
-    """True if 65 octets are a valid uncompressed P-256 point."""
+    """Return True if 65 octets are a valid uncompressed P-256 point."""
     try:
         public_key(point)
     except BadDataError:
@@ -125,7 +125,7 @@ Verify = Callable[[bytes, bytes, bytes], bool]
 
 
 def verify(point: bytes, message: bytes, signature: bytes) -> bool:
-    """True if ``signature`` (64 octets) is SIG(point, message); a high s is refused."""
+    """Return True if ``signature`` (64 octets) is SIG(point, message); a high s is refused."""
     if len(signature) != SIGNATURE_OCTETS:
         return False
     r, s = int.from_bytes(signature[:32], "big"), int.from_bytes(signature[32:], "big")
@@ -170,7 +170,7 @@ def from_pem(text: bytes) -> bytes:
 
 @lru_cache(maxsize=256)
 def node_key_good(uuid: bytes, node: bytes, signature: bytes) -> bool:
-    """True if SIG102 (64 octets) is a node's over its own key for this UUID; False if ``node`` is no point.
+    """Return True if SIG102 (64 octets) is a node's over its own key for this UUID; False if ``node`` is no point.
 
     Cached: each step of a provisioning needs it for the same octets, and it never changes.
     """

@@ -254,5 +254,8 @@ def good_point(point: bytes, own: bytes) -> bool:
 
 
 def good_one_time(point: bytes, *others: bytes) -> bool:
-    """True if ``point`` may be the other side's one-time key: a point, none of one's own, nor a known static one."""
+    """Return True if ``point`` may be the other side's one-time key.
+
+    It must be a point, none of one's own, nor a known static one.
+    """
     return point not in others and is_point(point)

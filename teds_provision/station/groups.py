@@ -29,7 +29,7 @@ _CREATE: Final = "teds-provision group create NAME UUID …"
 
 
 def is_valid_name(name: str) -> bool:
-    """True if a group may have this name."""
+    """Return True if a group may have this name."""
     forbidden = name in (ALL, *_NO_PATHS) or _LIKE_A_UUID.match(name) is not None
     return not forbidden and bool(name.strip()) and name.isprintable() and len(name) <= LONGEST
 

@@ -31,7 +31,7 @@ class StationIdentity:
     # -- facts -----------------------------------------------------------------------------------------------------
 
     def is_complete(self) -> bool:
-        """True if init was finished: a key, a CA and its signature are there."""
+        """Return True if init was finished: a key, a CA and its signature are there."""
         facts = self._store.facts()
         return facts is not None and facts.point is not None
 

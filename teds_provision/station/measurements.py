@@ -245,7 +245,7 @@ class Measurements:
             yield
 
     def is_running(self, uuid: bytes) -> bool:
-        """True if a measurement of this station holds the node, in this process or another one."""
+        """Return True if a measurement of this station holds the node, in this process or another one."""
         return self._mark(uuid).is_taken
 
     def holder(self, uuid: bytes) -> str | None:

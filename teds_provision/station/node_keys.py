@@ -31,7 +31,7 @@ MAX_PENDING = 8
 _NO_MARKS: Final = KeyFlags()
 
 RESTORED = "restored from a backup"
-"""Begins the reason of a rotation that needs a tap or a person's word: nobody knows who else has that key by now."""
+"""Prefix of the reason of a rotation that needs a tap or an operator: other holders of that key are unknown."""
 REMOVED: Final = "registry: "
 """Begins the reason of a rotation that is due because a station was removed from the plant."""
 _FROM: Final = f"{REMOVED}from "
@@ -89,7 +89,7 @@ class NodeKeys:
         return self._store.all_key_names()
 
     def held(self, uuid: bytes) -> bool:
-        """True if any key is held for a node."""
+        """Return True if any key is held for a node."""
         return bool(self._store.keys(uuid))
 
     def unwrapped(self, uuid: bytes) -> Iterator[NodeKey]:
@@ -327,7 +327,10 @@ class NodeKeys:
         return self._store.key_flags(uuid).rotation
 
     def rotates_now(self, uuid: bytes) -> bool:
-        """True if the next session with a node has to rotate its key first, and no other station is to do so before."""
+        """Return True if the next session with a node has to rotate its key first.
+
+        False while another station is due to do so before.
+        """
         why = self.rotation_due(uuid)
         if why is None or not why.startswith(_FROM):
             return why is not None
@@ -344,7 +347,7 @@ class NodeKeys:
         return {uuid for uuid, mark in marks.items() if mark.rotation is not None}
 
     def restored(self, uuid: bytes) -> bool:
-        """True if the keys of a node came back from a backup and none was agreed since."""
+        """Return True if the keys of a node came back from a backup and none was agreed since."""
         return (self.rotation_due(uuid) or "").startswith(RESTORED)
 
     def stolen(self, uuid: bytes) -> str | None:

@@ -121,7 +121,7 @@ class Nodes:
         return self._store.overview(uuids)
 
     def is_known(self, uuid: bytes) -> bool:
-        """True if anything is known of a node."""
+        """Return True if anything is known of a node."""
         return self._store.is_known(uuid)
 
     def named(self, name: str) -> bytes | None:
@@ -170,7 +170,7 @@ class Nodes:
         return self._store.reading_of(uuid)
 
     def reads_well(self, uuid: bytes) -> bool:
-        """True if a node's datasheet was read in a session and was free of faults: a hint, without trust."""
+        """Return True if a node's datasheet was read in a session and was free of faults: a hint, without trust."""
         row = self.reading(uuid)
         return row is not None and row.in_session and not row.failed
 
@@ -219,7 +219,7 @@ class Nodes:
 
 
 def is_whole(image: Image) -> bool:
-    """True if an image is a whole datasheet: more than a Security TEDS, with every TEDS of field 108."""
+    """Return True if an image is a whole datasheet: more than a Security TEDS, with every TEDS of field 108."""
     if not image.unsigned_blocks():
         return False
     if image.security is None:

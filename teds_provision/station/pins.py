@@ -165,7 +165,7 @@ class Pins:
         return 0 if former and pinned and not same_key(former, pinned) else self._keys.active_epoch(uuid)
 
     def is_unsettled(self, uuid: bytes) -> bool:
-        """True if the held link keys may belong to a board that was replaced since."""
+        """Return True if the held link keys may belong to a board that was replaced since."""
         return self._keys.former(uuid) is not None
 
     def settled(self, uuid: bytes) -> None:

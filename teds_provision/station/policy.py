@@ -65,7 +65,7 @@ class Policy:
         return sorted([*others, *members], key=lambda trusted: trusted.name)
 
     def in_roster(self, fingerprint: str) -> bool:
-        """True if the plant's roster names this key, as a member or as one that left."""
+        """Return True if the plant's roster names this key, as a member or as one that left."""
         roster = self._plant.roster
         return roster is not None and fingerprint in roster.by_key
 
@@ -101,7 +101,7 @@ class Policy:
         return [*cas, kept]
 
     def counts(self, ca: bytes) -> bool:
-        """True if trust in a CA has not been ended."""
+        """Return True if trust in a CA has not been ended."""
         ended, name = self._store.ended_cas(), keys.fingerprint(ca)
         return name not in ended or not self._row_macs.noted("ended ca", name, ended[name])
 
@@ -159,7 +159,7 @@ class Policy:
         return self._store.remove_revocation(uuid)
 
     def was_lifted(self, statement: str) -> bool:
-        """True if an operator has lifted the ban of this very statement here."""
+        """Return True if an operator has lifted the ban of this very statement here."""
         lifted = self._store.lifted()
         names = (_digest(statement), event.hash_of_statement(statement)) if lifted else ()
         return any(name in lifted and self._row_macs.noted("lifted", name, lifted[name]) for name in names)

@@ -112,11 +112,14 @@ class RowMacs:
             )
 
     def trusted(self, record: TrustRecord) -> bool:
-        """True if a trusted key counts: its MAC is right, or the vault is closed and it cannot be checked."""
+        """Return True if a trusted key counts: its MAC is right, or the vault is closed and it cannot be checked."""
         return not self.active or record.name not in self.broken_trust
 
     def noted(self, kind: str, name: str, mac: bytes | None) -> bool:
-        """True if an operator's decision counts: its MAC is right, or the vault is closed and it cannot be checked."""
+        """Return True if an operator's decision counts.
+
+        Its MAC is right, or the vault is closed and it cannot be checked.
+        """
         return not self.active or self._holds(mac, kind, (name,))
 
     def all_broken(self) -> Iterator[str]:
@@ -167,7 +170,7 @@ class RowMacs:
     # -- when the vault opens --------------------------------------------------------------------------------------
 
     def opened_by(self, masters: MasterKeys) -> bool:
-        """True if these master keys open the MAC key, and it is the one that is in use here."""
+        """Return True if these master keys open the MAC key, and it is the one that is in use here."""
         facts = self._store.facts()
         if facts is None or facts.seal_key is None or self._keyed is None:
             return False

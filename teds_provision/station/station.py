@@ -1,18 +1,18 @@
-"""The base station on this machine: it opens, locks, audits and closes, and holds the parts that know more.
+"""The base station on this machine: it opens, locks, audits and closes, and holds the parts.
 
 ============  ======================================================================
-part          what it knows
+part          content
 ============  ======================================================================
 ``identity``  name, key, owner's CA, certificates
-``keys``      link keys, whose CA a node keeps, who else holds a key, rotations due
-``pins``      the whitelist, and which key each UUID is pinned to
+``keys``      link keys, the CA of each node, other holders, rotations due
+``pins``      the whitelist, and the pinned key of each UUID
 ``policy``    trusted stations and CAs, the deny list, nodes given away
-``nodes``     what is known of each node, its datasheets and drafts
-``groups``    which nodes are measured together
-``measurements`` what is measured, also after a restart; detection; names
+``nodes``     each node's record, datasheets and drafts
+``groups``    nodes that are measured together
+``measurements`` measurements, also after a restart; detection; names
 ``handovers`` bundles that left and came
-``plant``     the registry that it joined, what it tells other stations there
-``seals``     MACs over the rows that decide whom the station believes
+``plant``     the joined registry, and events for its other stations
+``seals``     MACs over the rows that decide whom the station trusts
 ============  ======================================================================
 
 Opening a station reads the store only; the vault opens at the first secret.

@@ -96,7 +96,7 @@ def _take_up(station: Station, node: Conversation, held: NodeKey) -> NodeKey:
 
 
 def _is_taken_up(station: Station, record: KeyRecord) -> bool:
-    """True if the key is the active one already, no other of its time is left, and its epoch is known."""
+    """Return True if the key is the active one already, no other of its time is left, and its epoch is known."""
     if record.state == "pending" or station.pins.is_unsettled(record.uuid) or station.keys.outdated(record):
         return False
     known = station.nodes.get(record.uuid)
@@ -329,7 +329,7 @@ def _enlist(station: Station, entry: WhitelistEntry) -> None:
 
 
 def _may_return(station: Station, who: IdentifiedNode) -> bool:
-    """True if a node whose move was closed by its receipt may be keyed here again, if it proves to be reset."""
+    """Return True if a node whose move was closed by its receipt may be keyed here again, if it proves to be reset."""
     if who.state != NodeState.FACTORY:
         return False
     uuid = who.uuid

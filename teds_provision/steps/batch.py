@@ -382,7 +382,10 @@ class BatchRun:
         )
 
     def _is_meant(self, contact: Contact) -> bool:
-        """True if it is on the whitelist or in the sheet, and not finished yet; reports those that are neither."""
+        """Return True if it is on the whitelist or in the sheet, and not finished yet.
+
+        Reports those that are neither.
+        """
         uuid = contact.identity.uuid
         listed = self._station.pins.entry(uuid) is not None
         if self.progress is not None and any(row.uuid in (uuid, None) for row in self.progress.open):
@@ -522,7 +525,7 @@ def _progress(station: Station, request: ProvisionRequest, order: BuildOrder) ->
 
 
 def _has_it_already(station: Station, row: SheetRow, uuid: bytes) -> bool:
-    """True if the board's last known datasheet is what its row of the sheet gives."""
+    """Return True if the board's last known datasheet is what its row of the sheet gives."""
     image = station.nodes.datasheet(uuid)
     if image is None:
         return False

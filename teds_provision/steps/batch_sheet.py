@@ -166,7 +166,7 @@ class SheetRow:
         return any(channel.calibration.required for channel in profile.channels)
 
     def means(self, uuid: bytes, fingerprint: str) -> bool:
-        """True if this row names that board; a UUID with another key is for the pin to refuse."""
+        """Return True if this row names that board; a UUID with another key is for the pin to refuse."""
         if self.uuid is not None:
             return self.uuid == uuid
         return self.fingerprint is not None and fingerprint.startswith(self.fingerprint)
@@ -443,7 +443,7 @@ class Progress:
         )
 
     def has_passed(self, uuid: bytes) -> bool:
-        """True if the row of this board is done."""
+        """Return True if the row of this board is done."""
         return any(row.uuid == uuid.hex() and row.result == "passed" for row in self.rows.values())
 
     def save(self, *changed: SheetRow) -> None:

@@ -141,7 +141,7 @@ def _listed(numbers: Collection[int]) -> str:
 
 
 def _describes(has: Mapping[BlockId, bytes]) -> bool:
-    """True if these TEDS describe any channel; a new board usually has none."""
+    """Return True if these TEDS describe any channel; a new board usually has none."""
     return any(code == AccessCode.CHANNEL for _, code in has)
 
 
@@ -171,7 +171,7 @@ def _between(number: int, own: _ChannelStatement | None, wanted: _ChannelStateme
 
 
 def _says_nothing(units: Units) -> bool:
-    """True for counts, digital, a ratio, V, A: the raw unit of any quantity."""
+    """Return True for counts, digital, a ratio, V, A: the raw unit of any quantity."""
     bare = replace(units, extension=0)
     return units.interpretation != PRODUCT or bare in (Units(), _VOLT, _AMPERE)
 
@@ -189,9 +189,9 @@ def _form(form: tuple[int, int]) -> str:
 
 
 def is_remembered(station: Station, uuid: bytes, wanted: str | None, *, factory: bool) -> bool:
-    """True if this station knows the board as one of that profile, or as its own that was reset: that is no retype.
+    """Return True if this station knows the board as one of that profile, or as its own that was reset.
 
-    ``wanted`` None: of the profile that it was given before.
+    Then it is no retype. ``wanted`` None: of the profile that it was given before.
 
     What was merely built for it does not count; what was written, or came in a bundle, does.
     """

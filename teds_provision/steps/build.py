@@ -632,7 +632,7 @@ def _proposal(station: Station, prepared: PreparedOrder, present: NodeSnapshot) 
 
 
 def _intact(station: Station, present: NodeSnapshot) -> bool:
-    """True if the node's datasheet is authentic for this station, so that its values may be kept."""
+    """Return True if the node's datasheet is authentic for this station, so that its values may be kept."""
     checks = verify_image(station, present.image, known=FreshnessFloor(present.identity))
     return Verification(present.image.uuid, tuple(checks)).verdict == "authentic"
 

@@ -113,7 +113,10 @@ def _pinned_now(station: Station, who: IdentifiedNode) -> WhitelistEntry | None:
 
 
 def _opened(station: Station) -> bool:
-    """True if the vault is open, which makes a pin's MAC; without the passphrase, the first agreement will pin."""
+    """Return True if the vault is open, which makes a pin's MAC.
+
+    Without the passphrase, the first agreement will pin.
+    """
     with suppress(WrongPassphraseError, KeyringUnavailableError):
         station.unlock()
         return True

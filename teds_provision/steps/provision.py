@@ -162,10 +162,10 @@ class ProductionLine(Protocol):
         """Return the members about a board beside its steps."""
 
     def lists(self, who: IdentifiedNode) -> bool:
-        """True if the job names this very board, by UUID and key."""
+        """Return True if the job names this very board, by UUID and key."""
 
     def is_listed(self, uuid: bytes) -> bool:
-        """True if the job names this UUID."""
+        """Return True if the job names this UUID."""
 
     def allot_unit(
         self, node: Conversation, who: IdentifiedNode, prepared: PreparedOrder, entry: WhitelistEntry | None

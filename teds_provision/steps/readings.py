@@ -127,7 +127,7 @@ def keep_shown(station: Station, uuid: bytes, security_teds: bytes, *, by: str) 
 
 
 def is_known(station: Station, node: Conversation, image: Image) -> bool:
-    """True if the row has this already: the same TEDS, all of them read since the node last started."""
+    """Return True if the row has this already: the same TEDS, all of them read since the node last started."""
     row = station.nodes.reading(image.uuid)
     return (
         row is not None
@@ -168,7 +168,7 @@ def verdict_of(station: Station, uuid: bytes) -> NodeVerdict | None:
 
 
 def is_keyed(station: Station, uuid: bytes) -> bool:
-    """True if a session proves a node here: a key of it is held, and was not given away."""
+    """Return True if a session proves a node here: a key of it is held, and was not given away."""
     return bool(station.keys.held(uuid)) and station.policy.tombstone(uuid) is None
 
 

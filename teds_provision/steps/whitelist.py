@@ -289,7 +289,7 @@ def _add_several(element: _Element, own: dict[str, str], reading: _WhitelistRead
 
 
 def _is_entry_text(element: _Element, text: str, root: bool) -> bool:
-    """True if the text of an element is a UUID by its position or its form."""
+    """Return True if the text of an element is a UUID by its position or its form."""
     if element.tag in _ENTRY_ELEMENTS:
         return True
     return bool(text) and (root or text[:2].lower() == "0x")
@@ -487,7 +487,7 @@ def remove(station: Station, uuid: bytes) -> bool:
 
 
 def is_pinned(station: Station, uuid: bytes) -> bool:
-    """True if a key of this UUID is known, whitelisted or not."""
+    """Return True if a key of this UUID is known, whitelisted or not."""
     return station.pins.pinned(uuid) is not None
 
 

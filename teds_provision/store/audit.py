@@ -86,7 +86,7 @@ FAILED = (
 
 
 def is_failure(outcome: str) -> bool:
-    """True if an act did not succeed."""
+    """Return True if an act did not succeed."""
     return outcome.startswith(FAILED)
 
 

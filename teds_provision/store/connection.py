@@ -84,7 +84,7 @@ def damaged(path: Path) -> StoreError:
 
 
 def is_no_place_to_write(failure: StoreError) -> bool:
-    """True if a store could not be opened because its place cannot be written to."""
+    """Return True if a store could not be opened because its place cannot be written to."""
     cause = failure.__cause__
     if isinstance(cause, OSError):
         return cause.errno in _OS_CAUSES
@@ -185,7 +185,7 @@ class Connection:
                     raise self._failure(error) from error
 
     def _is_to_wait(self, error: Exception) -> bool:
-        """True if another process holds the file; inside a transaction that is impossible."""
+        """Return True if another process holds the file; inside a transaction that is impossible."""
         code = getattr(error, "sqlite_errorcode", 0) & 0xFF
         return not self._depth and code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
 

@@ -42,7 +42,7 @@ FILE_NAME: Final = "store.sqlite3"
 
 
 def has_store(home: Path) -> bool:
-    """True if there is a store here, usable or not."""
+    """Return True if there is a store here, usable or not."""
     return (home / FILE_NAME).exists()
 
 

@@ -201,7 +201,7 @@ class UsageLock(_HeldFile):
 
     @property
     def is_taken(self) -> bool:
-        """Whether somebody holds it now, alone or shared."""
+        """True if a process holds it now, alone or shared."""
         return self.holder is not None
 
     @property

@@ -123,7 +123,7 @@ class NodeReading:
         return frozenset(name for name, result, *_ in json.loads(self.checks) if result == "failed")
 
     def is_of_this_start(self, c: bytes) -> bool:
-        """True if a session with this c is of the same power-up of the node (profile.md, "Sessions")."""
+        """Return True if a session with this c is of the same power-up of the node (profile.md, "Sessions")."""
         if self.c is None:
             return False
         return (int.from_bytes(c, "big") - int.from_bytes(self.c, "big")) % (1 << 64) < 1 << 32

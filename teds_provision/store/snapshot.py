@@ -73,7 +73,7 @@ def set_aside(home: Path) -> Path:
 
 
 def is_damage(failure: StoreError) -> bool:
-    """True if a store could not be used because its file is damaged (and not locked, newer or unreadable)."""
+    """Return True if a store could not be used because its file is damaged (and not locked, newer or unreadable)."""
     cause = failure.__cause__
     return isinstance(cause, sqlite3.Error) and getattr(cause, "sqlite_errorcode", 0) & 0xFF in _DAMAGE
 

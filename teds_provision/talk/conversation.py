@@ -93,7 +93,7 @@ def refused(reason: int | None, doing: str, *, sealed: bool = False) -> NodeRefu
 
 
 def is_busy(error: TedsProvisionError) -> bool:
-    """True if a node refused because it is busy (17), which only time resolves."""
+    """Return True if a node refused because it is busy (17), which only time resolves."""
     return isinstance(error, NodeRefusedError) and error.reason == Reason.BUSY
 
 
@@ -293,9 +293,10 @@ class Conversation:
         return self.contact.link.capabilities.many
 
     def lives(self) -> bool:
-        """True if a node that a message did not reach still answers: on a bus single frames are lost, nodes are not.
+        """Return True if a node that a message did not reach still answers.
 
-        Never True at a reader: a node that does not answer there has left the field.
+        On a bus single frames are lost, nodes are not. Never True at a reader: a node that does not answer there has
+        left the field.
         """
         if not self._is_noisy:
             return False

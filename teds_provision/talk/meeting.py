@@ -357,7 +357,7 @@ class IdleStop(threading.Event):
         return not self._busy and self._until is not None and time.monotonic() >= self._until
 
     def is_set(self) -> bool:
-        """True if a stop was requested, or the time is over."""
+        """Return True if a stop was requested, or the time is over."""
         return self._asked or super().is_set() or self._is_over()
 
     def wait(self, timeout: float | None = None) -> bool:

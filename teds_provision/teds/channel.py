@@ -49,7 +49,10 @@ _RADIANS: Final = units_of(radians=1)
 
 
 def spans_a_turn(units: Units, low: float, high: float) -> bool:
-    """True if limits in SI units are one turn apart, so that an angle beyond one of them comes back at the other."""
+    """Return True if limits in SI units are one turn apart.
+
+    Then an angle beyond one of them comes back at the other.
+    """
     return units == _RADIANS and abs(high - low - TURN) < _NEARLY_A_TURN
 
 
@@ -185,7 +188,7 @@ class Channel:
         return self.calibration.due if self.calibration is not None else None
 
     def overdue(self, now: datetime) -> bool:
-        """True if the next calibration was due before ``now``."""
+        """Return True if the next calibration was due before ``now``."""
         return self.calibration is not None and self.calibration.overdue(now)
 
     @property

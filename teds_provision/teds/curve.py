@@ -134,7 +134,7 @@ class Curve:
         return float(np.median(last - first))
 
     def monotone(self, direction: str) -> bool:
-        """True if the results never go the other way; ``direction`` is increasing, decreasing or either."""
+        """Return True if the results never go the other way; ``direction`` is increasing, decreasing or either."""
         rises = bool((self.steps >= -self.noise).all())
         falls = bool((self.steps <= self.noise).all())
         return {"increasing": rises, "decreasing": falls}.get(direction, rises or falls)

@@ -101,7 +101,7 @@ class Requirement:
         return f'the channel "{self.channel}"' if self.channel else self.quantity or "a channel"
 
     def concerns(self, channel: Channel) -> bool:
-        """True if a channel is one that this requirement concerns."""
+        """Return True if a channel is one that this requirement concerns."""
         if self.channel:
             return channel.name == self.channel
         return not self.quantity or channel.units == QUANTITIES[self.quantity]
@@ -158,7 +158,7 @@ def judge(requirement: Requirement, sheet: Sheet, now: datetime | None = None) -
 
 
 def met(requirement: Requirement, fits: Iterable[Fit]) -> bool:
-    """True if a group meets a requirement: some channel does, and of a channel that is named every one."""
+    """Return True if a group meets a requirement: some channel does, and of a channel that is named every one."""
     results = [fit.result for fit in fits if fit.channel is not None]
     return bool(results) and (all if requirement.channel else any)(result == "passed" for result in results)
 
@@ -226,7 +226,7 @@ def _meets(term: Term, has: float, channel: Channel) -> bool:
 
 
 def _every_angle(channel: Channel) -> bool:
-    """True if a channel covers a full turn, which reaches every angle."""
+    """Return True if a channel covers a full turn, which reaches every angle."""
     return channel.units == NAMED["rad"] and channel.high - channel.low >= 2 * math.pi * (1 - ROUNDING)
 
 

@@ -229,7 +229,7 @@ def _residual(curve: Curve, given: Calibration | None) -> Iterator[Raised]:
 
 
 def _swapped(new: Calibration, old: Calibration) -> bool:
-    """True if coefficients 0 and 1 of every cell are exchanged (to a quarter), and were different before."""
+    """Return True if coefficients 0 and 1 of every cell are exchanged (to a quarter), and were different before."""
     shape = [(part.segments, part.degree) for part in new.inputs]
     if shape != [(part.segments, part.degree) for part in old.inputs] or len(shape) != 1 or shape[0][1] < 1:
         return False

@@ -141,5 +141,5 @@ def with_class(octets: bytes) -> TedsBlock:
 
 
 def is_run(blocks: Sequence[TedsBlock]) -> bool:
-    """True if concatenated blocks can be separated again."""
+    """Return True if concatenated blocks can be separated again."""
     return [block.octets for block in blocks] == split_run(b"".join(block.octets for block in blocks))

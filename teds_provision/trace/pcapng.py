@@ -58,7 +58,7 @@ def block(record: Record) -> bytes:
 
 
 def is_pcapng(octets: bytes) -> bool:
-    """True if a file begins as pcapng does."""
+    """Return True if a file begins as pcapng does."""
     return octets[:4] == _SECTION.to_bytes(4, "big") and len(octets) >= 12
 
 

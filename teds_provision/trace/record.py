@@ -73,7 +73,7 @@ def line(record: Record) -> bytes:
 
 
 def is_lines(octets: bytes) -> bool:
-    """True if a file begins as a trace of lines does."""
+    """Return True if a file begins as a trace of lines does."""
     return octets[:64].lstrip().startswith(b'{"format": "' + FORMAT.encode())
 
 

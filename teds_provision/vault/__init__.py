@@ -1,4 +1,4 @@
-"""Where a station's secrets lie: the keyring of the operating system, a PKCS #11 token, or a passphrase file."""
+"""Stores of a station's secrets: the OS keyring, a PKCS #11 token, or a passphrase file."""
 
 from typing import TYPE_CHECKING
 

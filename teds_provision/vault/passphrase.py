@@ -35,7 +35,7 @@ class Costs:
     lanes: int
 
     def bounded(self) -> bool:
-        """True if these costs may be tried; they come from a file that is not verified yet."""
+        """Return True if these costs may be tried; they come from a file that is not verified yet."""
         return (
             1 <= self.lanes <= _MAX_LANES
             and 8 * self.lanes <= self.memory_kib <= _MAX_MEMORY_KIB

@@ -26,18 +26,18 @@ def missing_bleak() -> NoReaderError:
 
 
 def is_full(error: BaseException, held: Collection[object]) -> bool:
-    """True if the adapter accepts no connection beyond those that are ``held``; with none it is only busy."""
+    """Return True if the adapter accepts no connection beyond those that are ``held``; with none it is only busy."""
     text = str(error)
     return _LIMIT in text or (bool(held) and any(word in text for word in _REFUSED))
 
 
 def is_busy(error: BaseException) -> bool:
-    """True if another program (or a killed one) has a connect or a scan under way on this adapter."""
+    """Return True if another program (or a killed one) has a connect or a scan under way on this adapter."""
     return getattr(error, "dbus_error", "") in _BUSY
 
 
 def is_gone(error: BaseException) -> bool:
-    """True if BlueZ has forgotten the device since it was seen."""
+    """Return True if BlueZ has forgotten the device since it was seen."""
     unknown = getattr(error, "dbus_error", "") in _UNKNOWN
     return unknown or type(error).__name__ == "BleakDeviceNotFoundError" or "not found" in str(error)
 

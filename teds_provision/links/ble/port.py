@@ -278,7 +278,7 @@ class BlePort:
         return [address for address, identity in self._known.items() if wanted(identity)][:_MOST_GUESSES]
 
     def _advertises(self, address: str) -> bool:
-        """True if this address is heard within a moment."""
+        """Return True if this address is heard within a moment."""
         return address in self._loop.run(self._adapter.scan(_GUESS_SECONDS, lambda seen: address in seen))
 
     def _advertising(self, seconds: float, asked: dict[str, float]) -> list[str]:

@@ -124,7 +124,7 @@ class Arrivals:
                 return
 
     def _was_served(self, frame: Frame) -> bool:
-        """True if an Announce is of a node that this round brought."""
+        """Return True if an Announce is of a node that this round brought."""
         announce = Announce.decode(frame.identifier, frame.data)
         return announce is not None and announce.crc in self._served
 
@@ -156,7 +156,10 @@ class Arrivals:
                 yield address, identity
 
     def _is_news(self, address: int, identity: Identity) -> bool:
-        """True if the node is new, back after silence, or reset to factory state. A new address alone is no news."""
+        """Return True if the node is new, back after silence, or reset to factory state.
+
+        A new address alone is no news.
+        """
         before = self._seen.get(identity.uuid)
         self._seen[identity.uuid] = _SeenNode(address, identity.state, self._round)
         factory = NodeState.FACTORY

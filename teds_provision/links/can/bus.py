@@ -420,7 +420,7 @@ def _descriptor(bus: can.BusABC) -> int:
 
 
 def _clock_is_ours(spec: CanSpec) -> bool:
-    """True if this machine's kernel stamps the frames, not an adapter or another machine.
+    """Return True if this machine's kernel stamps the frames, not an adapter or another machine.
 
     With a clock that is a little slow a frame would seem older than it is, and the bound of a node's time be false.
     """
@@ -500,7 +500,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _hung_up(bus: can.BusABC) -> bool:
-    """True if the server has closed the connection; python-can reads that as silence."""
+    """Return True if the server has closed the connection; python-can reads that as silence."""
     connection = getattr(bus, "_SocketCanDaemonBus__socket", None)
     if not isinstance(connection, socket.socket):
         return False

@@ -182,7 +182,7 @@ class AddressConflicts:
             del self._replies[:-_KEPT]
 
     def seen(self, *, within: float = 10.0) -> bool:
-        """True if another station used our address within these seconds."""
+        """Return True if another station used our address within these seconds."""
         since = time.monotonic() - within
         with self._lock:
             frames = sum(at >= since for at in self._frames)
@@ -543,7 +543,7 @@ class BusMultiplexer:
             asked.until = time.monotonic() + _STRAGGLERS_SECONDS
 
     def clash(self, node: int) -> bool:
-        """True if two nodes were heard under this address a short while ago, and no single one since then."""
+        """Return True if two nodes were heard under this address a short while ago, and no single one since then."""
         return time.monotonic() - self._clashes.get(node, -math.inf) < _CLASH_SECONDS
 
     # -- the loop, and what runs in it -----------------------------------------------------------------------------
@@ -577,7 +577,7 @@ class BusMultiplexer:
             listener.offer(frame)
 
     def announced_since(self, node: int, moment: float) -> bool:
-        """True if a node announced itself at this address after ``moment`` (time.monotonic)."""
+        """Return True if a node announced itself at this address after ``moment`` (time.monotonic)."""
         return self._announced.get(node, -math.inf) > moment
 
     def _from_node(self, line: AddressPair, frame: Frame) -> None:

@@ -162,7 +162,7 @@ class Pair:
         return True
 
     def _has_its_length(self, consecutive: bytes) -> bool:
-        """True if it is as long as its first frame, or the last and shorter; ISO 15765-2 ignores all others.
+        """Return True if it is as long as its first frame, or the last and shorter; ISO 15765-2 ignores all others.
 
         can-isotp takes any classic one.
         """

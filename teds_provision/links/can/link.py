@@ -250,7 +250,7 @@ class _Exchange:
         return shares[max(0, len(shares) - self._tries + whole)] if self._tries > 1 else 1.0
 
     def _worth_another(self, began: float, refused: int, *, begun: bool) -> bool:
-        """True if a request that never went out whole is worth another try.
+        """Return True if a request that never went out whole is worth another try.
 
         At once, while the node may only be busy.
         """

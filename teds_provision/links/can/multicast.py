@@ -139,7 +139,7 @@ def read(datagram: bytes, at: float, *, fd: bool) -> ReceivedFrame:
 
 
 def _is_data(fields: dict[object, object], octets: int, most: int) -> bool:
-    """True if it is a data frame of a 29-bit identifier whose length field matches its octets."""
+    """Return True if it is a data frame of a 29-bit identifier whose length field matches its octets."""
     if not fields.get("is_extended_id", True) or fields.get("is_remote_frame"):
         return False
     return octets <= most and fields.get("dlc", octets) == octets

@@ -30,11 +30,11 @@ class NdefRecord:
         return _NAMES[self.tnf] + "".join(chr(octet) if 32 <= octet < 127 else f"\\x{octet:02x}" for octet in self.type)
 
     def is_external(self, name: bytes) -> bool:
-        """True if this is the external type ``name`` (compared without case, as the NFC Forum requires)."""
+        """Return True if this is the external type ``name`` (compared without case, as the NFC Forum requires)."""
         return self.tnf == EXTERNAL and self.type.lower() == name.lower()
 
     def is_well_known(self, name: bytes) -> bool:
-        """True if this is the well-known type ``name``."""
+        """Return True if this is the well-known type ``name``."""
         return self.tnf == WELL_KNOWN and self.type == name
 
 

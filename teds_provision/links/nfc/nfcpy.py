@@ -56,7 +56,7 @@ Type4TagCommandError: Any = nfc.tag.tt4.Type4TagCommandError
 
 
 def _logged() -> bool:
-    """True if nfcpy's log of frames is enabled (``--debug``)."""
+    """Return True if nfcpy's log of frames is enabled (``--debug``)."""
     return bool(nfc.clf.log.isEnabledFor(logging.DEBUG))
 
 

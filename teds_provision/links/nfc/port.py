@@ -401,7 +401,7 @@ def _report_tag(seen: NodeInField | ForeignTag, told: str, notice: NoticeSink) -
 
 
 def _has_left(here: bytes | None, seen: NodeInField | ForeignTag | None, gone_at: float) -> TypeGuard[bytes]:
-    """True if the node ``here``, which is not ``seen``, is gone: another tag is there, or none for a while."""
+    """Return True if the node ``here``, which is not ``seen``, is gone: another tag is there, or none for a while."""
     return here is not None and (seen is not None or time.monotonic() - gone_at > _DEBOUNCE)
 
 

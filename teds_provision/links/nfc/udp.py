@@ -1,10 +1,10 @@
-"""nfcpy's udp driver, mended: NFC frames between two processes of one machine, for virtual transducers.
+"""nfcpy's udp driver, repaired: NFC frames between two processes of one machine, for virtual transducers.
 
-The wire format is nfcpy's (one datagram ``106A hex…`` or ``RFOFF``); nothing above the driver changes. What is mended:
+The wire format is nfcpy's (one datagram ``106A hex…`` or ``RFOFF``); nothing above the driver changes. Repairs:
 
 Node side (:class:`NodeDevice`)
     * the socket stays bound between two listens, so that no SENS_REQ behind an RFOFF is lost;
-    * it binds the loopback address asked for, not every interface;
+    * it binds the given loopback address, not every interface;
     * a UID of 10 octets can be selected (the third cascade level is 97h);
     * a command before selection is ignored, so that a node does not answer for its predecessor;
     * an answer is not sent when a newer command already waits;

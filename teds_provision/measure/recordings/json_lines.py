@@ -136,7 +136,7 @@ class JsonLines(Recording):
 
 
 def _goes_with(lines: list[dict[str, Any]], event: dict[str, Any]) -> bool:
-    """True if a line is another channel of the block that began with these lines."""
+    """Return True if a line is another channel of the block that began with these lines."""
     first = lines[0]
     return (
         event.get("event") == "data"

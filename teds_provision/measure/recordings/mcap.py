@@ -253,7 +253,7 @@ class McapRecording(Recording):
 
 
 def _ends(file: BinaryIO) -> bool:
-    """True if the file has the mark of an end."""
+    """Return True if the file has the mark of an end."""
     size = file.seek(0, 2)
     if size < 2 * len(MAGIC):
         return False

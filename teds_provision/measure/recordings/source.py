@@ -101,7 +101,7 @@ def first_instants(entry: Entry, channels: Collection[int], most: float) -> Bloc
 
 
 def is_locked(path: Path) -> bool:
-    """True if a recorder holds the file now."""
+    """Return True if a recorder holds the file now."""
     try:
         file = os.open(path, os.O_RDONLY | CLOSING | NONBLOCK)
     except OSError:

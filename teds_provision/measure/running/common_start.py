@@ -91,7 +91,7 @@ class CommonStart:
     # -- for the trigger -----------------------------------------------------------------------------------------------
 
     def due(self, ready: int, all_of: int) -> bool:
-        """True if the trigger has to go out now: all are ready, or the first has waited long enough for the rest."""
+        """Return True if the trigger has to go out now: all are ready, or the wait for the rest is over."""
         if not self._trigger or self._triggered:
             return False
         if ready and self._first is None:

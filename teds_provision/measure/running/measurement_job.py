@@ -6,8 +6,8 @@ The way of `measure` and of `ncap run` alike:
   after a start, ``settings_to_continue(NAME)`` what `measure NAME` continues; ``forget(ID)`` deletes.
 * ``Buses(ports)`` hears the buses of the process, once for all measurements.
 * ``MeasurementJob(station, kept)`` makes its sinks; ``run(buses, stop)`` measures on this thread until ``stop`` is set,
-  or ``start(buses)`` and ``stop()`` on a thread of its own, again and again after an error. While it runs, its nodes
-  and its group are held: ``station.measurements.is_running(uuid)``, PolicyError (6) for whoever wants them too.
+  or ``start(buses)`` and ``stop()`` in a thread, restarted after an error. While it runs, its nodes
+  and its group are held: ``station.measurements.is_running(uuid)``, PolicyError (6) for other users.
 * ``job.measurement.session(uuid)`` is the session of a node that is measured, for one more command in between.
 
 A measurement of a command is kept while it runs. The row of one that was killed belongs to no process, and the next

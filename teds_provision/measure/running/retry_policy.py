@@ -46,7 +46,7 @@ class RetryPolicy:
     def gives_up(
         self, error: TedsProvisionError, *, proven: bool, elsewhere: Callable[[], bool], decided: bool = False
     ) -> bool:
-        """True if no other try is worth it.
+        """Return True if no other try is worth it.
 
         ``decided``: this station itself decided so, by a ban, its whitelist or its trust. ``proven``: the error came in
         a session. Outside one any device on the bus can take the node's UUID and refuse to open one: then the node is

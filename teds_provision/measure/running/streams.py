@@ -200,7 +200,7 @@ class NodeStreams:
         return min((3 * stream.receiver.plan.span / 1e9 for stream in self._steady()), default=None)
 
     def heard_since(self, moment: float) -> bool:
-        """True if a good message came after ``moment`` (time.monotonic)."""
+        """Return True if a good message came after ``moment`` (time.monotonic)."""
         return any(stream.heard > moment for stream in self.running.values())
 
     def silent(self, now: float) -> float:

@@ -1,16 +1,16 @@
-"""What ROS 1 and ROS 2 have in common: which topics there are, and when which message goes out.
+"""The common part of ROS 1 and ROS 2: the topics, and when each message is published.
 
 The cost of a topic is its messages, not its values (notes of measurements in docs/ros.md). So a group's rows go out as
-one array at full rate, each channel on a topic of its own at ``StationFacts.scalar_rate``, and the sink counts its
+one array at full rate, each channel on its topic at ``StationFacts.scalar_rate``, and the sink counts its
 messages per second and says when that is more than what one process bears.
 
 | topic | type | when |
 |---|---|---|
 | ``/<station>/<group>`` | sensor_msgs/JointState (name, position = value) | each row of the grid |
 | ``/<station>/<group>/age`` | sensor_msgs/JointState (name, position = age in seconds) | each row |
-| ``/<station>/joint_states`` | the same of all joints, for ros2_control | each row, where there is a joint |
-| ``/<station>/joint_commands`` | the same, subscribed | where there is a joint that may be moved |
-| ``/<station>/<node>/array`` and ``/age`` | the same of one node, where nodes come and go | each row of its grid |
+| ``/<station>/joint_states`` | the same of all joints, for ros2_control | each row, if there is a joint |
+| ``/<station>/joint_commands`` | the same, subscribed | if there is a joint that may be moved |
+| ``/<station>/<node>/array`` and ``/age`` | the same of one node, if nodes come and go | each row of its grid |
 | ``/<station>/<node>/<channel>`` | by :func:`meaning_of` | at the scalar rate |
 | ``/<station>/<node>/imu`` and the like | by :mod:`vectors` | at the scalar rate |
 | ``/<station>/<node>/teds`` | std_msgs/String, JSON, latched | when the facts are known |

@@ -29,7 +29,7 @@ def slug(text: str) -> str:
 
 
 def is_topic(text: str) -> bool:
-    """True if a chosen name follows the rules; parts are divided by ``/``."""
+    """Return True if a chosen name follows the rules; parts are divided by ``/``."""
     return all(TOKEN.match(part) and "__" not in part for part in text.strip("/").split("/"))
 
 
@@ -37,7 +37,7 @@ FRAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*\Z")
 
 
 def is_frame(text: str) -> bool:
-    """True if a text can be a coordinate frame (``frame_id``), of an operator or a file."""
+    """Return True if a text can be a coordinate frame (``frame_id``), of an operator or a file."""
     return len(text) <= LONGEST and FRAME.match(text) is not None
 
 
@@ -188,7 +188,7 @@ class Topics:
                     raise _taken(name, f"channel {number} of node {other}")
 
     def _stands_for_else(self, topic: str) -> bool:
-        """True if a topic is that of a node as a whole, of a group, or of their companions."""
+        """Return True if a topic is that of a node as a whole, of a group, or of their companions."""
         _, _, rest = topic.partition(f"/{self.station}/")
         if not topic.startswith(f"/{self.station}/") or not rest:
             return False

@@ -1,11 +1,11 @@
-"""Messages of several channels: a vector group of the Meta-TEDS whose unit says what it is, and range finders.
+"""Messages of several channels: a vector group of the Meta-TEDS whose unit determines the type, and range finders.
 
 | channels | message | topic |
 |---|---|---|
 | three of T | sensor_msgs/MagneticField | ``/<station>/<node>/magnetic_field`` |
 | three of m/s², three of rad/s, or both | sensor_msgs/Imu | ``…/imu`` |
 | three of N and three of N·m | geometry_msgs/WrenchStamped | ``…/wrench`` |
-| one in m of what is called a range finder | sensor_msgs/Range | the channel's own |
+| one in m of a channel named as range finder | sensor_msgs/Range | the channel's own |
 
 The members of a vector group (Meta-TEDS, VGroup) are its axes x, y, z in their order. What is not measured is said as
 sensor_msgs asks: the first element of its covariance is -1. A covariance of 0 is unknown.
@@ -145,7 +145,7 @@ def _vectors(sensors: Mapping[int, ChannelFacts]) -> dict[object, list[list[Chan
 
 
 def is_range(facts: ChannelFacts) -> bool:
-    """True if a channel is a range finder: by its unit and the name in profile or datasheet."""
+    """Return True if a channel is a range finder: by its unit and the name in profile or datasheet."""
     words = f"{facts.quantity} {facts.name}".lower().replace("_", " ").replace("-", " ")
     return facts.kind == "sensor" and facts.units == _LENGTH and any(word in words for word in _RANGE_WORDS)
 

@@ -199,7 +199,7 @@ class NodeDirectory:
         return [(channel["number"], channel["name"]) for channel in self._sheet(uuid)]
 
     def known(self, uuid: str) -> bool:
-        """True if there is anything to show of a node."""
+        """Return True if there is anything to show of a node."""
         with self._lock:
             return uuid in self._rows or uuid in self._seen
 

@@ -388,7 +388,7 @@ class LinkWatch:
             self._live.event("link", place=self.place, state="strangers", count=count)
 
     def _wanted(self, contact: Contact) -> bool:
-        """True if detection shows this node: whitelist mode shows others as a count."""
+        """Return True if detection shows this node: whitelist mode shows others as a count."""
         return self._transparent() or is_listed(self._station, contact.identity.uuid)
 
     def _serve(self, contact: Contact) -> None:

@@ -167,7 +167,7 @@ class NodeJobs:
         return None if port is None else self._find(port, uuid)
 
     def on_a_bus(self, uuid: str) -> bool:
-        """True if a node is on a bus of this station now."""
+        """Return True if a node is on a bus of this station now."""
         return self._bus_of(uuid) is not None
 
     def _bus_of(self, uuid: str) -> Port | None:

@@ -95,7 +95,7 @@ async def body_of(request: Request, shape: type[Shape]) -> Shape:
 
 
 def _is_short(value: object) -> bool:
-    """True if a member is short enough for the audit log: no datasheet, no calibration."""
+    """Return True if a member is short enough for the audit log: no datasheet, no calibration."""
     if isinstance(value, list | tuple):
         return len(value) <= _MOST_IN_LOG and all(map(_is_short, value))
     return isinstance(value, bool | int | float) or (isinstance(value, str) and len(value) <= _LONGEST_IN_LOG)

@@ -123,7 +123,7 @@ class Tokens:
         return found
 
     def is_good(self, digest: str) -> bool:
-        """True if the token of this digest is still valid: neither removed nor expired."""
+        """Return True if the token of this digest is still valid: neither removed nor expired."""
         now = time.time()
         return any(token.digest == digest and (not token.until or token.until > now) for token in self._read())
 

@@ -196,7 +196,7 @@ class Board:
     # -- actuators -------------------------------------------------------------------------------------------------
 
     def bears(self, channel: int, data_set: bytes) -> bool:
-        """True if a raw value is between those of LowLimit and HiLimit."""
+        """Return True if a raw value is between those of LowLimit and HiLimit."""
         low, high = self._bounds[channel]
         return low <= self.converters[channel].raw_of(data_set) <= high
 
@@ -258,7 +258,7 @@ class Board:
         return self.now() < self._testing.get(channel, 0)
 
     def fault(self, channel: int) -> bool:
-        """True if a test put a fault in (``faults``)."""
+        """Return True if a test put a fault in (``faults``)."""
         return channel in self.faults
 
     def power(self) -> PowerReply:

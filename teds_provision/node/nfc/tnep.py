@@ -55,7 +55,10 @@ def out_of_band_record(address: bytes, *, random: bool) -> NdefRecord:
 
 
 def is_poller_information(record: NdefRecord) -> bool:
-    """True if a reader reports how it charges; it may write that at any time, into the mailbox that TNEP uses."""
+    """Return True if a reader reports how it charges.
+
+    It may write that at any time, into the mailbox that TNEP uses.
+    """
     return record.is_well_known(POLLER)
 
 

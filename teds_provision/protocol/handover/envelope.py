@@ -199,7 +199,7 @@ class _Outline:
         self.last = self.octets
 
     def _is_run(self, piece: bytes, here: int) -> bool:
-        """True if a piece is nothing but base64url, and begins or continues the run."""
+        """Return True if a piece is nothing but base64url, and begins or continues the run."""
         if len(piece) < PIECE or self.last not in (0, here):
             return False
         begins_in_an_escape = not self.last and b"\\" in self.text[-_ESCAPE:]

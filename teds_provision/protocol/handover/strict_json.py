@@ -397,7 +397,7 @@ class Members:
 
 
 def is_label(text: str) -> bool:
-    """True if a text may be shown to people: printable, at most 1,024 characters."""
+    """Return True if a text may be shown to people: printable, at most 1,024 characters."""
     return text.isprintable() and len(text) <= _MAX_TEXT
 
 

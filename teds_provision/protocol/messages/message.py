@@ -70,7 +70,7 @@ class Message:
 
 
 def looks_like_message(octets: bytes) -> bool:
-    """True if header, length and codes fit a known command, reply or network service; never for a TEDS."""
+    """Return True if header, length and codes fit a known command, reply or network service; never for a TEDS."""
     return _sniff(octets) != "unknown"
 
 

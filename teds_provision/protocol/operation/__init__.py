@@ -1,10 +1,10 @@
 """Measurement operation: claims, data sets, actuators, streams, clock, trigger (operation.md). Pure, both roles.
 
 Nothing here does I/O, waits or reads a clock. Times are integers: node ticks and station times in ns, ``gap`` in µs,
-leases in s, dead-men in ms. Data sets are raw octets as ModLenth and DatModel say.
+leases in s, dead-men in ms. Data sets are raw octets as in ModLenth and DatModel.
 
-Where things are
-----------------
+Contents
+--------
 ================  ====================================================================================================
 ``commands``      payloads of claims and values: ``Operate`` ``idle`` ``Operation`` ``read_data_set`` ``write_data_set``
                   ``sample`` ``Sampled`` ``set_values`` ``run_self_test`` ``Power``
@@ -14,10 +14,10 @@ Where things are
 ``can_frames``    identifiers and cutting on CAN and BLE: ``cut`` ``Assembly`` ``data_address`` ``trigger_station``
 ``budget``        the node's budget in ppm, the load of a CAN bus
 ``subscription``  station: ``Plan`` (Subscribe and the check of its reply), ``Receiver`` (opens messages, counts)
-``timing``        station: ``ClockSample`` (offset, bound, lies), ``Token`` (trigger)
+``timing``        station: ``ClockSample`` (offset, bound, dishonest clocks), ``Token`` (trigger)
 ``driving``       station: ``Driver`` (Drive messages)
-``hardware``      node: what the firmware below gives (``Hardware``, ``Port``)
-``claims``        node: who claims what, leases, dead-men, safe states
+``hardware``      node: the interface of the firmware below (``Hardware``, ``Port``)
+``claims``        node: claims, leases, dead-men, safe states
 ``streams``       node: streams, their budget, messages being filled and sent
 ``role``          node: every command of operation.md inside a session; used by ``Tim``
 ================  ====================================================================================================
@@ -33,7 +33,7 @@ A station, in order
 
 A node
 ------
-``Tim(..., hardware=...)``; the link tells it what only a link knows:
+``Tim(..., hardware=...)``; the link reports what only a link knows:
 
 * ``tim.handle(frame, link=…, tapped=…)`` as before; then, when the reply has left, ``tim.reply_left(link)``;
 * ``tim.poll()`` again and again: takes samples, runs leases and dead-men; gives the seconds until it wants to be
@@ -41,7 +41,7 @@ A node
 * ``tim.next_frame_in()`` and ``tim.next_frame(bus)`` for a link that streams: when the next data frame may begin, and
   that frame; one at a time to the controller;
 * ``tim.trigger(link, token, tick)`` and ``tim.drive(link, octets)`` for what comes without a reply;
-* ``tim.actuator_claimed()`` before it moves to another CAN address; ``tim.link_lost(link)`` at bus-off, as ever.
+* ``tim.actuator_claimed()`` before it moves to another CAN address; ``tim.link_lost(link)`` at bus-off, as before.
 """
 
 from typing import TYPE_CHECKING

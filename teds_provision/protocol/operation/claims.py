@@ -49,7 +49,7 @@ class Claims:
         return frozenset(sensors | acting)
 
     def holds(self, session: NodeSession, channel: int) -> bool:
-        """True if a session claims a channel."""
+        """Return True if a session claims a channel."""
         held = self.actuators.get(channel)
         return (held is not None and held.session is session) or session in self._sensors.get(channel, ())
 

@@ -67,13 +67,13 @@ class Hardware(Protocol):
         """Return the present tick."""
 
     def keeps(self, period: int) -> bool:
-        """True if the clock keeps a period of so many ns on average."""
+        """Return True if the clock keeps a period of so many ns on average."""
 
     def read(self, channel: int, tick: int) -> RawReading:
         """Return the value of a sensor at ``tick``, which is now or a little before."""
 
     def bears(self, channel: int, data_set: bytes) -> bool:
-        """True if the hardware of an actuator accepts this raw value."""
+        """Return True if the hardware of an actuator accepts this raw value."""
 
     def apply(self, values: Mapping[int, bytes]) -> None:
         """Give actuators their values, all together."""
@@ -91,7 +91,7 @@ class Hardware(Protocol):
         """True if its self-test runs."""
 
     def fault(self, channel: int) -> bool:
-        """True if its hardware has a fault, or its last self-test failed."""
+        """Return True if its hardware has a fault, or its last self-test failed."""
 
     def power(self) -> PowerReply:
         """Battery and charge."""
@@ -122,7 +122,10 @@ def port_of(link: str) -> SessionPort:
 
 
 def teds_fits(own: ChannelHardware, teds: bytes | None) -> bool:
-    """True if a stored Channel TEDS matches the firmware: ChanType, DatModel, ModLenth, and ActHalt if present."""
+    """Return True if a stored Channel TEDS matches the firmware.
+
+    Compared: ChanType, DatModel, ModLenth, and ActHalt if present.
+    """
     if teds is None:
         return False
     said = channel_from(decode(teds))

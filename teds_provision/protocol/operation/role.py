@@ -112,7 +112,7 @@ class OperationRole:
         return self._hardware.now()
 
     def knows(self, command: Command) -> bool:
-        """True if a command is one of operation.md."""
+        """Return True if a command is one of operation.md."""
         return (command.command_class, command.function) in self._commands
 
     def run(self, inner: InnerCommand) -> Reply:

@@ -166,7 +166,7 @@ class Sender:
             self._stream, self._pieces, self._next = None, None, None
 
     def sends(self, stream: Stream) -> bool:
-        """True if a message of this stream is being sent."""
+        """Return True if a message of this stream is being sent."""
         return self._stream is stream
 
     def due(self, streams: list[Stream]) -> int | None:
@@ -214,5 +214,5 @@ def gap(streams: list[Stream]) -> int:
 
 
 def waits(start: int) -> bool:
-    """True if a start means that the stream waits for a trigger."""
+    """Return True if a start means that the stream waits for a trigger."""
     return start == WAITS

@@ -244,7 +244,7 @@ class Receiver:
         return good
 
     def _jumps(self, counter: int) -> bool:
-        """True if a counter that does not follow is a later one: the messages between are lost."""
+        """Return True if a counter that does not follow is a later one: the messages between are lost."""
         if counter <= self.last:
             self.counts.late += 1
             return False
@@ -299,7 +299,7 @@ class Receiver:
         return b"".join(rows)
 
     def _fresh(self, tick: int, low: int, high: int) -> bool:
-        """True if it is after the one before, neither from the future nor too old; else count it.
+        """Return True if it is after the one before, neither from the future nor too old; else count it.
 
         The node's tick is between ``low`` and ``high``.
         """

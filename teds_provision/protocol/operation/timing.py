@@ -79,5 +79,5 @@ def commitment(token: bytes) -> bytes:
 
 
 def mark_is_honest(mark: int, seen: TickBounds) -> bool:
-    """True if a node's mark matches the time, in its ticks, at which the station sent the trigger frame."""
+    """Return True if a node's mark matches the time, in its ticks, at which the station sent the trigger frame."""
     return seen.low <= mark <= seen.high

@@ -132,12 +132,12 @@ _PATTERNS: Final = {
 
 
 def is_form(kind: str, value: object) -> bool:
-    """True if a value is a text of one of the forms: uuid, sha256, digits, point, time, random_id."""
+    """Return True if a value is a text of one of the forms: uuid, sha256, digits, point, time, random_id."""
     return isinstance(value, str) and _PATTERNS[kind][0].fullmatch(value) is not None
 
 
 def is_time(value: object) -> bool:
-    """True if a value is an existing time of that form: the 31st of February is none."""
+    """Return True if a value is an existing time of that form: the 31st of February is none."""
     try:
         return is_form("time", value) and datetime.fromisoformat(str(value)) is not None
     except ValueError:
@@ -145,17 +145,17 @@ def is_time(value: object) -> bool:
 
 
 def is_number(value: object) -> bool:
-    """True if a value is a whole number of 0 to 2^32 - 1 (true is none)."""
+    """Return True if a value is a whole number of 0 to 2^32 - 1 (true is none)."""
     return type(value) is int and 0 <= value <= LAST_NUMBER
 
 
 def is_name(value: object) -> bool:
-    """True if a value is 1 to 100 printable characters without space at either end."""
+    """Return True if a value is 1 to 100 printable characters without space at either end."""
     return isinstance(value, str) and 1 <= len(value) <= LONGEST_NAME and value.isprintable() and value == value.strip()
 
 
 def is_text(value: object) -> bool:
-    """True if a value is printable and of at most 1,024 characters."""
+    """Return True if a value is printable and of at most 1,024 characters."""
     return isinstance(value, str) and len(value) <= LONGEST_TEXT and value.isprintable()
 
 

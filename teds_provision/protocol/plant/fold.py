@@ -210,7 +210,7 @@ def _pin_conflicts(
 
 
 def bans(roster: Roster, statement: BanStatement, own: LocalState, liftings: Mapping[str, Collection[str]]) -> bool:
-    """True if a statement bans its node here.
+    """Return True if a statement bans its node here.
 
     Its signer is a keeper, or by one's own store holds or was given the node's key; a removed one's statement counts
     only from its own pages, up to ``last``. It ends when a keeper lifts it, its signer, or here an operator.

@@ -120,7 +120,7 @@ class Roster:
         return found.roles if found is not None else frozenset()
 
     def has(self, fingerprint: str, role: Role) -> bool:
-        """True if a member has this role now."""
+        """Return True if a member has this role now."""
         found = self.member(fingerprint)
         return found is not None and role in found.roles
 

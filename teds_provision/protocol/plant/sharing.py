@@ -29,7 +29,7 @@ def receivers(roster: Roster, sender: str, share: Share) -> tuple[str, ...]:
 
 
 def shares_any(shares: Iterable[Share], view: MergedClaims, sender: str) -> bool:
-    """True if any share covers the node: all, a profile that the sender wrote on it, a group.
+    """Return True if any share covers the node: all, a profile that the sender wrote on it, a group.
 
     A group is the sender's own, or a keeper's: else any member could add a node to a group that shares its key.
     """
@@ -42,7 +42,7 @@ def shares_any(shares: Iterable[Share], view: MergedClaims, sender: str) -> bool
 
 
 def gave_away(view: MergedClaims, station: str) -> bool:
-    """True if a station gave the node away by a move that is still in force."""
+    """Return True if a station gave the node away by a move that is still in force."""
     return any(giver == station and mode == "move" for giver, _, _, _, mode, _ in view.gave)
 
 
@@ -121,13 +121,16 @@ def why_not(
 
 
 def _claims(view: MergedClaims, sender: str, node: str) -> bool:
-    """True if the sender names this node key, else any station: as there is no conflict, none names another one."""
+    """Return True if the sender names this node key, else any station.
+
+    As there is no conflict, none names another one.
+    """
     named = [view.pins[sender]] if sender in view.pins else list(view.pins.values())
     return any(same_key(fingerprint, node) for fingerprint in named)
 
 
 def forgets(roster: Roster, me: str, fitting: Iterable[Share], taken: Collection[str]) -> bool:
-    """True if a key may be deleted here.
+    """Return True if a key may be deleted here.
 
     That needs shares that allow it, none that names me, and receipts of all their receivers.
     """

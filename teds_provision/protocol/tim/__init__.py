@@ -5,7 +5,7 @@ the hardware are injected. One :class:`Tim` serves all links of a node.
 
 ==============  ======================================================================================================
 ``node``        :class:`Tim`: routing, Identify, Prove, Reset, List
-``permission``  where a command came from, which command may be run when, and what claims forbid
+``permission``  the origin of a command, when each may be run, and what claims forbid
 ``node_sessions``    Open, Sealed, the lives of sessions
 ``node_agreement``    Request and Confirm
 ``teds_access`` Query, Read, Write, Update, and the commit

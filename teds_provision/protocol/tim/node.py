@@ -234,11 +234,11 @@ class Tim:
             self._role.streams.unheard(session)
 
     def in_session(self, link: str) -> bool:
-        """True if a session is open on this link."""
+        """Return True if a session is open on this link."""
         return self._sessions.on(link) is not None
 
     def actuator_claimed(self) -> bool:
-        """True if a session claims an actuator."""
+        """Return True if a session claims an actuator."""
         return self._role is not None and bool(self._role.claims.actuators)
 
     # -- routing ---------------------------------------------------------------------------------------------------

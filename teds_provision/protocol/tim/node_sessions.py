@@ -95,7 +95,7 @@ class Sessions:
         return made.reply
 
     def any_on(self, link: str) -> bool:
-        """True if a session or half-open Open of this link lives; drops those whose time is over."""
+        """Return True if a session or half-open Open of this link lives; drops those whose time is over."""
         held = self._links.get(link)
         if held is None:
             return False

@@ -137,5 +137,5 @@ class Permission:
 
 
 def of_teds(command: Command) -> bool:
-    """True if it is Query, Read, Write or Update."""
+    """Return True if it is Query, Read, Write or Update."""
     return command.command_class == COMMON and command.function in _TEDS_FUNCTIONS

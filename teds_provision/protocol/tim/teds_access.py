@@ -139,7 +139,7 @@ class TedsAccess:
         return Reply(True, self._status(flash, block, staged[block]).encode()), state
 
     def _can_list(self, blocks: set[BlockId]) -> bool:
-        """True if the reply to List, sealed, still fits into one message."""
+        """Return True if the reply to List, sealed, still fits into one message."""
         return _ENTRY_OCTETS * len(blocks) <= self.max_message - LIST_OVERHEAD
 
     def _status(self, flash: Flash, block: BlockId, teds: bytes | None) -> TedsStatus:

@@ -102,7 +102,7 @@ class OverviewTables:
         )
 
     def is_known(self, uuid: bytes) -> bool:
-        """True if anything is known of a node."""
+        """Return True if anything is known of a node."""
         row = self._database.one(f"SELECT {_IS_KNOWN}", (uuid,))
         return row is not None and bool(row[0])
 

@@ -130,7 +130,7 @@ class Calibration:
             return None
 
     def overdue(self, now: datetime) -> bool:
-        """True if the due date has passed."""
+        """Return True if the due date has passed."""
         return self.due is not None and self.due < now
 
     def date_warnings(self, now: datetime, demanded_interval: float | None = None) -> list[str]:
@@ -305,12 +305,12 @@ def _seconds(value: object) -> float | None:
 
 
 def is_sound(calibration: Calibration) -> bool:
-    """True if it can be computed: every number of it is a number, and the boundaries of its segments ascend."""
+    """Return True if it can be computed: every number of it is a number, and the boundaries of its segments ascend."""
     return is_finite(calibration) and all(part.ascending for part in calibration.inputs)
 
 
 def is_finite(calibration: Calibration) -> bool:
-    """True if every number of it is a number."""
+    """Return True if every number of it is a number."""
     numbers = [*calibration.coefficients, calibration.zero_offset]
     for part in calibration.inputs:
         numbers += [*part.boundaries, *part.offsets]

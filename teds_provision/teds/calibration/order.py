@@ -17,7 +17,7 @@ from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
 
 def is_number(value: object) -> bool:
-    """True if a value is a finite number that a Float32 may hold."""
+    """Return True if a value is a finite number that a Float32 may hold."""
     return type(value) in (int, float) and abs(value) <= FLOAT32_MAXIMUM  # type: ignore[arg-type]
 
 

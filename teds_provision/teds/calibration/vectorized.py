@@ -192,7 +192,7 @@ def _most(interpreter: ChannelInterpreter) -> float:
 
 
 def _can_stand_beside(interpreter: ChannelInterpreter) -> bool:
-    """True for a sensor of unsigned integers with a curve over its own raw value, of not too many segments, or none."""
+    """Return True for a sensor of unsigned integers with few segments over its own raw value, or without a curve."""
     if interpreter.reader.form.model != DataModel.UNSIGNED or interpreter.channel.actuator or interpreter.others:
         return False
     curve = interpreter.channel.calibration

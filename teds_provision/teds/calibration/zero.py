@@ -48,7 +48,7 @@ class SampleStatistics:
         return _SIGMAS * self.spread / math.sqrt(self.count) + 4 * _STEP * abs(self.mean)
 
     def restless(self, most: float) -> bool:
-        """True if it spreads, or drifts, by more than ``most``."""
+        """Return True if it spreads, or drifts, by more than ``most``."""
         return max(self.spread, abs(self.drift)) > most
 
 

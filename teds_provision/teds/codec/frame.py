@@ -119,15 +119,15 @@ def _is_message(octets: bytes) -> bool:
 
 
 def _counts(octets: bytes, at: int) -> bool:
-    """True if the u16 at ``at`` counts what follows it to the octet."""
+    """Return True if the u16 at ``at`` counts what follows it to the octet."""
     return len(octets) >= at + 2 and int.from_bytes(octets[at : at + 2], "big") == len(octets) - at - 2
 
 
 def _is_service(octets: bytes) -> bool:
-    """True for a network service of 2024: type 1 to 9, id, message type 1 to 5, length."""
+    """Return True for a network service of 2024: type 1 to 9, id, message type 1 to 5, length."""
     return _counts(octets, 3) and 1 <= octets[0] <= 9 and 1 <= octets[2] <= 5
 
 
 def _is_command(octets: bytes) -> bool:
-    """True for a command of 2007: channel u16, class 1 to 7 or a maker's, function, length."""
+    """Return True for a command of 2007: channel u16, class 1 to 7 or a maker's, function, length."""
     return _counts(octets, 4) and octets[3] != 0 and (1 <= octets[2] <= 7 or octets[2] >= 128)

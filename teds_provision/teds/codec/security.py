@@ -203,7 +203,7 @@ def _without_signature(uuid: bytes, block: bytes, places: list[tuple[int, int, i
 
 
 def has_profile_version(teds: bytes) -> bool:
-    """True if the tuples close and field 105 is there: such a TEDS is canonical or refused."""
+    """Return True if the tuples close and field 105 is there: such a TEDS is canonical or refused."""
     try:
         return any(number == PROFILE_VERSION for number, _, _ in _places(unframe(teds)))
     except BadDataError:

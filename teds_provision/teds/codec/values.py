@@ -108,7 +108,7 @@ def units_of(packed: bytes) -> Units:
 
 
 def is_packed_units(raw: bytes) -> bool:
-    """True if a UNITS value is packed (10 or 11 octets, interpretation first) rather than a run of tuples."""
+    """Return True if a UNITS value is packed (10 or 11 octets, interpretation first) rather than a run of tuples."""
     return len(raw) in (10, 11) and raw[0] <= 5
 
 

@@ -27,7 +27,7 @@ _LINE_DIGITS: Final = 64
 
 
 def looks_like_hex(text: str) -> bool:
-    """True if a text holds hex digits and nothing else, comments aside."""
+    """Return True if a text holds hex digits and nothing else, comments aside."""
     some = False
     for line in text.splitlines():
         digits = _digits(line)

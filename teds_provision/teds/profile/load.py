@@ -94,7 +94,7 @@ def parse_profile(text: str, name: str = "profile") -> Profile:
 
 
 def is_profile_name(text: str) -> bool:
-    """True if ``find_profile`` treats this as a name, looked for in the folders, and never as a path."""
+    """Return True if ``find_profile`` treats this as a name, looked for in the folders, and never as a path."""
     return _NAME.match(text) is not None and not text.endswith(".toml")
 
 

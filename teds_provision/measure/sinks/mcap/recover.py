@@ -202,7 +202,7 @@ def _indexes(places: _Places) -> list[bytes]:
 
 
 def _names_all(found: dict[int, bytes], places: _Places) -> bool:
-    """True if the contents of message indexes name exactly these messages."""
+    """Return True if the contents of message indexes name exactly these messages."""
     told = {channel: sorted(struct.iter_unpack("<QQ", index[6:])) for channel, index in found.items() if len(index) > 6}
     return told == {channel: sorted(entries) for channel, entries in places.items()}
 
@@ -492,7 +492,7 @@ def _describe(summary: McapSummary, code: int, content: bytes) -> None:
 
 
 def _fits(content: bytes) -> bool:
-    """True if the lengths within a chunk and the chunk's own agree."""
+    """Return True if the lengths within a chunk and the chunk's own agree."""
     if len(content) < CHUNK_HEAD.size + 12:
         return False
     name = int.from_bytes(content[CHUNK_HEAD.size : CHUNK_HEAD.size + 4], "little")
@@ -529,7 +529,7 @@ def unpacked(content: bytes, path: Path, most: int = LARGEST_RECORD) -> tuple[by
 
 
 def _parses(code: int, content: bytes) -> bool:
-    """True if the parts of a record end at its end; other records than these are not checked."""
+    """Return True if the parts of a record end at its end; other records than these are not checked."""
     try:
         if code == METADATA:
             return _after_map(content, _after_text(content, 0)) == len(content)

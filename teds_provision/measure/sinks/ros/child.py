@@ -32,7 +32,7 @@ PROBING = 60.0  # seconds: an import of rospy takes one on a machine that is not
 
 
 def imports(python: str, packages: str, environment: dict[str, str]) -> bool:
-    """True if this Python can import these packages (``a, b.c``) in this environment."""
+    """Return True if this Python can import these packages (``a, b.c``) in this environment."""
     try:
         probe = [python, "-s", "-c", f"import {packages}"]
         done = subprocess.run(probe, env=environment, capture_output=True, timeout=PROBING, check=False)

@@ -69,7 +69,7 @@ def keep_on_loopback(ports: range) -> None:
 
 
 def on_this_machine_alone() -> bool:
-    """True if the environment keeps ROS 2 on this machine; ROS_LOCALHOST_ONLY is its older name."""
+    """Return True if the environment keeps ROS 2 on this machine; ROS_LOCALHOST_ONLY is its older name."""
     local = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() in ("LOCALHOST", "OFF")
     return (local and not os.environ.get("ROS_STATIC_PEERS")) or os.environ.get("ROS_LOCALHOST_ONLY") == "1"
 

@@ -2,7 +2,7 @@
 
 Nothing of this package is imported here, and nothing but rospy beside the standard library: that Python has other
 versions of everything. Out go lines of JSON too: ready, and set points of actuators. It ends when stdin closes, and
-with exit code 3 when the master is gone or has been started anew, 4 when another program took the node's name (the
+with exit code 3 when the master is gone or was restarted, 4 when another program took the node's name (the
 parent then starts another one).
 
 Lines in: ``{"op": "topic", "id": 1, "topic": "/a", "type": "std_msgs/Float64", "latch": false}``,
@@ -110,7 +110,7 @@ class Outlet:
         return True
 
     def sent(self) -> bool:
-        """True if its connections have taken all of it; their queues are rospy's own."""
+        """Return True if its connections have taken all of it; their queues are rospy's own."""
         connections = getattr(self.publisher.impl, "connections", ()) if self.publisher.impl else ()
         return not any(getattr(connection, "_queue", ()) for connection in connections)
 
