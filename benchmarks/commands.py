@@ -51,7 +51,7 @@ class Rows:
 
 @contextmanager
 def station(*, quick: bool = False) -> Iterator[Path]:
-    """A home with a station; ``quick``: its passphrase costs next to nothing."""
+    """Yield a home with a station; ``quick``: its passphrase costs next to nothing."""
     forget_vaults()
     with tempfile.TemporaryDirectory(dir=os.environ.get("BENCH_DISK")) as folder:
         home = Path(folder) / "home"
@@ -114,10 +114,10 @@ def timed(home: Path, *words: str) -> float:
 
 
 def fixed_cost(rows: Rows) -> None:
-    """What a command costs from its start to its verdict beside link, node and Argon2id, least of seven.
+    """Measure a command from its start to its verdict, without link, node and Argon2id; least of seven.
 
-    Links are not paced, so a board of ``--watch`` takes what link and node take, and the 10 ms that are ours between
-    the exchanges. ``provision`` over CAN is given the UUID: without it, the contract has it listen 0.3 s for a second
+    Links are not paced, so a board of ``--watch`` takes what link and node take, and our own 10 ms between the
+    exchanges. ``provision`` over CAN is given the UUID: without it, the contract requires listening 0.3 s for a second
     node.
     """
     stretched = min(timeit.repeat(lambda: SealingKey.derive(PASSPHRASE, costs=PRODUCT), number=1, repeat=7))

@@ -37,7 +37,7 @@ def classic(sizes: Sizes) -> float:
 
 
 def fd(sizes: Sizes) -> float:
-    """The same on FD, 500 kbit/s and 2 Mbit/s."""
+    """Return the same on FD, 500 kbit/s and 2 Mbit/s."""
     full = _fd_frame(64)
     flow = fd_seconds(_IDENTIFIER, _FLOW, BITRATE, DATA_BITRATE)
     total = 0.0
@@ -58,12 +58,12 @@ def _fd_frame(octets: int) -> float:
 
 
 def type4(sizes: Sizes) -> float:
-    """The same on a Type 4 tag at 106 kbit/s: each message with its length in as few commands as it fits into."""
+    """Return the same on a Type 4 tag at 106 kbit/s: message and length in as few commands as possible."""
     return sum(_written(request) + _answer(reply) for request, reply in sizes)
 
 
 def type4_in_two_steps(sizes: Sizes) -> float:
-    """The same with the length read by a command of its own, as NFC Forum's read procedure has it."""
+    """Return the same with the length read by a separate command, as in NFC Forum's read procedure."""
     return sum(
         _written(request) + _block(5, 4) + sum(_block(5, octets + 2) for octets in _cut(_RECORD + _STATUS + reply))
         for request, reply in sizes

@@ -79,7 +79,7 @@ def plant_of_two(folder: Path, server: Cluster) -> Iterator[tuple[Path, Path, Pa
 
 
 def make_job(office: Path, line: Path, boards: int) -> str:
-    """A job for the line, signed for by the office, sent and known there."""
+    """Make a job for the line, signed for by the office, sent and known there."""
     words = ("--title", "bench", "--profile", ANGLE, "--station", "line", "--count", str(boards), "--sign", "office")
     job: str = json.loads(finished(started(office, "job", "new", *words, "--ends", "2099-01-01")))["id"]
     finished(started(office, "job", "send", job))

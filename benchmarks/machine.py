@@ -19,7 +19,7 @@ _SYNCS = 20
 
 
 def checks_a_second(cores: int) -> float:
-    """Checks of a P-256 signature that openssl makes here and now, in a second of the processor, on so many at once."""
+    """Return openssl's P-256 signature checks here and now, in a second of the processor, on so many cores."""
     words = ["openssl", "speed", "-seconds", "2", "ecdsap256"]
     speeds = [
         subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) for _ in range(cores)
@@ -73,7 +73,7 @@ def _median(act: Callable[[], None], times: int) -> float:
 
 
 def line() -> str:
-    """The line: Python, cores, load, and what openssl, the disk and the scheduler do here and now."""
+    """Return the line: Python, cores, load, and the present speed of openssl, the disk and the scheduler."""
     cores = len(os.sched_getaffinity(0))
     return (
         f"machine: Python {sys.version.split()[0]}, {cores} cores, load {os.getloadavg()[0]:.1f}; openssl"

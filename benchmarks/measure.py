@@ -98,7 +98,7 @@ def bare(raw: np.ndarray) -> object:
 
 
 def calibrated(raw: np.ndarray) -> object:
-    """A table, limits, NaN beyond them."""
+    """Calibrate by a table and limits; NaN beyond them."""
     value = np.interp(raw, KNOTS, VALUES)
     valid = (value >= LOW) & (value <= HIGH)
     if not valid.all():

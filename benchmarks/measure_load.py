@@ -70,7 +70,7 @@ def plan_of(stream: int) -> StreamPlan:
 
 
 def sheet_of(node: int) -> Sheet:
-    """A datasheet of 25 channels, each with a table of two segments."""
+    """Return a datasheet of 25 channels, each with a table of two segments."""
     text = PROFILE.read_text(encoding="utf-8").replace("1-12", f"1-{CHANNELS}")
     before, _, after = text.partition("members = [")
     profile = parse_profile(f"{before}members = {list(range(1, CHANNELS + 1))}{after.partition(']')[2]}")
@@ -96,7 +96,7 @@ class Feeder:
         ]
 
     def send(self, node: int, counter: int) -> None:
-        """A message of each stream of a node."""
+        """Send a message of each stream of a node."""
         bus = self._buses[node % len(self._buses)]
         for stream, bodies in enumerate(self._bodies):
             octets = self._sealer.seal(counter, bodies[(counter + node) % BODIES])
@@ -154,7 +154,7 @@ class Load:
         return int(self.seconds * RATE / N) * N * CHANNELS * self.nodes
 
     def told(self) -> str:
-        """The row of the table."""
+        """Return the row of the table."""
         below = np.cumsum(self.lags)
         p50, p99 = (float(np.searchsorted(below, below[-1] * share)) * STEP for share in (0.50, 0.99))
         cores = self.cpu / self.seconds
@@ -278,7 +278,7 @@ def _watch(machine: Machine, feeder: subprocess.Popen[str], began: int) -> None:
 
 
 def _add_up(load: Load, machine: Machine, sinks: list[Sink], messages: int) -> None:
-    """What the receivers and the sinks counted."""
+    """Add up the counts of receivers and sinks."""
     receivers = [stream.receiver for stream in machine.heard.values()]
     load.lost = sum(receiver.counts.lost + messages - 1 - receiver.last for receiver in receivers)
     load.late = sum(receiver.counts.late + receiver.counts.stale for receiver in receivers)
@@ -287,7 +287,7 @@ def _add_up(load: Load, machine: Machine, sinks: list[Sink], messages: int) -> N
 
 
 def _wrong(sink: Sink, values: int) -> str:
-    """What went wrong with a sink; a recorder must have written everything."""
+    """Return what went wrong with a sink; a recorder must have written everything."""
     if sink.files and sink.stats.written < values:
         return f"{sink.name} wrote {sink.stats.written} of {values}: {sink.stats.error}"
     return sink.stats.error

@@ -54,7 +54,7 @@ CALIBRATION = "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n"
 
 
 def provisioned(station: Station, folder: Path, name: str) -> bytes:
-    """A node with a signed, calibrated datasheet; its UUID."""
+    """Provision a node with a signed, calibrated datasheet; return its UUID."""
     create(folder, name=name, profile=TYPE)
     node = VirtualNode(folder)
     (folder / "calibration.csv").write_text(CALIBRATION)
@@ -65,7 +65,7 @@ def provisioned(station: Station, folder: Path, name: str) -> bytes:
 
 
 def serve(can: str, folders: Sequence[str]) -> None:
-    """The nodes' process: prints, for each, the host's time at which its clock stood at 0."""
+    """Run the nodes' process: print, for each, the host's time at which its clock was at 0."""
     pulse, server = RealtimeLoop(), CanServer(can)
     boards: dict[str, Board] = {}
     for folder in folders:

@@ -33,7 +33,7 @@ _EVERY = 60.0
 
 @contextmanager
 def whole_bus(home: Path, count: int) -> Iterator[str]:
-    """A bus of so many provisioned nodes in one process."""
+    """Yield a bus of so many provisioned nodes in one process."""
     link = f"udp_multicast:239.74.163.9?port={free_port()}&fd=1"
     with nodes("can", link, "--many", str(count)) as process:
         assert process.stdout is not None
@@ -77,7 +77,7 @@ def memory(process: subprocess.Popen[str]) -> float:
 
 
 def deaf_client(url: str, token: str) -> socket.socket:
-    """A WebSocket that is opened and never read."""
+    """Return a WebSocket that is opened and never read."""
     port = int(url.rpartition(":")[2])
     deaf = socket.create_connection(("127.0.0.1", port))
     deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

@@ -150,7 +150,7 @@ class Wire:
                 self.frames.append((time.monotonic(), frame))
 
     def seconds(self, since: float, until: float, *, address: int | None = None) -> tuple[float, float]:
-        """What commands and replies, and what data occupied of the wire; of one node, or of all."""
+        """Return the wire time of commands and replies, and of data; of one node, or of all."""
         talk = data = 0.0
         for at, frame in self._after(since):
             sender, to = frame.identifier & 0xFF, frame.identifier >> 8 & 0xFF
@@ -233,7 +233,7 @@ def until(found: Callable[[], Any], seconds: float = PATIENCE, why: str = "It di
 
 @contextmanager
 def temporary() -> Iterator[Path]:
-    """A folder on the disk of the benches."""
+    """Yield a folder on the disk of the benches."""
     with tempfile.TemporaryDirectory(dir=os.environ.get("BENCH_DISK")) as folder:
         yield Path(folder)
 

@@ -66,13 +66,13 @@ class CountingServer(CanServer):
 
 
 def made(folder: Path, delay: float) -> CountingNode:
-    """A new node in factory state; ``delay`` seconds a point operation."""
+    """Return a new node in factory state; ``delay`` seconds a point operation."""
     FlashFile.create(folder)
     return CountingNode(folder, delays=Delays(crypto=delay))
 
 
 def one_after_the_other(options: argparse.Namespace, place: Path) -> None:
-    """A line in, another node."""
+    """Serve another node for each line of input."""
     server: NfcServer | CanServer | None = None
     node: CountingNode | None = None
     for number, _ in enumerate(sys.stdin):
@@ -93,7 +93,7 @@ def one_after_the_other(options: argparse.Namespace, place: Path) -> None:
 
 
 def one_after_the_other_in_c(options: argparse.Namespace, place: Path) -> None:
-    """A line in, another node in C."""
+    """Serve another node in C for each line of input."""
     process: subprocess.Popen[str] | None = None
     for number, _ in enumerate(sys.stdin):
         told = ended(process) if process is not None else dict.fromkeys(("chip", "flash", "turned"), 0.0)

@@ -141,7 +141,7 @@ def _local(boards: int) -> None:
 
 
 def _history(nodes: int) -> None:
-    """The whole past of a plant lies on a stick; who joins today reads it there."""
+    """Measure joining with the whole past of a plant on a stick."""
     with tempfile.TemporaryDirectory(prefix="plant-history-") as folder:
         made = Plant(Path(folder))
         west, _ = made.member("west", "line", "sign"), made.member("south", "base")
@@ -161,7 +161,7 @@ def _history(nodes: int) -> None:
 
 
 def _told_of(uuid: bytes) -> list[dict[str, Any]]:
-    """What a line says of a board that it provisioned."""
+    """Return a line's events about a board that it provisioned."""
     at, who, digest = "2026-11-23T09:00:00Z", os.urandom(32).hex(), os.urandom(32).hex()
     written = {"epoch": 1, "sequence": 1, "teds_sha256": digest}
     kind = {"profile": "magnetic-angular-position-sensor", "profile_sha256": "ab" * 32, "due": "2027-11-23"}

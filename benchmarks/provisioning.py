@@ -124,7 +124,7 @@ class Disk:
         Database.execute = execute  # type: ignore[method-assign, assignment]
 
     def taken(self) -> tuple[float, int, int]:
-        """What came together (seconds, commits, those waited for), and begin anew."""
+        """Return the counts (seconds, commits, those waited for), and reset them."""
         all_three = self.seconds, self.commits, self.waited
         self.seconds, self.commits, self.waited = 0.0, 0, 0
         return all_three
@@ -155,7 +155,10 @@ class Run:
     turned: float = 0.0
 
     def ratio(self, delay: float) -> float:
-        """The whole, finding included, to the least that link, waits and node take; ``delay`` a point operation."""
+        """Return the ratio of the whole, finding included, to the least that link, waits and node take.
+
+        ``delay`` is the time of a point operation.
+        """
         node = self.operations * delay + self.chip + self.flash
         return (self.find + self.whole) / (self.octets + self.waits + node)
 
@@ -206,7 +209,7 @@ OWN_SHARE = 0.05
 
 @contextmanager
 def nodes(via: str, link: str, *extra: str) -> Iterator[subprocess.Popen[str]]:
-    """The process with the nodes, until the block ends."""
+    """Run the process with the nodes for the block."""
     process = subprocess.Popen(
         [sys.executable, "-m", "benchmarks.nodes", via, link, *extra],
         stdin=subprocess.PIPE,
@@ -291,7 +294,7 @@ def measure(station: Station, disk: Disk, line: Line, count: int) -> list[Run]:
 
 
 def _least(line: Line, sizes: limits.Sizes) -> tuple[float, float, float]:
-    """The least of octets, of the contract's waits, and of the exchanges alone; 0 for unpaced links."""
+    """Return the least of octets, of the contract's waits, and of the exchanges alone; 0 for unpaced links."""
     if line.limit is None:
         return 0.0, 0.0, 0.0
     return line.limit.octets(sizes), line.limit.waits(len(sizes)), line.limit.exchanges(sizes)

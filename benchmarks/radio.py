@@ -69,7 +69,7 @@ def _run(station: Station, links: LinkSettings, name: str) -> tuple[ProvisionRes
 
 
 def ble(place: Path, station: Station) -> None:
-    """A node that has a key gets a new datasheet over the air: identify to verdict."""
+    """Give a keyed node a new datasheet over the air: identify to verdict."""
     from tests.links.ble.radio import Radio
     from tests.links.ble.test_whole_runs import tapped_once
 
@@ -95,7 +95,7 @@ def ble(place: Path, station: Station) -> None:
 
 
 def pn532(place: Path, station: Station) -> None:
-    """A new node on a PN532 behind a serial line: from the tap to the verdict."""
+    """Provision a new node on a PN532 behind a serial line: from the tap to the verdict."""
     print("\nPN532 on a serial line, as fast as nfcpy sets it (chip model under nfcpy's own driver), paced")
     print(f"{'tag':>7} {'commands':>9} {'octets':>8} {'seconds':>8} {'limit':>7} {'ratio':>6}")
     for tag in ("4", "2"):
@@ -110,7 +110,7 @@ def pn532(place: Path, station: Station) -> None:
 
 @contextmanager
 def _serial(folder: Path, tag: str) -> Iterator[tuple[str, Callable[[], tuple[int, int, float]]]]:
-    """A reader on a pty with a node on it; at the end, what the chip counted: commands, octets, the least seconds."""
+    """Yield a reader on a pty with a node on it, and the chip's counters: commands, octets, the least seconds."""
     path = f"udp:localhost:{free_port()}"
     name = f"ttyTP{os.getpid()}{secrets.randbelow(1000)}"
     with _node(folder, "--nfc", path, "--tag", tag):
@@ -136,7 +136,7 @@ def _serial(folder: Path, tag: str) -> Iterator[tuple[str, Callable[[], tuple[in
 
 @contextmanager
 def _node(folder: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
-    """A node of its own in a process of its own."""
+    """Run a node in a process."""
     program = [sys.executable, "-m", "teds_provision", "--json", "node"]
     subprocess.run([*program, "create", str(folder)], check=True, stdout=subprocess.DEVNULL)
     running = subprocess.Popen([*program, "run", str(folder), *words], stdout=subprocess.PIPE, text=True)
@@ -150,7 +150,7 @@ def _node(folder: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def chips(place: Path, station: Station) -> None:
-    """A new node whose chip takes so long for a point operation, over paced links, step by step."""
+    """Provision a new node with a slow chip over paced links, step by step."""
     steps = ("identify", "agree", "build", "sign", "write", "verify")
     print("\nSlow chips: seconds of each step of `provision`, paced links, one new node each; the papers allow 10 s")
     print(f"{'link':<12} {'ms each':>8} " + " ".join(f"{step:>9}" for step in steps) + f" {'whole':>7}  {'of 10 s':>7}")

@@ -60,7 +60,7 @@ class Taken:
 
 
 def fill(home: Path, count: int) -> None:
-    """A station with so many provisioned nodes: pin, key, datasheet, and an entry of the audit log each."""
+    """Make a station with so many provisioned nodes: pin, key, datasheet, and an entry of the audit log each."""
     forget_vaults()
     costs = passphrase.THROWAWAY
     station, _ = initialise(home, name="n", keystore="file", ask=lambda p, c: PASSPHRASE, costs=costs)
@@ -111,7 +111,7 @@ def _key(station: Station, number: int) -> KeyRecord:
 
 
 def commands(folder: Path, count: int) -> Iterator[Row]:
-    """What is timed on a store of ``count`` nodes."""
+    """Yield the timed commands on a store of ``count`` nodes."""
     last = _uuid(count - 1).hex()
     listed = str(folder / f"whitelist{count}.csv")
     yield Row("--version", ("--version",))
@@ -152,7 +152,7 @@ def told(home: Path, *words: str) -> dict[str, Any]:
 
 
 def acquaint(folder: Path, home: Path, count: int) -> None:
-    """A second station, and each with the other's key: who hands over and who takes in."""
+    """Make a second station, and exchange keys: one hands over, one takes in."""
     receiver = folder / f"receiver{count}"
     keys = {"sender": told(home, "init"), RECEIVER: told(receiver, "init", "--keystore", "file", "--name", RECEIVER)}
     for at, name in ((receiver, "sender"), (home, RECEIVER)):
@@ -163,7 +163,7 @@ def acquaint(folder: Path, home: Path, count: int) -> None:
 
 @contextmanager
 def node(folder: Path) -> Iterator[None]:
-    """A factory node on the simulated reader of ``provision``."""
+    """Run a factory node on the simulated reader of ``provision``."""
     told(folder, "node", "create", str(folder / "node"))
     command = [sys.executable, "-m", "teds_provision", "node", "run", str(folder / "node")]
     process = subprocess.Popen([*command, "--nfc", f"udp:localhost:{NODE_PORT}"], stdout=subprocess.PIPE)

@@ -63,7 +63,7 @@ sys.stdin.read()
 
 @contextmanager
 def bus(*, socketcand: bool) -> Iterator[str]:
-    """What stands before the options of ``--can``: a multicast, or a server that gives each frame to all others."""
+    """Yield the bus for ``--can``: a multicast, or a server that gives each frame to all others."""
     if not socketcand:
         yield f"udp_multicast:239.74.163.10?port={free_port()}"
         return
@@ -94,7 +94,7 @@ def seconds_of_a_message(octets: int, *, fd: bool, bitrate: int) -> float:
 
 
 def provisioned(folder: Path, link: str, home: Path) -> None:
-    """The node gets its key and its datasheet."""
+    """Give the node its key and its datasheet."""
     calibration = folder / "angle.csv"
     calibration.write_text(f"# date: {time.strftime('%Y-%m-%d')}\nraw,value [degree]\n0,0\n32768,180\n65535,360\n")
     words = ("--via", "can", "--can", link, "--profile", PROFILE, "--calibration", str(calibration), "--yes")

@@ -238,7 +238,7 @@ def topics(name: str, sink: Sink, reader: subprocess.Popen[str], seconds: float,
 
 
 def _line(lines: IO[str], begin: str) -> str:
-    """The next line that begins so; rospy says other things too."""
+    """Return the next line with this beginning; rospy prints other lines too."""
     for line in lines:
         if line.startswith(begin):
             return line

@@ -33,7 +33,7 @@ PROFILE = "magnetic-angular-position-sensor"
 
 
 def fill(folder: Path, home: Path, count: int) -> None:
-    """A station, and so many images that it signed for nodes with keys of their own."""
+    """Make a station, and so many images that it signed for nodes with different keys."""
     station, _ = initialise(
         home, name="n", keystore="file", ask=lambda p, c: "correct horse battery", costs=passphrase.THROWAWAY
     )

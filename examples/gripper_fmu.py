@@ -14,7 +14,7 @@ class GripperFmu(Fmi2Slave):
         self.register_variable(Real("force", causality=Fmi2Causality.output))
 
     def do_step(self, current_time, step_size):
-        """Called by the simulation's master for each step."""
+        """Advance the model; the simulation's master calls it for each step."""
         self.opening += (self.target - self.opening) * step_size / 0.2
         self.force = max(0.0, 0.02 - self.opening) * 5000
         return True

@@ -33,7 +33,7 @@ class Bounds:
     resets: int = 0
 
     def defines(self) -> list[str]:
-        """The bounds as options of spin."""
+        """Return the bounds as options of spin."""
         return [f"-D{name.upper()}={value}" for name, value in vars(self).items()]
 
     def __str__(self) -> str:

@@ -55,7 +55,7 @@ def _targets(tree: ast.AST, known: set[str]) -> set[str]:
 
 
 def scripts() -> dict[str, frozenset[str]]:
-    """What each script of the page imports, by its path in the page's folder."""
+    """Return the imports of each script of the page, by its path in the page's folder."""
     folder = PACKAGE / "ncap" / "page" / "js"
     found = {}
     for path in folder.rglob("*.js"):
@@ -67,7 +67,7 @@ def scripts() -> dict[str, frozenset[str]]:
 
 
 def circles(imports: Mapping[str, Collection[str]]) -> list[list[str]]:
-    """Groups of files that import each other (Tarjan's strongly connected components of more than one)."""
+    """Return groups of files that import each other (Tarjan's strongly connected components of more than one)."""
     number: dict[str, int] = {}
     low: dict[str, int] = {}
     stack: list[str] = []
@@ -96,7 +96,7 @@ def circles(imports: Mapping[str, Collection[str]]) -> list[list[str]]:
 
 
 def late_imports(found: dict[str, Module]) -> list[str]:
-    """Imports of our own modules inside functions: ``file:line``."""
+    """Return imports of our own modules inside functions: ``file:line``."""
     result = set()
     for module in found.values():
         functions = (node for node in ast.walk(module.tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
@@ -165,7 +165,7 @@ def used_once(found: dict[str, Module]) -> list[str]:
 
 
 def _called(node: ast.Call) -> str:
-    """The name that is called; nothing for what a class does as its base does, and more."""
+    """Return the name that is called; "" for a call of the base class's method."""
     if isinstance(node.func, ast.Attribute):
         return "" if ast.unparse(node.func.value) == "super()" else node.func.attr
     return getattr(node.func, "id", "")
@@ -192,7 +192,7 @@ def lines(found: dict[str, Module]) -> list[tuple[int, str]]:
 
 
 def entered() -> str:
-    """What ``benchmarks/entered.py`` counts; it runs nodes, so that no test asks for it."""
+    """Return the counts of ``benchmarks/entered.py``; it runs nodes, so that no test needs it."""
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks.entered"],
         cwd=PACKAGE.parent,
@@ -208,7 +208,7 @@ def entered() -> str:
 
 
 def report() -> Iterator[str]:
-    """The table, line by line."""
+    """Yield the table, line by line."""
     found = modules()
     rings = circles({name: module.imports for name, module in found.items()}) + circles(scripts())
     late, knots = late_imports(found), complex_functions(found)

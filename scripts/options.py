@@ -32,7 +32,7 @@ def commands(group: click.Group = cli, path: str = "") -> Iterator[tuple[str, cl
 
 
 def options_of(command: click.Command) -> list[click.Option]:
-    """The options of a command that have a long name."""
+    """Return the options of a command that have a long name."""
     found = [parameter for parameter in command.params if isinstance(parameter, click.Option) and not parameter.hidden]
     return [option for option in found if _long(option)]
 
@@ -42,7 +42,7 @@ def _long(option: click.Option) -> str:
 
 
 def option_names() -> str:
-    """The module that knows every option by name, so that config.toml is checked without loading any command."""
+    """Return the module with every option's name, so that config.toml is checked without loading any command."""
     rows = []
     for path, command in commands():
         names = ", ".join(f'"{_long(option)}"' for option in options_of(command))
@@ -82,7 +82,7 @@ def parameter_names() -> tuple[list[str], list[str]]:
 
 
 def file_names() -> list[str]:
-    """The options whose values are paths in every command that has them."""
+    """Return the options whose values are paths in every command that has them."""
     kinds: dict[str, set[bool]] = {}
     for _, command in commands():
         for option in options_of(command):

@@ -75,7 +75,7 @@ def targets(modules: dict[Path, ast.Module]) -> Counter[str]:
 
 
 def no_shorter_than_its_function(node: Documented, text: str) -> bool:
-    """True if the docstring of a function has at least as many lines as the rest of its body."""
+    """Return True if the docstring of a function has at least as many lines as the rest of its body."""
     if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) or len(node.body) < 2:
         return False
     last = node.body[-1].end_lineno or node.body[-1].lineno
