@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import signal
 import threading
+import time
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from teds_provision.node.hardware.board import ActuatorReading, Board
     from teds_provision.node.nfc.tnep import ExtraRecords
     from teds_provision.node.virtual import LinkServer, VirtualNode
+    from teds_provision.node.wrapped.running import SensorPlace, WrappedRun
     from teds_provision.protocol.operation.streams import DataFrame
 
 
@@ -74,6 +77,7 @@ def _name(_ctx: click.Context, _parameter: click.Parameter, text: str) -> str:
     "teds-provision node create bench/finger",
     "teds-provision node create bench/angle --profile magnetic-angular-position-sensor --name angle",
     "teds-provision node create bench/copy --teds angle.json",
+    "teds-provision node create bench/torque --from dbc:torque.dbc --message Torque",
 )
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--uuid", callback=_uuid, metavar="HEX", help="UUID, 20 hex digits (default: from the file, or random).")
@@ -85,6 +89,13 @@ def _name(_ctx: click.Context, _parameter: click.Parameter, text: str) -> str:
     help="File with its datasheet and hardware: image, XML, JSON, hex or binary.",
 )
 @click.option("--profile", metavar="P", help="Transducer type that defines its datasheet and hardware.")
+@click.option(
+    "--from",
+    "wrapped",
+    metavar="SENSOR",
+    help="Sensor that it wraps: dbc:FILE, eds:FILE or iio:DEVICE; channels, units and scaling come from there.",
+)
+@click.option("--message", metavar="NAME", help="Message of the DBC file (default: the only one).")
 @click.option(
     "--max-message",
     type=WholeNumber(512, 4094),
@@ -101,14 +112,26 @@ def create(
     name: str,
     teds: Path | None,
     profile: str | None,
+    wrapped: str | None,
+    message: str | None,
     max_message: int,
 ) -> None:
     """Create a virtual node in DIR, in factory state, with its own key.
 
-    With --teds or --profile, it has the channels of that datasheet and carries its TEDS unsigned.
+    With --teds or --profile, it has the channels of that datasheet and carries its TEDS unsigned. With --from it wraps
+    an existing sensor, whose values `node run --source` reads, and is marked as wrapped.
     """
-    if teds is not None and profile is not None:
-        raise UsageError("--teds and --profile cannot be combined.", hint="A node has one datasheet: use one of them.")
+    named = {"--teds": teds, "--profile": profile, "--from": wrapped}
+    given = [name for name, value in named.items() if value is not None]
+    if len(given) > 1:
+        raise UsageError(
+            f"{' and '.join(given)} cannot be combined.", hint="A node has one datasheet: use one of them."
+        )
+    if message is not None and wrapped is None:
+        raise UsageError("--message needs --from dbc:FILE.")
+    sensor = node_room.wrapped.reading.describe(wrapped, message) if wrapped is not None else None
+    for note in sensor.notes if sensor is not None else ():
+        app.note(note)
     made = node_room.node_template.create(
         folder,
         uuid=uuid,
@@ -117,10 +140,11 @@ def create(
         teds=teds,
         profile=profile,
         folders=teds_room.profile.default_folders(app.home),
+        sensor=sensor,
     )
     flash = made.load()  # what lies there: the same command once more finds the node that it made
     print_of_key = protocol.keys.fingerprint(flash.node_key)
-    channels = [
+    channels: list[dict[str, object]] = [
         {
             "channel": channel.number,
             "name": channel.name,
@@ -129,6 +153,9 @@ def create(
         }
         for channel in teds_room.sheet.Sheet.from_blocks(made.hardware).channels
     ]
+    for channel, described in zip(channels, sensor.channels if sensor is not None else (), strict=False):
+        channel.update(node_room.wrapped.description.facts(described))
+    origin = teds_room.origin.origin_of(made.hardware)
     app.emit(
         {
             "uuid": flash.uuid.hex(),
@@ -136,9 +163,11 @@ def create(
             "name": made.name,
             "can_address": flash.can_address,
             "channels": channels,
+            "origin": origin.to_json() if origin is not None else None,
         },
         f"Node {flash.uuid.hex()} in {folder}, key {print_of_key[:16]}, CAN address 0x{flash.can_address:02x}"
-        + (f", {len(channels)} channel{'' if len(channels) == 1 else 's'}." if channels else "."),
+        + (f", {len(channels)} channel{'' if len(channels) == 1 else 's'}" if channels else "")
+        + (f", wraps {origin.text}." if origin is not None else "."),
     )
 
 
@@ -165,6 +194,8 @@ _DEFAULT_SOURCE = "noise"
     "teds-provision node run bench/finger --nfc udp:localhost:54321 --can udp_multicast:239.74.163.2",
     "teds-provision node run bench/angle --can udp_multicast:239.74.163.2 --source sine:2",
     "teds-provision node run bench/a bench/b bench/c --can udp_multicast:239.74.163.2",
+    "teds-provision node run bench/torque --can socketcan:can0 --source dbc:torque.dbc --bus socketcan:can1",
+    "teds-provision node run bench/f --can socketcan:can0 --source canopen:cell.eds --bus socketcan:can1 --node-id 5",
     short_help="Run the nodes in DIR … until SIGTERM or Ctrl-C.",
 )
 @click.argument("folders", metavar="DIR…", nargs=-1, required=True, type=click.Path(path_type=Path, file_okay=False))
@@ -183,7 +214,17 @@ _DEFAULT_SOURCE = "noise"
     default=_DEFAULT_SOURCE,
     show_default=True,
     metavar="SOURCE",
-    help="Source of the values: noise, sine:PERIOD, ramp:PERIOD, file:CSV, -, unix:PATH, exec:COMMAND.",
+    help="Source of the values: noise, sine:PERIOD, ramp:PERIOD, file:CSV, -, unix:PATH, exec:COMMAND; of a wrapped"
+    " node: dbc:FILE, canopen:FILE, iio:DEVICE.",
+)
+@click.option("--bus", metavar="INTERFACE:CHANNEL", help="Bus of the wrapped CAN sensors.")
+@click.option(
+    "--node-id",
+    "node_ids",
+    type=WholeNumber(1, 127),
+    multiple=True,
+    metavar="N",
+    help="CANopen node id; one for each DIR, in their order.",
 )
 @click.option("--crypto-delay", type=Number(min=0), default=0, metavar="MS", help="Milliseconds per point operation.")
 @click.option("--flash-delay", type=Number(min=0), default=0, metavar="MS", help="Milliseconds per flash commit.")
@@ -211,16 +252,21 @@ def run(
     flash_delay: float,
     source: str,
     battery: float | None,
+    bus: str | None,
+    node_ids: Sequence[int],
     **links: Any,
 ) -> None:
     """Run the nodes in DIR … until SIGTERM or Ctrl-C; SIGUSR1 resets them by hand.
 
-    Prints one line when the links are up, then one line per actuator change.
+    Prints one line when the links are up, then one line per actuator change, and for a wrapped node one line when a
+    channel becomes invalid, with the reason, or valid again.
     """
-    _check_options(len(folders), source, **links)
+    place = node_room.wrapped.running.SensorPlace(source, bus, tuple(node_ids), links["can"])
+    _check_options(len(folders), place, **links)
     delays = node_room.virtual.Delays(crypto_delay / 1000, flash_delay / 1000)
     lines, pulse = ActuatorLines(app), node_room.realtime_loop.RealtimeLoop()
-    make = _boards(app, lines, source, battery)
+    wrapped = _wrapped(app, lines, folders, place)
+    make = _boards(app, lines, source, battery, wrapped)
     nodes = [
         node_room.virtual.VirtualNode(
             folder, delays=delays, exclusive=True, board=make, pulse=pulse, has_can=bool(links["can"])
@@ -234,7 +280,8 @@ def run(
     running: list[Any] = []
     try:
         boards = [node.board for node in nodes if node.board is not None]
-        parts: list[LinkServer] = [pulse, *boards, *_servers(app, nodes, **links)]
+        readers = [wrapped] if wrapped is not None else []
+        parts: list[LinkServer] = [pulse, *readers, *boards, *_servers(app, nodes, **links)]
         for part in parts:
             part.start()
             running.append(part)
@@ -248,20 +295,62 @@ def run(
             part.stop()
 
 
-def _check_options(count: int, source: str, *, nfc: str | None, can: str | None, ble: str | None, **_: Any) -> None:
+def _wrapped(app: App, lines: ActuatorLines, folders: Sequence[Path], place: SensorPlace) -> WrappedRun | None:
+    """Return the reader of the sensors that the nodes wrap, None if they wrap none; raises UsageError.
+
+    A wrapped node gives the values of its sensor and no others: its datasheet would vouch for made-up ones.
+    """
+    running = node_room.wrapped.running
+    files = [node_room.flash_file.FlashFile(folder) for folder in folders]
+    origins = [teds_room.origin.origin_of(file.hardware) for file in files]
+    if not running.is_wrapped(place.source):
+        for origin, folder in zip(origins, folders, strict=True):
+            if origin is not None:
+                raise UsageError(
+                    f"The node in {folder} wraps {origin.text}, so --source {place.source} cannot give its values.",
+                    hint=f"Use --source {running.SOURCE_OF[origin.kind]}.",
+                )
+        return None
+    running.require_match(place, origins, [str(folder) for folder in folders])
+    uuids = [file.load().uuid.hex() for file in files]
+    return running.WrappedRun(
+        place,
+        [origin for origin in origins if origin is not None],
+        lambda number: lines.validity_of(uuids[number]),
+        app.warn,
+    )
+
+
+def _check_options(
+    count: int, place: SensorPlace, *, nfc: str | None, can: str | None, ble: str | None, **_: Any
+) -> None:
     """Raise UsageError if the options do not go together."""
+    source, wraps = place.source, node_room.wrapped.running.is_wrapped(place.source)
+    if not wraps and (place.bus is not None or place.node_ids):
+        raise UsageError(
+            f"{'--bus' if place.bus is not None else '--node-id'} names wrapped sensors.",
+            hint="Omit it, or use --source dbc:FILE or canopen:FILE.",
+        )
     if not nfc and not can and not ble:
         raise UsageError(
             "A node needs a link.", hint="Add --nfc udp:localhost:54321, --can udp_multicast:239.74.163.2, or both."
         )
     alone = "--nfc" if nfc else "--ble" if ble else ""
-    if not alone and node_room.sources.kind_of(source) in node_room.sources.ONE_NODE_ONLY:
+    if not wraps and not alone and node_room.sources.kind_of(source) in node_room.sources.ONE_NODE_ONLY:
         alone = f"--source {source}"
     if count > 1 and alone:
         raise UsageError(f"{alone} supports one node only.", hint="Run the others in separate processes.")
 
 
-def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) -> Callable[[FlashFile], Board | None]:
+def _boards(
+    app: App,
+    lines: ActuatorLines,
+    source: str,
+    percent: float | None,
+    wrapped: WrappedRun | None,
+) -> Callable[[FlashFile], Board | None]:
+    numbers = itertools.count()
+
     def make(file: FlashFile) -> hardware_room.board.Board | None:
         uuid, hardware = file.load().uuid, file.hardware
         if not hardware and source != _DEFAULT_SOURCE:
@@ -272,7 +361,7 @@ def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) 
             return None
         return hardware_room.board.Board(
             teds.sheet.Sheet.from_image(teds.image.Image(uuid, hardware)),
-            source=source,
+            source=source if wrapped is None else wrapped.source(next(numbers)),
             battery=None if percent is None else hardware_room.board.Battery(percent),
             shown=lines.observer_of(uuid.hex()),
             tell=app.warn,
@@ -361,6 +450,11 @@ def _extras(node: VirtualNode, air: BleServer | None) -> ExtraRecords:
 # ``time`` is when the state began, not when the line was printed, so it shows how long a dead-man took.
 
 _EVERY_SECONDS = 0.05
+_MOST_LINES = 1000
+
+
+def _iso(moment: float) -> str:
+    return datetime.fromtimestamp(moment, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 class ActuatorLines:
@@ -370,6 +464,7 @@ class ActuatorLines:
         self._app = app
         self._news: dict[tuple[str, int], ActuatorReading] = {}
         self._told: dict[tuple[str, int], ActuatorReading] = {}
+        self._validity: list[dict[str, object]] = []
         self._condition = threading.Condition()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="actuators", daemon=True)
@@ -383,6 +478,19 @@ class ActuatorLines:
                 self._condition.notify()
 
         return shown
+
+    def validity_of(self, uuid: str) -> Callable[[int, str, str], None]:
+        """Return what a wrapped node reports its invalid channels to."""
+
+        def report(channel: int, name: str, reason: str) -> None:
+            line: dict[str, object] = {"event": "valid", "uuid": uuid, "channel": channel, "name": name}
+            line |= {"event": "invalid", "reason": reason} if reason else {}
+            with self._condition:
+                self._validity.append(line | {"time": _iso(time.time())})
+                del self._validity[:-_MOST_LINES]
+                self._condition.notify()
+
+        return report
 
     def start(self) -> None:
         """Begin to print."""
@@ -399,7 +507,7 @@ class ActuatorLines:
     def _run(self) -> None:
         while not self._stop.is_set():
             with self._condition:
-                while not self._news and not self._stop.is_set():
+                while not self._news and not self._validity and not self._stop.is_set():
                     self._condition.wait()
             self._tell_news()
             self._stop.wait(_EVERY_SECONDS)
@@ -408,6 +516,13 @@ class ActuatorLines:
     def _tell_news(self) -> None:
         with self._condition:
             news, self._news = self._news, {}
+            validity, self._validity = self._validity, []
+        try:
+            for line in validity:
+                self._print_validity(line)
+        except OSError:
+            self._stop.set()
+            return
         for (uuid, channel), state in news.items():
             if self._told.get((uuid, channel)) != state:
                 self._told[uuid, channel] = state
@@ -416,6 +531,10 @@ class ActuatorLines:
                 except OSError:  # nobody reads, or the disk is full: the node runs on
                     self._stop.set()
                     return
+
+    def _print_validity(self, line: dict[str, object]) -> None:
+        state = f"invalid: {line['reason']}" if line["event"] == "invalid" else "valid again"
+        self._app.emit(line, f"{line['uuid']} {line['name']}: {state}")
 
     def _print_state(self, uuid: str, state: ActuatorReading) -> None:
         name = state.name or f"channel {state.channel}"
@@ -430,9 +549,7 @@ class ActuatorLines:
                 "unit": state.unit,
                 "raw": state.raw if state.raw == state.raw else None,
                 "safe": state.safe,
-                "time": datetime.fromtimestamp(state.time, UTC)
-                .isoformat(timespec="milliseconds")
-                .replace("+00:00", "Z"),
+                "time": _iso(state.time),
             },
             f"{uuid} {name}: {'safe state, ' if state.safe else ''}{value}",
         )

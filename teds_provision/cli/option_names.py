@@ -17,7 +17,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "trust ca drop": frozenset({"yes"}),
     "trust ca sign": frozenset({"output", "yes", "dry-run"}),
     "trust remove": frozenset({"yes", "dry-run"}),
-    "profile new": frozenset({"extends", "from", "map", "output", "dry-run"}),
+    "profile new": frozenset({"extends", "from", "message", "map", "output", "dry-run"}),
     "doctor": frozenset({"nfc", "can", "ble", "report", "with-uuids"}),
     "identify": frozenset({"watch", "add", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "whitelist add": frozenset({"fingerprint", "name", "dry-run"}),
@@ -94,8 +94,8 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "evidence verify": frozenset({"ca", "pins", "roster"}),
     "demo": frozenset({"page", "plant", "line", "http"}),
     "node check": frozenset({"factory", "explain", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
-    "node create": frozenset({"uuid", "name", "teds", "profile", "max-message"}),
-    "node run": frozenset({"nfc", "tag", "can", "ble", "source", "crypto-delay", "flash-delay", "wait-time", "battery", "pace"}),
+    "node create": frozenset({"uuid", "name", "teds", "profile", "from", "message", "max-message"}),
+    "node run": frozenset({"nfc", "tag", "can", "ble", "source", "bus", "node-id", "crypto-delay", "flash-delay", "wait-time", "battery", "pace"}),
 }
 FILES: Final = frozenset({"batch", "calibration", "calibrations", "certificate", "csv", "draft", "files", "home", "image", "label-to", "list", "map", "member", "output", "pins", "plot", "receipt", "record", "recovery-key", "report", "request", "require", "roster", "teds", "tls-cert", "tls-key", "trace"})
 """Options that name a file or a folder, in every command that has them."""
@@ -127,6 +127,8 @@ PARAMETERS: Final[dict[str, dict[str, str]]] = {
     "job new": {"list": "listed", "station": "stations"},
     "job status": {"csv": "csv_file"},
     "signer run": {"job": "jobs", "for": "seconds"},
+    "node create": {"from": "wrapped"},
+    "node run": {"node-id": "node_ids"},
 }
 """Options that the code calls otherwise than the command line does."""
 SEVERAL: Final[dict[str, frozenset[str]]] = {
@@ -157,5 +159,6 @@ SEVERAL: Final[dict[str, frozenset[str]]] = {
     "job new": frozenset({"station", "read-only"}),
     "signer run": frozenset({"job"}),
     "node check": frozenset({"nfc", "can"}),
+    "node run": frozenset({"node-id"}),
 }
 """Options that may be given several times."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from teds_provision import node as node_room
 from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, command, dry_run_option, examples
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from teds_provision.node.wrapped.description import WrappedSensor
     from teds_provision.teds.profile import ProfileProblem
 
 
@@ -177,10 +179,17 @@ profile.add_command(check)
     "teds-provision profile new wrist-torque",
     "teds-provision profile new my-finger --extends tactile-finger-sensor",
     "teds-provision profile new lab-angle --from examples/xml/angle.xml --map examples/xml/angle-map.toml",
+    "teds-provision profile new torque --from dbc:examples/bench/torque.dbc --message Torque",
 )
 @click.argument("name")
 @click.option("--extends", metavar="PROFILE", help="Start from another type and state only the differences.")
-@click.option("--from", "source", type=FileToRead(), metavar="XML", help="A datasheet XML of your own; needs --map.")
+@click.option(
+    "--from",
+    "source",
+    metavar="FILE",
+    help="A datasheet XML of your own (needs --map), or a sensor to wrap: dbc:FILE, eds:FILE, iio:DEVICE.",
+)
+@click.option("--message", metavar="NAME", help="Message of the DBC file (default: the only one).")
 @click.option(
     "--map", "mapping", type=FileToRead(), metavar="FILE", help="Where each key stands in that XML, and its unit."
 )
@@ -197,15 +206,17 @@ def new(
     app: App,
     name: str,
     extends: str | None,
-    source: Path | None,
+    source: str | None,
+    message: str | None,
     mapping: Path | None,
     output: Path | None,
     dry_run: bool,
 ) -> None:
-    """Write a template for a new type, or a type from XML.
+    """Write a template for a new type, or a type from XML, or from the description of a sensor.
 
     The template has every key, commented. A type is read from a datasheet XML of your own by a mapping file;
-    docs/formats.md says how that is written.
+    docs/formats.md says how that is written. From a DBC file, an EDS or an IIO device come channels, units, ranges
+    and scaling (docs/virtual-nodes.md).
     """
     import re
 
@@ -214,12 +225,18 @@ def new(
             f'"{name}" is not a valid profile name.',
             hint="Use lower-case letters, digits and dashes, like wrist-torque.",
         )
-    if (source is None) != (mapping is None) or (source is not None and extends is not None):
+    sensor = _sensor(source, message, mapping)
+    if (sensor is None and (source is None) != (mapping is None)) or (source is not None and extends is not None):
         raise UsageError("--from needs --map, and no --extends.", hint="The mapping may say extends under [values].")
     text = template(name)
-    if source is not None and mapping is not None:
+    if sensor is not None:
+        text = sensor.profile_text(name)
+        parse_profile(text, name)
+        for note in sensor.notes:
+            app.note(note)
+    elif source is not None and mapping is not None:
         rules = read_file(mapping).decode(errors="replace")
-        text = profile_from_xml(read_file(source), rules, name=name, file=str(source), by=str(mapping))
+        text = profile_from_xml(read_file(Path(source)), rules, name=name, file=source, by=str(mapping))
         parse_profile(text, name)  # what the XML says is checked like any profile
     elif extends is not None:
         base = find_profile(extends, default_folders(app.home)).stem
@@ -233,8 +250,9 @@ def new(
     done = holds(path, text.encode())
     if path.exists() and not done:
         raise UsageError(f"{path} already exists with different content.", hint="Choose another name, or use --output.")
+    more = _origin_of(sensor) if sensor is not None else {}
     if dry_run:
-        app.emit({"profiles": [{"name": name, "file": str(path)}], "text": text}, _plain(text.rstrip("\n")))
+        app.emit({"profiles": [{"name": name, "file": str(path)}], "text": text, **more}, _plain(text.rstrip("\n")))
         return
     if not done:
         if output is None:
@@ -244,7 +262,27 @@ def new(
                 raise StoreError(f"Cannot create {path.parent}: {error.strerror}.") from error
         write_new(path, text.encode("utf-8"), mode=SHARED)
     said = _plain(f"{path} {'already exists' if done else 'written'}.")
-    app.emit({"profiles": [{"name": name, "file": str(path)}]}, said)
+    app.emit({"profiles": [{"name": name, "file": str(path)}], **more}, said)
+
+
+def _sensor(source: str | None, message: str | None, mapping: Path | None) -> WrappedSensor | None:
+    """Return the sensor that ``--from`` names, None if it names a file of XML or nothing; raises UsageError."""
+    if source is None or source.partition(":")[0] not in ("dbc", "eds", "iio"):
+        if message is not None:
+            raise UsageError("--message needs --from dbc:FILE.")
+        return None
+    if mapping is not None:
+        raise UsageError("--map reads XML.", hint="Omit --map.")
+    return node_room.wrapped.reading.describe(source, message)
+
+
+def _origin_of(sensor: WrappedSensor) -> dict[str, Any]:
+    """Return the keys of a type that was read from the description of a sensor."""
+    channels = [
+        {"channel": number, "name": channel.name, "unit": channel.unit, **node_room.wrapped.description.facts(channel)}
+        for number, channel in enumerate(sensor.channels, 1)
+    ]
+    return {"channels": channels, "origin": sensor.origin.to_json()}
 
 
 profile.add_command(new)

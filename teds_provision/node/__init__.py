@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         realtime_loop,
         sources,
         virtual,
+        wrapped,
     )
 else:
     __getattr__ = lazy(__name__)

@@ -52,10 +52,12 @@ class FlashFile:
         name: str = "",
         max_message: int = 2048,
         blocks: Mapping[BlockId, bytes] | None = None,
+        read_only: frozenset[BlockId] = frozenset(),
     ) -> FlashFile:
         """Make a node in factory state with its own key; an existing one of that UUID is opened instead.
 
-        ``blocks`` are TEDS that it is made with: stored unsigned, and kept aside as what its hardware is.
+        ``blocks`` are TEDS that it is made with: stored unsigned, and kept aside as what its hardware is; those of
+        ``read_only`` cannot be written.
         """
         if (folder / FILE).exists():
             existing = cls(folder)
@@ -79,6 +81,7 @@ class FlashFile:
             key.point,
             key.sign(node_key_message(uuid, key.point)),
             blocks=dict(blocks or {}),
+            read_only=read_only,
             can_address=default_can_address(uuid),
         )
         head = {"format": FORMAT, "name": name, "max_message": max_message, "key": key.secret().hex()}

@@ -6,6 +6,7 @@ import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadDataError
 from teds_provision.files import read_limited
@@ -15,8 +16,12 @@ from teds_provision.node.hardware.board import Board
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.teds.formats import UUID_OCTETS, placed, stated_uuid, under
 from teds_provision.teds.image import SECURITY, BlockId, Image
+from teds_provision.teds.origin import ORIGIN
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet
+
+if TYPE_CHECKING:
+    from teds_provision.node.wrapped.description import WrappedSensor
 
 
 @dataclass(frozen=True)
@@ -70,8 +75,11 @@ def create(
     teds: Path | None = None,
     profile: str | None = None,
     folders: tuple[Path, ...] | None = None,
+    sensor: WrappedSensor | None = None,
 ) -> FlashFile:
     """Make a node, or open the one that was made so before. Its UUID: the one given, else the file's, else random.
+
+    With ``sensor`` it wraps that one: its Origin TEDS is read-only.
 
     Raises UsageError (the folder holds another node), NotFoundError, BadDataError, StoreError.
     """
@@ -81,8 +89,11 @@ def create(
         wanted = FlashFile(folder).load().uuid if (folder / FILE).exists() else secrets.token_bytes(UUID_OCTETS)
     if profile is not None:
         described = from_profile(profile, folders, wanted, name)
+    if sensor is not None:
+        described = NodeTemplate(sensor.blocks(wanted, name), wanted)
     blocks = None
     if described is not None:
         blocks = described.with_uuid(wanted).blocks
         Board(Sheet.from_image(Image(wanted, blocks)))  # what it could not imitate is told now, not when it runs
-    return FlashFile.create(folder, uuid=wanted, name=name, max_message=max_message, blocks=blocks)
+    read_only = frozenset({ORIGIN}) if sensor is not None else frozenset[BlockId]()
+    return FlashFile.create(folder, uuid=wanted, name=name, max_message=max_message, blocks=blocks, read_only=read_only)

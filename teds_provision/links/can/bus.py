@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from teds_provision.errors import LinkError, NoReaderError, UsageError
@@ -119,7 +120,7 @@ _LIBRARIES: Final = {
 """Libraries that come from the maker of the adapter."""
 
 
-__all__ = ["Bus", "Frame", "known_keys", "require_known"]
+__all__ = ["Bus", "Frame", "clock_is_ours", "known_keys", "open_bus", "require_known"]
 
 
 class Bus:
@@ -131,10 +132,10 @@ class Bus:
     def __init__(self, spec: CanSpec, trace: Trace | None = None) -> None:
         self.spec = spec
         self._trace = trace
-        self._bus = _open(spec)
+        self._bus = open_bus(spec, _OURS)
         self._multicast = _multicast(self._bus, spec)
         self._descriptor = _descriptor(self._bus)
-        self._clock_is_ours = _clock_is_ours(spec)
+        self._clock_is_ours = clock_is_ours(spec)
         self._pacer = Pacer(spec.bitrate, spec.data_bitrate, spec.wire) if spec.pace else None
         # SocketCAN marks every frame of this machine as sent here, also those of other programs: nodes beside us
         self._marks_own = spec.interface != "socketcan"
@@ -296,7 +297,11 @@ class Bus:
         ) from error
 
 
-def _open(spec: CanSpec) -> can.BusABC:
+def open_bus(spec: CanSpec, filters: Sequence[tuple[int, int]] = ()) -> can.BusABC:
+    """Open a bus of python-can; ``filters`` are 29-bit identifiers and masks that SocketCAN lets through.
+
+    Raises NoReaderError or UsageError with the cause and the remedy.
+    """
     import can
 
     for name in ("can", "isotp"):
@@ -322,8 +327,8 @@ def _open(spec: CanSpec) -> can.BusABC:
         if isinstance(found, socket.socket):
             with contextlib.suppress(OSError):
                 found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
-    if spec.interface == "socketcan":
-        bus.set_filters([{"can_id": value, "can_mask": mask, "extended": True} for value, mask in _OURS])
+    if spec.interface == "socketcan" and filters:
+        bus.set_filters([{"can_id": value, "can_mask": mask, "extended": True} for value, mask in filters])
     return bus
 
 
@@ -419,7 +424,7 @@ def _descriptor(bus: can.BusABC) -> int:
         return -1
 
 
-def _clock_is_ours(spec: CanSpec) -> bool:
+def clock_is_ours(spec: CanSpec) -> bool:
     """Return True if this machine's kernel stamps the frames, not an adapter or another machine.
 
     With a clock that is a little slow a frame would seem older than it is, and the bound of a node's time be false.

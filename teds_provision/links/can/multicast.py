@@ -88,7 +88,7 @@ class Multicast:
 
     def _read(self) -> ReceivedFrame:
         datagram, ancillary, _, sender = self._in.recvmsg(_LARGEST, _ANCILLARY, socket.MSG_DONTWAIT)
-        return _NOTHING if sender[:2] == self._own else read(datagram, _arrival(ancillary), fd=self._fd)
+        return _NOTHING if sender[:2] == self._own else read(datagram, arrival(ancillary), fd=self._fd)
 
 
 def of_bus(bus: object, options: dict[str, Any], *, fd: bool) -> Multicast | None:
@@ -145,7 +145,7 @@ def _is_data(fields: dict[object, object], octets: int, most: int) -> bool:
     return octets <= most and fields.get("dlc", octets) == octets
 
 
-def _arrival(ancillary: list[tuple[int, int, bytes]]) -> float:
+def arrival(ancillary: list[tuple[int, int, bytes]]) -> float:
     """Return the time of arrival on the monotonic clock, less the datagram's time in the kernel's queue.
 
     Never too early: the wall clock is read first. A thread that is preempted between the two readings makes the arrival

@@ -17,7 +17,7 @@ from teds_provision.errors import BadDataError
 from teds_provision.node import sources
 from teds_provision.node.hardware.clock import NANOSECONDS, NodeClock
 from teds_provision.node.hardware.converter import Converter
-from teds_provision.node.sources.base import Reading, SourceChannel, Tell
+from teds_provision.node.sources.base import Reading, Source, SourceChannel, Tell
 from teds_provision.protocol.operation.commands import PowerFlag, PowerReply
 from teds_provision.protocol.operation.hardware import ChannelHardware, RawReading
 from teds_provision.teds.sheet import Channel, ChannelKind, Sheet
@@ -94,7 +94,7 @@ class ActuatorReading:
 
 
 class Board:
-    """Channels of ``sheet``; ``source`` is the text of ``--source``.
+    """Channels of ``sheet``; ``source`` is the text of ``--source``, or a source that was made already.
 
     ``shown`` is called with the state of actuators, from any thread, and must return at once; ``tell`` receives
     messages for people. Raises BadDataError if a channel cannot be imitated, and errors of the source.
@@ -104,7 +104,7 @@ class Board:
         self,
         sheet: Sheet,
         *,
-        source: str = "noise",
+        source: str | Source = "noise",
         clock: NodeClock | None = None,
         battery: Battery | None = None,
         shown: Callable[[ActuatorReading], None] = lambda shown: None,
@@ -128,7 +128,7 @@ class Board:
         self._safe_state = {n: self._lowest(n) for n, facts in self.channels.items() if facts.actuator}
         self._bounds = {number: self._raw_limits(number) for number in self._safe_state}
         self._set_points = dict(self._safe_state)
-        self.source = sources.make_source(source, self.places, tell)
+        self.source = sources.make_source(source, self.places, tell) if isinstance(source, str) else source
 
     @property
     def places(self) -> list[SourceChannel]:

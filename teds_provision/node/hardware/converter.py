@@ -60,6 +60,8 @@ class Converter:
 
         Raises BadDataError if the value cannot be converted to a sample.
         """
+        if reading.missing:
+            return self._no_value()
         return self.write(reading.raw if reading.raw is not None else self.raw(reading.value or 0.0))
 
     def raw(self, value: float) -> float:
@@ -89,6 +91,14 @@ class Converter:
         if self._packing is not None and abs(raw) < _MOST_FLOAT:
             return self._packing.pack(raw)
         return self._writer.write(np.array([raw]))
+
+    def _no_value(self) -> bytes:
+        """A sample that no reader takes for a value; raises BadDataError where every sample is one."""
+        if self._packing is not None:
+            return self._packing.pack(math.nan)
+        if self._most is not None and self._most < (1 << 8 * self._octets) - 1:
+            return b"\xff" * self._octets
+        raise BadDataError("Every sample of this channel is a value.")
 
     def value(self, octets: bytes) -> float | None:
         """Return the value that a set point means, None if it is undefined."""

@@ -30,7 +30,8 @@ def kind_of(text: str) -> str:
     if kind not in SOURCES:
         raise UsageError(
             f"--source {text!r} is not known.",
-            hint="Use noise, sine:PERIOD, ramp:PERIOD, file:CSV, -, unix:PATH or exec:COMMAND.",
+            hint="Use noise, sine:PERIOD, ramp:PERIOD, file:CSV, -, unix:PATH or exec:COMMAND; for a wrapped node"
+            " dbc:FILE, canopen:FILE or iio:DEVICE.",
         )
     return kind
 

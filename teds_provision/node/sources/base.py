@@ -12,10 +12,15 @@ from teds_provision.errors import UsageError
 
 
 class Reading(NamedTuple):
-    """One channel at one instant: a ``value`` in its display unit, or a ``raw`` number."""
+    """One channel at one instant: a ``value`` in its display unit, or a ``raw`` number.
+
+    ``missing``: this channel alone has no valid value. It is sent as a raw number that the channel cannot give, as the
+    data message has one mark for all its channels (operation.md, section 3).
+    """
 
     value: float | None = None
     raw: float | None = None
+    missing: bool = False
 
 
 @dataclass(frozen=True)

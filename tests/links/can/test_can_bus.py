@@ -110,7 +110,7 @@ def test_on_socketcan_programs_of_one_machine_hear_each_other(
             pass
 
     kernel = Kernel()
-    monkeypatch.setattr("teds_provision.links.can.bus._open", lambda _spec: kernel)
+    monkeypatch.setattr("teds_provision.links.can.bus.open_bus", lambda _spec, _filters: kernel)
     bus = Bus(parse_spec(text))
     bus.send(Frame(0x18DA21F1, b"own"))
     assert bus.receive(0) is None, "what this very program sent is no news"

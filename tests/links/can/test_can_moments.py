@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from teds_provision.links.can.bus import Bus, Frame, _clock_is_ours
+from teds_provision.links.can.bus import Bus, Frame, clock_is_ours
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.node.can.server import CanServer
 from teds_provision.protocol.operation.can_frames import trigger_identifier
@@ -98,4 +98,4 @@ def test_a_node_dates_requests_and_triggers_by_their_arrival_not_by_when_its_thr
 )
 def test_time_stamps_of_another_clock_are_not_believed(spec: str, ours: bool) -> None:
     """An adapter's or another machine's clock that is 0.3 s behind would make each frame 0.3 s older than it is."""
-    assert _clock_is_ours(parse_spec(spec)) is ours
+    assert clock_is_ours(parse_spec(spec)) is ours

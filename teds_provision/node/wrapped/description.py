@@ -1,0 +1,362 @@
+"""Description of a wrapped sensor, and the profile and TEDS that follow from it.
+
+A signal keeps its raw number if a sample and a Calibration TEDS can hold it: at most 24 bits, because coefficients are
+Float32 and must not move a value by half a step. A signed raw number is moved by half its range, as a sample is
+unsigned (offset binary). The sample has a bit to spare, which is set if the channel has no value. Every other signal is
+measured as its value in SI units, a float.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+from xml.sax.saxutils import escape, quoteattr
+
+from teds_provision.errors import BadDataError
+from teds_provision.teds.calibration.model import Calibration, CalibrationInput
+from teds_provision.teds.image import SECURITY, BlockId
+from teds_provision.teds.origin import ORIGIN, Origin
+from teds_provision.teds.profile.load import parse_profile
+from teds_provision.teds.units import WrittenUnit, parse_unit
+
+DEFAULT_PERIOD: Final = 0.1
+"""Seconds between frames if the file states none; a note says so."""
+PERIODS_LATE: Final = 3
+"""A value becomes invalid if the next frame is so many periods late."""
+MOST_CHANNELS: Final = 255
+_EXACT_BITS: Final = 24
+_MOST_BITS: Final = 64
+_LARGEST: Final = 3.4e38
+_MOST_TABLE: Final = 64
+"""Rows of a value table that are put into the datasheet."""
+_NAME_OCTETS: Final = 120
+
+_ALIASES: Final[Mapping[str, str]] = {
+    "": "count",
+    "-": "count",
+    "counts": "count",
+    "cnt": "count",
+    "n/a": "count",
+    "celsius": "degC",
+    "deg c": "degC",
+    "degree c": "degC",
+    "degrees c": "degC",
+    "°c": "degC",
+    "degc": "degC",
+    "deg f": "degF",
+    "n m": "N·m",
+    "n-m": "N·m",
+    "n.m": "N·m",
+    "nm": "N·m",
+    "u/min": "rpm",
+    "r/min": "rpm",
+    "kmh": "km/h",
+    "kph": "km/h",
+    "ohm": "Ω",
+    "ohms": "Ω",
+    "m/s2": "m/s²",
+    "rad/s2": "rad/s²",
+    "sec": "s",
+    "msec": "ms",
+    "volt": "V",
+    "volts": "V",
+    "amp": "A",
+    "amps": "A",
+    "percent": "%",
+    "%rh": "%",
+    "% rh": "%",
+    "%rel": "%",
+    "rpm": "rpm",
+}
+"""How files spell units that our table spells otherwise, in lower case."""
+_KEEP_CASE: Final = frozenset({"nm"})
+"""Aliases whose case means something: nm is a nanometre, Nm a newton metre."""
+_AMBIGUOUS: Final = {
+    "C": "coulomb; if it is °C, write degC",
+    "g": "gram; if it is the acceleration of free fall, write gn",
+    "G": "gauss; if it is the acceleration of free fall, write gn",
+}
+
+
+def written_unit(text: str) -> tuple[str, str]:
+    """Return the unit of our table for one of a file, and a note for people ("" if there is nothing to note).
+
+    A unit that nothing knows counts as none: the values are plain numbers, and the note says so.
+    """
+    stripped = text.strip()
+    if stripped.lower() in _ALIASES and not (stripped.lower() in _KEEP_CASE and stripped != "Nm"):
+        return _ALIASES[stripped.lower()], ""
+    if stripped == "G":
+        return "count", f"the unit {stripped!r} could be {_AMBIGUOUS[stripped]}: values are plain numbers"
+    try:
+        parse_unit(stripped)
+    except BadDataError:
+        return "count", f"the unit {stripped!r} is unknown: values are plain numbers"
+    return stripped, f"the unit {stripped!r} was read as {_AMBIGUOUS[stripped]}" if stripped in _AMBIGUOUS else ""
+
+
+@dataclass(frozen=True)
+class SampleChoice:
+    """How a raw number travels: the profile's sample, and the calibration that turns it into the value.
+
+    ``raw`` samples keep the raw number, increased by ``shift``; others hold the value in SI units as a float.
+    """
+
+    model: str
+    octets: int
+    bits: int
+    raw: bool
+    shift: int = 0
+    coefficients: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class WrappedChannel:
+    """One signal: value = raw × ``scale`` + ``offset``, in ``unit``.
+
+    Raw is an integer of ``bits`` or, if ``is_float``, a float. ``low`` and ``high`` are the range that the file states,
+    None for none; ``period`` is in seconds. ``choices`` is the value table: text by raw number. ``comment`` and
+    ``note`` are for people; ``note`` reports what was assumed. ``shares_frame``: every frame carries it with all other
+    channels of the node, so they are late together.
+    """
+
+    name: str
+    unit: str
+    scale: float = 1.0
+    offset: float = 0.0
+    bits: int = 16
+    signed: bool = False
+    is_float: bool = False
+    low: float | None = None
+    high: float | None = None
+    period: float = DEFAULT_PERIOD
+    choices: Mapping[int, str] = field(default_factory=dict)
+    comment: str = ""
+    note: str = ""
+    shares_frame: bool = False
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.bits <= _MOST_BITS or not math.isfinite(self.scale) or not math.isfinite(self.offset):
+            raise BadDataError(f"The signal {self.name} has a form that cannot be measured.")
+        if self.scale == 0:
+            raise BadDataError(f"The signal {self.name} has the factor 0, so it has one value only.")
+        if not (self.period > 0 and math.isfinite(self.period)):
+            raise BadDataError(f"The signal {self.name} has no period.")
+
+    @property
+    def written(self) -> WrittenUnit:
+        """The unit with its way into SI."""
+        return parse_unit(self.unit)
+
+    @property
+    def raw_ends(self) -> tuple[int, int]:
+        """Lowest and highest raw integer."""
+        if self.signed:
+            return -(1 << self.bits - 1), (1 << self.bits - 1) - 1
+        return 0, (1 << self.bits) - 1
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest valid value in ``unit``: those of the file, else all that the raw number can give."""
+        if self.low is not None and self.high is not None and self.low < self.high:
+            return self.low, self.high
+        if self.is_float:
+            return -_LARGEST, _LARGEST
+        ends = [raw * self.scale + self.offset for raw in self.raw_ends]
+        return min(ends), max(ends)
+
+    @property
+    def sample(self) -> SampleChoice:
+        """How its samples travel."""
+        if self.is_float:
+            plain = self.bits == 32 and (self.scale, self.offset) == (1.0, 0.0) and self._is_si
+            return SampleChoice("float32", 4, 32, raw=False) if plain else SampleChoice("float64", 8, 64, raw=False)
+        octets = min(self.bits // 8 + 1, 8)  # a bit to spare marks a sample that has no value
+        shift = -self.raw_ends[0]
+        if not shift and (self.scale, self.offset) == (1.0, 0.0) and self.unit == "count":
+            return SampleChoice("unsigned", octets, self.bits, raw=True)  # a count is its own value
+        coefficients = (self.offset - self.scale * shift, self.scale)
+        if self.bits <= _EXACT_BITS and self._held_by_float32(coefficients):
+            return SampleChoice("unsigned", octets, self.bits, raw=True, shift=shift, coefficients=coefficients)
+        return SampleChoice("float64", 8, 64, raw=False)
+
+    @property
+    def _is_si(self) -> bool:
+        unit = self.written
+        return (unit.scale, unit.offset) == (1.0, 0.0)
+
+    def _held_by_float32(self, coefficients: tuple[float, float]) -> bool:
+        """True if rounding the coefficients to Float32 moves no value by as much as half a step."""
+        try:
+            intercept, slope = struct.unpack(">2f", struct.pack(">2f", *coefficients))
+        except (OverflowError, struct.error):
+            return False
+        top = (1 << self.bits) - 1
+        moved = [abs(intercept + slope * raw - coefficients[0] - coefficients[1] * raw) for raw in (0, top)]
+        return bool(slope != 0 and max(moved) < abs(self.scale) / 2)
+
+    @property
+    def raw_limits(self) -> tuple[float, float] | None:
+        """Raw numbers, moved as in the sample, that the limits allow; None if samples hold values."""
+        form = self.sample
+        if not form.raw:
+            return None
+        ends = sorted((limit - self.offset) / self.scale for limit in self.limits)
+        least, most = self.raw_ends
+        low, high = max(math.ceil(ends[0] - 1e-9), least), min(math.floor(ends[1] + 1e-9), most)
+        if low >= high:
+            low, high = least, most
+        return float(low + form.shift), float(high + form.shift)
+
+    def value(self, raw: float) -> float:
+        """Return the value in ``unit`` of a raw number of the bus."""
+        return raw * self.scale + self.offset
+
+    def number(self, raw: float) -> float:
+        """Return what a sample holds for a raw number of the bus."""
+        form = self.sample
+        return raw + form.shift if form.raw else self.written.to_si(self.value(raw))
+
+    def shown(self, raw: float) -> str:
+        """Return a value for people: the text of the value table, else the number with its unit."""
+        text = self.choices.get(int(raw)) if self.choices and float(raw).is_integer() else None
+        return (
+            text if text is not None else f"{self.value(raw):.6g} {'' if self.unit == 'count' else self.unit}".strip()
+        )
+
+    def calibration(self, number: int) -> Calibration | None:
+        """Return the calibration of channel ``number`` that applies factor and offset; None if none is needed."""
+        form = self.sample
+        if form.coefficients is None:
+            return None
+        ends = self.raw_limits or (0.0, float((1 << self.bits) - 1))
+        part = CalibrationInput(number, 1, ends, (0.0,))
+        low, high = self.limits
+        return Calibration(
+            number, "linear", (part,), form.coefficients, self.written, low_limit=low, high_limit=high, raw_range=ends
+        )
+
+
+def facts(channel: WrappedChannel) -> dict[str, object]:
+    """Return what ``node create`` reports of a signal: its range, period, scaling and value table."""
+    low, high = channel.limits
+    table = {str(raw): text for raw, text in sorted(channel.choices.items())}
+    return {
+        "low": low,
+        "high": high,
+        "period": channel.period,
+        "factor": channel.scale,
+        "offset": channel.offset,
+        "raw": channel.sample.raw,
+    } | ({"choices": table} if table else {})
+
+
+@dataclass(frozen=True)
+class WrappedSensor:
+    """A sensor that a virtual node wraps; ``title`` is what people call it, ``file`` the description it came from."""
+
+    origin: Origin
+    title: str
+    channels: tuple[WrappedChannel, ...]
+    file: str = ""
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.channels) <= MOST_CHANNELS:
+            raise BadDataError(
+                f"{self.title} has {len(self.channels)} signals; a node has 1 to {MOST_CHANNELS} channels.",
+                hint="Choose another message." if self.origin.kind == "dbc" else "",
+            )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences about what was assumed, for people."""
+        return tuple(f"{channel.name}: {channel.note}." for channel in self.channels if channel.note)
+
+    def profile_text(self, name: str) -> str:
+        """Return the TOML of a transducer type for this sensor."""
+        head = [
+            f"# Transducer type {name}, made from {self.file or self.origin.name} ({self.origin.text}).",
+            "# Neither names an uncertainty: each is one step of the raw number. Replace it by that of the data sheet.",
+            *(f"# {note}" for note in self.notes),
+            "",
+            f"title = {_toml(self.title)}",
+            f"name = {_toml(_cut(self.title))}",
+            'links = ["can"]',
+            "",
+            "[meta]",
+            'operation-timeout = "100 ms"',
+            'slow-timeout = "2 s"',
+            "self-test-time = 0.0",
+        ]
+        channels = [line for number, channel in enumerate(self.channels, 1) for line in _channel_lines(number, channel)]
+        return "\n".join([*head, *channels, ""])
+
+    def blocks(self, uuid: bytes, name: str = "") -> dict[BlockId, bytes]:
+        """Return the TEDS of a node around this sensor, without Security TEDS; raises BadDataError."""
+        profile = parse_profile(self.profile_text("wrapped"), "wrapped")
+        calibrations = {
+            number: calibration
+            for number, channel in enumerate(self.channels, 1)
+            if (calibration := channel.calibration(number)) is not None
+        }
+        made = profile.build(uuid, calibration=calibrations, name=name or None)
+        kept = {place: teds for place, teds in made.blocks.items() if place != SECURITY}
+        return {**kept, ORIGIN: self.origin.encode()}
+
+
+def _channel_lines(number: int, channel: WrappedChannel) -> list[str]:
+    form, (low, high) = channel.sample, channel.limits
+    step = abs(channel.scale) if not channel.is_float else max(abs(low), abs(high)) * 1e-7 if abs(high) < 1e30 else 1e-7
+    lines = [
+        "",
+        f"[channel.{number}]",
+        f"name = {_toml(_cut(channel.name))}",
+        'type = "sensor"',
+        f"unit = {_toml(channel.unit)}",
+        f"low-limit = {_number(low)}",
+        f"high-limit = {_number(high)}",
+        f"uncertainty = {_number(step)}",
+        f'sample = {{ model = "{form.model}", octets = {form.octets}, bits = {form.bits} }}',
+        'sampling = { modes = ["trigger", "continuous"], default = "continuous" }',
+        f"update-time = {_number(channel.period)}",
+        f"sampling-period = {_number(channel.period)}",
+        "read-setup-time = 0.0",
+        "read-delay-time = 0.0",
+        "warm-up-time = 0.0",
+    ]
+    if form.coefficients is not None and channel.raw_limits is not None:
+        ends = ", ".join(_number(end) for end in channel.raw_limits)
+        lines += ["", f"[channel.{number}.calibration]", "required = true", f"raw-range = [{ends}]"]
+    text = _text_of(channel)
+    if text:
+        lines += ["", "[[text]]", 'kind = "channel-identification"', f"channel = {number}", f"xml = {_toml(text)}"]
+    return lines
+
+
+def _text_of(channel: WrappedChannel) -> str:
+    """Return comment and value table as the XML of a Channel Identification TEDS; "" if there is neither."""
+    rows = sorted(channel.choices.items())[:_MOST_TABLE]
+    values = "".join(f'<Value raw="{raw}">{escape(text)}</Value>' for raw, text in rows)
+    if not channel.comment and not values:
+        return ""
+    comment = f" comment={quoteattr(channel.comment[:200])}" if channel.comment else ""
+    return f"<Signal name={quoteattr(channel.name)}{comment}>{values}</Signal>"
+
+
+def _cut(name: str) -> str:
+    """Return a name as a TEDS can hold it: printable, at most 120 octets."""
+    printable = "".join(letter if letter.isprintable() else " " for letter in name).strip()
+    return printable.encode()[:_NAME_OCTETS].decode(errors="ignore")
+
+
+def _toml(text: str) -> str:
+    """Return a TOML basic string; JSON escapes are a part of TOML's but for DEL, which it refuses."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _number(value: float) -> str:
+    return repr(float(value))

@@ -1,0 +1,43 @@
+"""The source of a wrapped node's values: what its reader heard last, by the node's clock."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from teds_provision.node.wrapped.latest_values import LatestValues, ValidityEvents
+
+if TYPE_CHECKING:
+    from teds_provision.node.sources.base import Reading, SimulationClock
+
+Report = Callable[[int, str, str], None]
+"""Channel number, name, and the reason why it is invalid ("" once it is valid again)."""
+
+
+class WrappedSource:
+    """Values of one wrapped node; ``channels`` are numbered from 1 in the order of its description."""
+
+    def __init__(self, channels: Sequence[LatestValues], report: Report) -> None:
+        self._channels = dict(enumerate(channels, 1))
+        self._events = ValidityEvents(report)
+        self._since = 0.0
+
+    def at(self, channel: int, seconds: float) -> Reading | None:
+        """Return the last number that came by then; None, and an event with the reason, if it is not valid."""
+        values = self._channels.get(channel)
+        if values is None:
+            return None
+        reading, reason = values.at(self._since + seconds)
+        self._events.note(channel, values.channel.name, reason)
+        return reading
+
+    def start(self, drive: SimulationClock) -> None:
+        """Note where the node's clock is on the monotonic one, by which arrivals are dated."""
+        self._since = time.monotonic() - drive.now()
+
+    def acted(self, values: Mapping[str, float]) -> None:
+        """Nothing: a wrapped node has sensors only."""
+
+    def stop(self) -> None:
+        """Nothing to end: its reader serves other nodes as well."""

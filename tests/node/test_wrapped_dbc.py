@@ -1,0 +1,304 @@
+"""Wrapped CAN messages: what is measured is what cantools decodes, and what is not valid says why."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import cantools
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.errors import BadDataError, NotFoundError, UsageError
+from teds_provision.links.can.sensor_bus import SensorFrame
+from teds_provision.node import node_template
+from teds_provision.node.hardware.board import Board
+from teds_provision.node.sources.base import Reading
+from teds_provision.node.wrapped import dbc_message
+from teds_provision.node.wrapped.can_reader import MessageReader
+from teds_provision.node.wrapped.dbc_message import DbcMessage, pgn_of
+from teds_provision.node.wrapped.description import WrappedChannel, written_unit
+from teds_provision.node.wrapped.latest_values import LatestValues
+from teds_provision.node.wrapped.reading import describe
+from teds_provision.node.wrapped.running import SensorPlace, WrappedRun, require_match
+from teds_provision.node.wrapped.wrapped_source import WrappedSource
+from teds_provision.teds.calibration.interpreter import ChannelInterpreter
+from teds_provision.teds.guard import check_calibration
+from teds_provision.teds.image import Image
+from teds_provision.teds.origin import ORIGIN, origin_of
+from teds_provision.teds.sheet import Sheet
+from tests.e2e.desk import ROOT
+
+DBC = ROOT / "examples" / "bench" / "torque.dbc"
+UUID = bytes(range(10))
+MISSING = Reading(missing=True)
+HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A\n'
+
+
+def reader(message: str, told: list[str] | None = None) -> MessageReader:
+    return MessageReader(dbc_message.read(DBC, message), (told if told is not None else []).append)
+
+
+def written(folder: Path, signals: str, more: str = "") -> DbcMessage:
+    path = folder / "one.dbc"
+    path.write_text(f"{HEAD}BO_ 100 One: 8 A\n{signals}\n{more}\n")
+    return dbc_message.read(path)
+
+
+def sheet_of(sensor: object) -> Sheet:
+    return Sheet.from_image(Image(UUID, sensor.blocks(UUID)))  # type: ignore[attr-defined]
+
+
+@st.composite
+def signals(draw: st.DrawFn) -> str:
+    """One signal somewhere in eight octets; little-endian, any width, factor and offset."""
+    bits = draw(st.integers(1, 64))
+    start = draw(st.integers(0, 64 - bits))
+    scale = draw(st.sampled_from(["1", "0.01", "0.0625", "-0.5", "0.001", "3.7e-05", "250"]))
+    offset = draw(st.sampled_from(["0", "-40", "273.15", "-1000", "1e6"]))
+    sign = draw(st.sampled_from("+-"))
+    limits = draw(st.sampled_from(["[0|0]", "[-100|100]", "[0|12.5]"]))
+    unit = draw(st.sampled_from(["Nm", "degC", "rpm", "", "V", "km/h"]))
+    return f' SG_ x : {start}|{bits}@1{sign} ({scale},{offset}) {limits} "{unit}" A'
+
+
+@given(signals(), st.binary(min_size=8, max_size=8))
+def test_a_station_reads_what_cantools_decodes_and_nothing_outside_the_range(
+    tmp_path_factory: pytest.TempPathFactory, signal: str, data: bytes
+) -> None:
+    folder = tmp_path_factory.mktemp("dbc")
+    message = written(folder, signal)
+    sensor = message.sensor
+    oracle = cantools.database.load_string(f"{HEAD}BO_ 100 One: 8 A\n{signal}\n", "dbc").messages[0]
+    expected = float(oracle.decode(data)["x"])
+    values = LatestValues(sensor.channels[0])
+    values.put(1.0, message.numbers(data)["x"])
+    reading, why = values.at(1.0)
+    stated = oracle.signals[0]
+    low, high = (-math.inf, math.inf) if stated.minimum is None else (float(stated.minimum), float(stated.maximum))
+    assert reading is not None
+    if why and low - 1e-6 <= expected <= high + 1e-6:
+        assert math.isclose(expected, low, rel_tol=1e-6) or math.isclose(expected, high, rel_tol=1e-6)
+        return
+    assert ("is outside" in why) == (not low - 1e-6 <= expected <= high + 1e-6)
+    sheet = sheet_of(sensor)
+    board = Board(sheet, source=WrappedSource([values], lambda *_: None))
+    try:
+        octets = board.converters[1].octets(reading)
+    except BadDataError:
+        assert sensor.channels[0].bits == 64  # no bit to spare: the mark of the whole message says it
+        return
+    interpreter = ChannelInterpreter(sheet, 1)
+    shown = interpreter.decode(octets)
+    if why:
+        assert not shown.valid[0]
+        return
+    assert shown.valid[0], interpreter.why_invalid(shown.raw)
+    got = (interpreter.unit.to_si(float(shown.value[0])) - sensor.channels[0].written.offset) / (
+        sensor.channels[0].written.scale
+    )
+    step = abs(float(stated.scale))
+    assert abs(got - expected) < max(step / 2, abs(expected) * 1e-9)
+
+
+@given(st.binary(max_size=400))
+def test_a_file_ends_in_a_description_or_in_an_error_of_ours(
+    tmp_path_factory: pytest.TempPathFactory, octets: bytes
+) -> None:
+    path = tmp_path_factory.mktemp("dbc") / "any.dbc"
+    for content in (octets, DBC.read_bytes()[: 40 * len(octets) // 10] + octets):
+        path.write_bytes(content)
+        with suppress(BadDataError, UsageError):
+            dbc_message.read(path).sensor.blocks(UUID)
+
+
+def test_the_example_has_units_ranges_tables_and_a_calibration_that_the_guard_likes() -> None:
+    sensor = describe(f"dbc:{DBC}", "Torque")
+    blocks = sensor.blocks(UUID)
+    sheet = Sheet.from_image(Image(UUID, blocks))
+    assert not sheet.errors
+    assert [(c.name, c.unit.text, c.period) for c in sheet.channels] == [
+        ("torque", "N·m", pytest.approx(0.01)),
+        ("speed", "rpm", pytest.approx(0.01)),
+        ("temperature", "°C", pytest.approx(0.01)),
+        ("state", "", pytest.approx(0.01)),
+    ]
+    assert [finding for finding in check_calibration(blocks) if finding.severity == "error"] == []
+    assert b'<Value raw="2">overload</Value>' in blocks[4, 4]
+    assert b"clockwise is positive" in blocks[1, 4]
+    origin = origin_of(blocks)
+    assert origin is not None
+    assert (origin.kind, origin.name, origin.text) == ("dbc", "Torque", "CAN message Torque (dbc)")
+
+
+def test_multiplexed_signals_come_in_turns_and_are_late_by_their_own_period() -> None:
+    supply = reader("Supply")
+    by_name = {part.channel.name: part for part in supply.values}
+    assert {name: part.channel.period for name, part in by_name.items()} == pytest.approx(
+        {"group": 0.05, "voltage": 0.1, "current": 0.1}
+    )
+    supply.handle(SensorFrame(292, False, bytes.fromhex("00c05d0000000000"), 10.0))
+    supply.handle(SensorFrame(292, False, bytes.fromhex("01000020c1000000"), 10.05))
+    assert by_name["voltage"].at(10.06)[0] is not None
+    current, _ = by_name["current"].at(10.06)
+    assert current is not None
+    assert current.raw == -10.0  # Float32 in A: its own value
+    assert by_name["voltage"].at(10.29)[0] is not None
+    assert by_name["voltage"].at(10.31) == (MISSING, "no frame for 300 ms, 3 periods of 100 ms")
+
+
+def test_a_j1939_message_is_matched_by_its_group_from_one_address() -> None:
+    told: list[str] = []
+    shaft = reader("Shaft", told)
+    assert shaft.message.key == (pgn_of(0x18FEF121), True, True)
+    assert pgn_of(0x18EA2133) == pgn_of(0x18EA0033) == 0xEA00
+    shaft.handle(SensorFrame(0x18FEF121, True, bytes.fromhex("4038c8ffffffffff"), 5.0))
+    speed, load = shaft.values
+    assert speed.channel.value(0x3840) == 1800
+    assert speed.at(5.0)[0] is not None
+    shaft.handle(SensorFrame(0x18FEF122, True, bytes.fromhex("0000ffffffffffff"), 5.01))
+    assert told == ["Shaft also comes from the source address 0x22; only 0x21 is read."]
+    assert load.last is not None
+    assert load.last.raw == 0xC8
+    shaft.handle(SensorFrame(0x18FEF121, True, bytes.fromhex("fffffeffffffffff"), 5.02))
+    assert speed.at(5.02) == (MISSING, "the device reports it as not available")
+    assert load.at(5.02) == (MISSING, "the device reports an error")
+    shaft.handle(SensorFrame(0x18FEF122, True, bytes.fromhex("4038c8ffffffffff"), 9.0))  # the first one is silent
+    assert speed.at(9.0)[0] is not None
+
+
+def test_reasons_and_their_order() -> None:
+    torque = reader("Torque")
+    values = torque.values[0]
+    assert values.at(1.0) == (None, "no frame has come yet")
+    torque.handle(SensorFrame(291, False, bytes.fromhex("e803000000000000"), 1.0))
+    assert values.at(0.999) == (None, "no frame has come yet"), "a sample takes nothing younger than its tick"
+    torque.handle(SensorFrame(291, False, bytes.fromhex("214e000000000000"), 1.01))
+    reading, _ = values.at(1.005)
+    assert reading is not None
+    assert reading.raw == 1000 + 32768
+    assert values.at(1.02) == (MISSING, "200.01 N·m is outside -200 to 200 N·m")
+    assert values.at(1.05)[1].startswith("no frame for 30 ms")
+    values.trouble("the bus is gone")
+    assert values.at(1.05)[1].endswith(": the bus is gone")
+
+
+def test_a_frame_that_cannot_be_decoded_is_counted_and_changes_nothing() -> None:
+    told: list[str] = []
+    supply = reader("Supply", told)
+    supply.handle(SensorFrame(292, False, bytes.fromhex("05"), 1.0))
+    supply.handle(SensorFrame(292, False, bytes.fromhex("0500000000000000"), 1.0))
+    assert (supply.frames, supply.bad, len(told)) == (0, 2, 1)
+    assert "Supply cannot be decoded" in told[0]
+    assert all(part.last is None for part in supply.values)
+
+
+def test_a_channel_reports_when_it_becomes_invalid_and_valid_again() -> None:
+    events: list[tuple[int, str, str]] = []
+    values = reader("Torque").values
+    source = WrappedSource(values, lambda *event: events.append(event))
+    assert source.at(1, 1.0) is None
+    assert source.at(1, 1.1) is None
+    values[0].put(1.1, 5)
+    assert source.at(1, 1.11) is not None
+    assert source.at(1, 9.0) is None
+    assert [(channel, name, bool(why)) for channel, name, why in events] == [
+        (1, "torque", True),
+        (1, "torque", False),
+        (1, "torque", True),
+    ]
+
+
+def test_what_cannot_be_wrapped_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="has 3 messages: Torque, Supply, Shaft"):
+        describe(f"dbc:{DBC}")
+    with pytest.raises(NotFoundError, match="no message 'Brake'"):
+        describe(f"dbc:{DBC}", "Brake")
+    with pytest.raises(NotFoundError):
+        describe(f"dbc:{tmp_path}/none.dbc")
+    for text in ("dbc:", "usb:x", "torque.dbc"):
+        with pytest.raises(UsageError, match="names no sensor"):
+            describe(text)
+    with pytest.raises(UsageError, match="message of a DBC file"):
+        describe("iio:device0", "Torque")
+
+
+def test_units_of_files_and_what_is_doubtful() -> None:
+    assert [written_unit(text)[0] for text in ("Nm", "N m", "m/s2", "Deg C", "%RH", "", "1/min")] == [
+        "N·m",
+        "N·m",
+        "m/s²",
+        "degC",
+        "%",
+        "count",
+        "1/min",
+    ]
+    assert written_unit("nm") == ("nm", ""), "nanometres, no torque"
+    assert "degC" in written_unit("C")[1]
+    assert written_unit("G")[0] == "count"
+    assert written_unit("smoots") == ("count", "the unit 'smoots' is unknown: values are plain numbers")
+
+
+def test_a_raw_number_that_float32_cannot_calibrate_travels_as_its_value() -> None:
+    wide = WrappedChannel("x", "V", 0.001, 0.0, bits=32)
+    assert (wide.sample.model, wide.sample.raw) == ("float64", False)
+    far = WrappedChannel("x", "V", 0.001, 1_000_000.3, bits=16)
+    assert far.sample.model == "float64"
+    near = WrappedChannel("x", "V", 0.001, 0.0, bits=16, signed=True)
+    assert near.sample == (near.sample.__class__)("unsigned", 3, 16, True, 32768, (-32.768, 0.001))
+
+
+def test_a_wrapped_node_is_run_from_its_own_file_only(tmp_path: Path) -> None:
+    made = node_template.create(tmp_path / "n", sensor=describe(f"dbc:{DBC}", "Torque"))
+    flash = made.load()
+    assert flash.read_only == {ORIGIN}
+    origin = origin_of(flash.blocks)
+    assert origin is not None
+    changed = tmp_path / "changed.dbc"
+    changed.write_text(DBC.read_text().replace("0.01,0", "0.02,0"))
+    bus = "udp_multicast:239.1.2.3"
+    with pytest.raises(Exception, match="not the file that the node was made from"):
+        WrappedRun(SensorPlace(f"dbc:{changed}", bus), [origin], lambda _: lambda *_: None, print)
+    place = SensorPlace(f"dbc:{DBC}", bus)
+    require_match(place, [origin], ["n"])
+    for wrong, origins in (
+        (SensorPlace(f"dbc:{DBC}"), [origin]),
+        (SensorPlace("dbc:", bus), [origin]),
+        (SensorPlace(f"canopen:{DBC}", bus, (5,)), [origin]),
+        (SensorPlace(f"dbc:{DBC}", bus, (5,)), [origin]),
+        (place, [None]),
+    ):
+        with pytest.raises(UsageError):
+            require_match(wrong, origins, ["n"])
+
+
+def test_j1939_groups_of_the_profile_need_a_bus_of_their_own(tmp_path: Path) -> None:
+    path = tmp_path / "ours.dbc"
+    path.write_text(DBC.read_text().replace("2566844926", str(0x80000000 + 0x1CFF00FE)))
+    origin = describe(f"dbc:{path}", "Shaft").origin
+    bus = "udp_multicast:239.1.2.3?port=4000"
+    with pytest.raises(UsageError, match="identifiers of the nodes' own frames: Shaft"):
+        WrappedRun(SensorPlace(f"dbc:{path}", bus, (), bus), [origin], lambda _: lambda *_: None, print)
+    WrappedRun(SensorPlace(f"dbc:{path}", bus, (), f"{bus}1"), [origin], lambda _: lambda *_: None, print)
+
+
+def test_describing_needs_the_extra_and_nothing_else_loads_it() -> None:
+    code = (
+        "import sys\n"
+        "from teds_provision.node.wrapped import running, reading\n"
+        "assert not {'cantools', 'canopen', 'can', 'numpy'} & set(sys.modules), sorted(sys.modules)\n"
+        "sys.modules['cantools'] = None\n"
+        "from teds_provision.errors import NotFoundError\n"
+        "try:\n"
+        f"    reading.describe('dbc:{DBC}', 'Torque')\n"
+        "except NotFoundError as error:\n"
+        "    print(error.message, error.hint)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "needs the package cantools" in done.stdout
+    assert "teds-provision[bench]" in done.stdout
