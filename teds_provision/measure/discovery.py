@@ -22,7 +22,6 @@ from teds_provision.links.can.identify_broadcast import (
     SILENCE_SECONDS,
     FunctionalAnswers,
     ask_all,
-    ask_unclear_again,
     twice_text,
 )
 from teds_provision.links.can.isotp import Frame
@@ -216,14 +215,14 @@ class CanDiscovery(Discovery):
         self._round_ends()
 
     def _settle(self, found: FunctionalAnswers, began: float) -> None:
-        settled = ask_unclear_again(found, self.port.identify, until=began + 2 * LONGEST_SECONDS)
+        settled = self.port.settled(found, began + 2 * LONGEST_SECONDS)
         for address in sorted(settled.conflicts):
             self._presence.conflict(self.port.place, address)
         for address, identity in sorted(settled.identities.items()):
             if address in found.conflicts | found.unfinished:
                 self._saw(address, identity)
         for uuid, addresses in settled.twice.items():
-            self._presence.note(twice_text(uuid, addresses))
+            self._presence.report(twice_text(uuid, addresses))
 
     def identify_at(self, address: int, seconds: float) -> None:
         """Ask one address now, on the caller's thread; an answer is reported as any other. Raises LinkError.

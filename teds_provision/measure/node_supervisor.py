@@ -27,6 +27,7 @@ from teds_provision.errors import (
     TedsProvisionError,
     VaultLockedError,
 )
+from teds_provision.links.can.link import conflict
 from teds_provision.links.ports import CancellableLink
 from teds_provision.measure.background_reread import BackgroundReread
 from teds_provision.measure.blocks import NodeReport, SetPointCommand, State
@@ -274,6 +275,8 @@ class NodeSupervisor:
             # Under its key it said what it is refused for: it is there, and another measurement may want it now.
             if not (self._proven and isinstance(error, (NotAuthenticError, PolicyError, BadDataError))):
                 self._buses.presence.wrong(sighting)
+            if not self._proven and isinstance(error, TedsProvisionError) and self._buses.presence.is_shared(sighting):
+                raise conflict(sighting.address) from error  # whichever of the two answered
             raise
 
     def _in_session(self, bus: MeasuredBus, sighting: Sighting, standing: NodeStanding) -> None:

@@ -21,6 +21,8 @@ from teds_provision.protocol.messages.identity import Identity
 
 RECENT = 30.0  # seconds for which a conflict of addresses is the reason why a node is not found
 MOST = 1024  # UUIDs that are kept: a bus has 239 addresses, and at each of them anybody can give himself a new one
+REPEATED = 600.0  # seconds until the same trouble with addresses is reported again
+ROUND = 0.7  # seconds of two questions to everybody, after which two boards at one address are known
 TWIN = 0.5  # seconds in which the node itself may answer as well, where one that says it is it was not
 
 
@@ -68,6 +70,7 @@ class Presence:
     _missing: dict[bytes, int] = field(default_factory=dict)
     _unseen: set[bytes] = field(default_factory=set)  # those that somebody waited for, and that were not seen since
     _welcome: frozenset[int] = frozenset()  # CRCs of UUIDs that are measured as soon as they come
+    _reported: dict[str, float] = field(default_factory=dict)  # what was noted, and when
     gone: int = 0  # how often a node that had been seen, or was never looked for, became missing
     _turn: threading.Condition = field(default_factory=threading.Condition)
 
@@ -94,7 +97,19 @@ class Presence:
             for places in self._seen.values():
                 places.pop((place, address), None)
             self._turn.notify_all()
-        self.note(conflict_text(address))
+        self.report(conflict_text(address))
+
+    def report(self, text: str) -> None:
+        """Note what a look-out found out about addresses; the same again only after :data:`REPEATED` seconds."""
+        now = time.monotonic()
+        with self._turn:
+            known = now - self._reported.get(text, -REPEATED) < REPEATED
+            if not known:
+                self._reported[text] = now
+                while len(self._reported) > MOST:
+                    del self._reported[next(iter(self._reported))]
+        if not known:
+            self.note(text)
 
     def on_announce(
         self, sighting: Sighting, tell: Callable[[], None], moved: Callable[[], None] | None = None
@@ -184,17 +199,34 @@ class Presence:
             self._wrong.setdefault(sighting.uuid, {})[place] = time.monotonic()
 
     def elsewhere(self, uuid: bytes) -> bool:
+<<<<<<< HEAD
         """Return True if it answers, or ever answered, at more than one place; waits for the answer of a twin.
 
         A place that was wrong counts: the node itself may have been silent for a moment, in which an impostor answered
         and then refused the session.
+=======
+        """True if it answers, or ever answered, at more than one place, or beside another board at its own.
+
+        Waits for the answer of a twin, or until the look-out is sure of two boards at one address. A place that was
+        wrong counts: the node itself may have been silent there for a moment, which is when whoever says that he is it
+        comes into question, and refuses.
+>>>>>>> f6210e8c (Two boards with one UUID at one address are named by every command)
         """
 
         def other() -> bool:
-            return len(self._seen.get(uuid, {}).keys() | self._wrong.get(uuid, {}).keys()) > 1
+            places = self._seen.get(uuid, {}).keys() | self._wrong.get(uuid, {}).keys()
+            return len(places) > 1 or any(map(self._is_shared, places))
 
         with self._turn:
-            return self._turn.wait_for(other, TWIN)
+            return self._turn.wait_for(other, TWIN + ROUND)
+
+    def is_shared(self, sighting: Sighting) -> bool:
+        """True if two boards were heard at the address of a sighting a short while ago."""
+        with self._turn:
+            return self._is_shared((sighting.port.place, sighting.address))
+
+    def _is_shared(self, place: Place) -> bool:
+        return time.monotonic() - self._conflicts.get(place, -RECENT) < RECENT
 
     def _best(self, uuid: bytes, fresh: float) -> Sighting | None:
         """Return where to search for a node. A place that was wrong is not tried while another one may still answer."""

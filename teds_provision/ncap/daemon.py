@@ -45,7 +45,7 @@ class Daemon:
         self.station, self.settings = station, settings
         self.live, self.node_locks, self.tokens = Live(), NodeLocks(), Tokens(station.home)
         self.directory = NodeDirectory(station, self.live)
-        self.buses = Buses(news=self._saw)
+        self.buses = Buses(news=self._saw, note=lambda text: self.live.event("link", state="notice", why=text))
         self.node_jobs = NodeJobs(self.directory, self.node_locks, self._port_of)
         sinks = DaemonSinks(
             station.home,

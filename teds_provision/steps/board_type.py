@@ -140,6 +140,34 @@ def _listed(numbers: Collection[int]) -> str:
     return ", ".join(map(str, sorted(numbers))) or "none"
 
 
+def topic_warnings(station: Station, has: Image | None, wanted: Image) -> tuple[str, ...]:
+    """Return a warning for each chosen topic name whose channel will measure another quantity, or be gone.
+
+    ``has``: what the board has; without channels in it, what it was last known to have.
+    """
+    names = {number: name for (uuid, number), name in station.measurements.names.items() if uuid == wanted.uuid}
+    before = has if has is not None and _describes(has.blocks) else station.nodes.datasheet(wanted.uuid)
+    if before is None or not any(names):
+        return ()
+    old, new = ({channel.number: channel for channel in Sheet.from_image(image).channels} for image in (before, wanted))
+    warnings = []
+    for number, name in sorted(names.items()):
+        if number not in old or not number:
+            continue
+        was, now = name_of_units(old[number].units), new.get(number)
+        if now is None:
+            change = "which the new datasheet does not have"
+        elif replace(now.units, extension=0) != replace(old[number].units, extension=0):
+            change = f"which was in {was} and is in {name_of_units(now.units)} now"
+        else:
+            continue
+        warnings.append(
+            f"The chosen topic name {name!r} stays with channel {number}, {change}. "
+            f"To change it: names set {wanted.uuid.hex()[:8]} {number} NAME"
+        )
+    return tuple(warnings)
+
+
 def _describes(has: Mapping[BlockId, bytes]) -> bool:
     """Return True if these TEDS describe any channel; a new board usually has none."""
     return any(code == AccessCode.CHANNEL for _, code in has)

@@ -543,6 +543,7 @@ def build(
         image = image.with_block(SECURITY, unsigned_security(station, known_node_keys(station, uuid, has), image))
     except NotFoundError:
         warnings += ("The node's key is not known yet: the Security TEDS is added once it is identified.",)
+    warnings += topic_warnings(station, has, image)
     built = BuildResult(image, plan.profile.name, merged(warnings), plan.calibrations)
     if not keep_draft:
         return built
@@ -601,7 +602,7 @@ def propose(station: Station, prepared: PreparedOrder, present: NodeSnapshot, *,
         proposal.image,
         changes,
         proposal.named,
-        merged(proposal.warnings + warnings),
+        merged(proposal.warnings + warnings + topic_warnings(station, has, proposal.image)),
         proposal.profile,
         proposal.name,
         proposal.calibrations,

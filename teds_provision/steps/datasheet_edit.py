@@ -92,6 +92,7 @@ def plan_sheet(
     }
     require_fit(same, present.image, image)
     warnings = guard(station, image, present.image, accept_calibration, record=record)
+    warnings += topic_warnings(station, present.image, image)
     changes = tuple(diff_blocks(present.image.unsigned_blocks(), image.unsigned_blocks()))
     return SheetPlan(image, changes, warnings, present)
 

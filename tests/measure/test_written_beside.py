@@ -1,21 +1,23 @@
-"""Commands that write to a node which a `measure` of the same station has: refused before anything is signed."""
+"""A node beside its own measurement: commands that write to it, and a second board with its UUID."""
 
 from __future__ import annotations
 
+import shutil
 import signal
 from collections.abc import Iterator
 
 import pytest
 
 from tests.e2e.desk import ANGLE
-from tests.measure.hall import Hall, events
+from tests.measure.hall import Hall, Placed, events, of, ran
+from tests.pace import until
 
 pytestmark = pytest.mark.link
 
 
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
-    made = Hall(tmp_path_factory.mktemp("hall"), {"a": ANGLE})
+    made = Hall(tmp_path_factory.mktemp("hall"), {"a": ANGLE, "b": ANGLE})
     try:
         made.nodes["a"].start("--source", "ramp:1000000")  # steady, for a zero
         yield made
@@ -44,3 +46,26 @@ def test_no_sequence_is_used_up_for_a_node_that_is_being_measured(hall: Hall) ->
     assert hall.ask(*provision)["verdict"] == "authentic"
     [node] = hall.station.ask("nodes", uuid)["nodes"]
     assert node["sequence"] == 2
+
+
+def test_two_boards_with_one_uuid_at_one_address_are_named_and_end_no_other_measurement(hall: Hall) -> None:
+    """Copies answer octet for octet alike: no answer of the address alone shows that they are two."""
+    a, b = hall.nodes["a"], hall.nodes["b"]
+    b.start()
+    beside = hall.begin(b.uuid, "--rate", 20)
+    beside.wait_for('"event":"data"')
+    shutil.copytree(a.folder, hall.folder / "twin")
+    twin = Placed(hall, hall.folder / "twin", a.uuid).start()
+    outcome = hall.begin(a.uuid, "--rate", 10, "--duration", 1, "--timeout", 3).end()
+    assert outcome.code == 5, outcome
+    last = events(outcome.out)[-1]
+    assert last["error"]["code"] == "address-conflict", last
+    assert outcome.err.count("Two nodes answer at CAN address") == 1, "once, not at each question"
+    assert hall.ask("identify", "--via", "can", code=5)["error"]["code"] == "address-conflict"
+    before = beside.out.count('"event":"data"')
+    twin.kill()
+    assert of(hall.measure(a.uuid, "--rate", 10, "--duration", 0.5), a.uuid), "one of them is gone"
+    until(lambda: (beside.read(0.1), beside.out.count('"event":"data"') > before)[1])
+    beside.signal(signal.SIGTERM)
+    ended = beside.end()
+    assert (ended.code, ran(events(ended.out))) == (0, ["running", "ended"]), ended

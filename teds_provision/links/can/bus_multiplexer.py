@@ -216,8 +216,14 @@ class BroadcastReplies:
     """One functional Identify of station ``own``: ``answers`` by node address, without the transaction octet.
 
     ``conflicts`` are addresses under which two nodes answered: two first frames within this Identify, two different
+<<<<<<< HEAD
     whole answers, or consecutive frames out of sequence (profile.md, "CAN"). A lost frame looks the same, so the caller
     asks again before reporting it. ``clashes`` are those that are certain: two different beginnings.
+=======
+    whole answers, or consecutive frames out of sequence (profile.md, "CAN"). A frame that was lost looks the same,
+    so whoever asks looks again before it says so. ``clashes`` are those where it is sure: two different beginnings.
+    ``repeated`` are those with two beginnings, alike or not, which no lost frame explains.
+>>>>>>> f6210e8c (Two boards with one UUID at one address are named by every command)
     """
 
     own: int
@@ -225,6 +231,7 @@ class BroadcastReplies:
     answers: dict[int, bytes] = field(default_factory=dict)
     conflicts: set[int] = field(default_factory=set)
     clashes: set[int] = field(default_factory=set)
+    repeated: set[int] = field(default_factory=set)
     _partial: dict[int, Reassembly] = field(default_factory=dict)
     _began: dict[int, bytes] = field(default_factory=dict)
 
@@ -286,6 +293,7 @@ class BroadcastReplies:
     def _note_first_piece(self, node: int, data: bytes) -> None:
         if node in self._began:
             self.conflicts.add(node)
+            self.repeated.add(node)
             if self._began[node] != data:
                 self.clashes.add(node)
         self._began[node] = data

@@ -24,24 +24,36 @@ AskOne = Callable[[int], Identity | None]
 
 @dataclass
 class FunctionalAnswers:
+<<<<<<< HEAD
     """Result of one functional Identify: the node at each address, and the unclear ones."""
+=======
+    """What one functional Identify came to: who answers where, and what remained unclear.
+
+    ``repeated`` are conflicts with two whole beginnings, ``sure`` those where that was so in two questions: two boards
+    with one UUID and one state answer octet for octet alike, so that no answer of one address alone shows them.
+    """
+>>>>>>> f6210e8c (Two boards with one UUID at one address are named by every command)
 
     identities: dict[int, Identity] = field(default_factory=dict)
     conflicts: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
+    repeated: set[int] = field(default_factory=set)
+    sure: set[int] = field(default_factory=set)
 
     def together(self, other: FunctionalAnswers) -> FunctionalAnswers:
         """Return the combined result of two questions; an address that one of them settled is settled."""
         identities = self.identities | other.identities
         unfinished = (self.unfinished | other.unfinished) - identities.keys()
-        return FunctionalAnswers(identities, self.conflicts | other.conflicts, unfinished)
+        repeated, sure = self.repeated | other.repeated, self.sure | other.sure
+        return FunctionalAnswers(identities, self.conflicts | other.conflicts, unfinished, repeated, sure)
 
     def cleared_by(self, later: FunctionalAnswers) -> FunctionalAnswers:
         """Return the result after a later question: a conflict remains only if it appeared again."""
         identities = {node: who for node, who in self.identities.items() if node not in later.conflicts}
         identities |= later.identities
         unclear = self.unfinished | self.conflicts | later.unfinished
-        return FunctionalAnswers(identities, later.conflicts, unclear - identities.keys() - later.conflicts)
+        left = unclear - identities.keys() - later.conflicts
+        return FunctionalAnswers(identities, later.conflicts, left, later.repeated, self.repeated & later.repeated)
 
     @property
     def twice(self) -> dict[bytes, list[int]]:
@@ -72,7 +84,10 @@ def ask_all(
                 yield node, identity
         gathering = asked.replies
     yield FunctionalAnswers(
-        _identities(gathering), set(gathering.conflicts), gathering.unfinished | _unreadable(gathering)
+        _identities(gathering),
+        set(gathering.conflicts),
+        gathering.unfinished | _unreadable(gathering),
+        set(gathering.repeated),
     )
 
 
@@ -96,6 +111,10 @@ def ask_unclear_again(found: FunctionalAnswers, ask: AskOne, *, until: float) ->
     """
     identities, conflicts, unfinished = dict(found.identities), set[int](), set[int]()
     for address in sorted(found.conflicts | found.unfinished):
+        if address in found.sure:
+            identities.pop(address, None)
+            conflicts.add(address)
+            continue
         if time.monotonic() >= until:
             (conflicts if address in found.conflicts else unfinished).add(address)
             continue

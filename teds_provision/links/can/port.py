@@ -212,7 +212,7 @@ class CanPort:
             found = found.together(more)
             if len(found.identities) == known:
                 break
-        found = self._settled(found, began + LONGEST_SECONDS + _HELLO_SECONDS)
+        found = self.settled(found, began + LONGEST_SECONDS + _HELLO_SECONDS)
         if found.unfinished:
             notice(Notice("unfinished", unfinished_text(found.unfinished)))
         for uuid, addresses in found.twice.items():
@@ -227,8 +227,13 @@ class CanPort:
                 found = news
         return found
 
+<<<<<<< HEAD
     def _settled(self, found: FunctionalAnswers, until: float) -> FunctionalAnswers:
         """Check unclear answers again: apparent conflicts by asking all once more.
+=======
+    def settled(self, found: FunctionalAnswers, until: float) -> FunctionalAnswers:
+        """Look again at what remained unclear: where two seem to be, by asking everyone once more.
+>>>>>>> f6210e8c (Two boards with one UUID at one address are named by every command)
 
         A reply to a station that ended a moment ago, by chance under our transaction number, looks like a second node;
         it comes once, a second node each time.
@@ -300,7 +305,7 @@ class CanPort:
                 found = news
             elif wanted(news[1]):
                 return self._contact(*news)
-        found = self._settled(found, time.monotonic() + min(LONGEST_SECONDS, seconds))
+        found = self.settled(found, time.monotonic() + min(LONGEST_SECONDS, seconds))
         for node in sorted(found.conflicts):
             notice(Notice("conflict", conflict_text(node)))
         for node, identity in sorted(found.identities.items()):
