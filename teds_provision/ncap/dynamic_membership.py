@@ -1,6 +1,6 @@
 """The nodes of one measurement that takes in nodes as they come (``ncap run --measure``.
 
-Ncap.md, "Measure what comes").
+ncap.md, "Measure what comes").
 
 A selected node that answers on a bus joins: its lock is taken at once, before any other part works on it, its room on
 the bus is known from the stored datasheet, and its supervisor is started. A lost one leaves, gives its lock and its
