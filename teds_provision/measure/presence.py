@@ -199,18 +199,11 @@ class Presence:
             self._wrong.setdefault(sighting.uuid, {})[place] = time.monotonic()
 
     def elsewhere(self, uuid: bytes) -> bool:
-<<<<<<< HEAD
-        """Return True if it answers, or ever answered, at more than one place; waits for the answer of a twin.
+        """Return True if it answers, or ever answered, at more than one place, or beside another board at its own.
 
-        A place that was wrong counts: the node itself may have been silent for a moment, in which an impostor answered
-        and then refused the session.
-=======
-        """True if it answers, or ever answered, at more than one place, or beside another board at its own.
-
-        Waits for the answer of a twin, or until the look-out is sure of two boards at one address. A place that was
-        wrong counts: the node itself may have been silent there for a moment, which is when whoever says that he is it
-        comes into question, and refuses.
->>>>>>> f6210e8c (Two boards with one UUID at one address are named by every command)
+        Waits for the answer of a twin, or until discovery is sure of two boards at one address. A place that was wrong
+        counts: the node itself may have been silent for a moment, in which an impostor answered and then refused the
+        session.
         """
 
         def other() -> bool:

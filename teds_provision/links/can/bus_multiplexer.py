@@ -216,14 +216,9 @@ class BroadcastReplies:
     """One functional Identify of station ``own``: ``answers`` by node address, without the transaction octet.
 
     ``conflicts`` are addresses under which two nodes answered: two first frames within this Identify, two different
-<<<<<<< HEAD
     whole answers, or consecutive frames out of sequence (profile.md, "CAN"). A lost frame looks the same, so the caller
-    asks again before reporting it. ``clashes`` are those that are certain: two different beginnings.
-=======
-    whole answers, or consecutive frames out of sequence (profile.md, "CAN"). A frame that was lost looks the same,
-    so whoever asks looks again before it says so. ``clashes`` are those where it is sure: two different beginnings.
-    ``repeated`` are those with two beginnings, alike or not, which no lost frame explains.
->>>>>>> f6210e8c (Two boards with one UUID at one address are named by every command)
+    asks again before reporting it. ``clashes`` are those that are certain: two different beginnings. ``repeated`` are
+    those with two beginnings, alike or not, which no lost frame explains.
     """
 
     own: int

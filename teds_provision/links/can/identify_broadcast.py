@@ -24,15 +24,11 @@ AskOne = Callable[[int], Identity | None]
 
 @dataclass
 class FunctionalAnswers:
-<<<<<<< HEAD
-    """Result of one functional Identify: the node at each address, and the unclear ones."""
-=======
-    """What one functional Identify came to: who answers where, and what remained unclear.
+    """Result of one functional Identify: the node at each address, and the unclear ones.
 
-    ``repeated`` are conflicts with two whole beginnings, ``sure`` those where that was so in two questions: two boards
-    with one UUID and one state answer octet for octet alike, so that no answer of one address alone shows them.
+    ``repeated`` are conflicts with two whole beginnings, ``sure`` those with two in two questions: two boards with one
+    UUID and one state answer octet for octet alike, so that no answer of one address alone shows them.
     """
->>>>>>> f6210e8c (Two boards with one UUID at one address are named by every command)
 
     identities: dict[int, Identity] = field(default_factory=dict)
     conflicts: set[int] = field(default_factory=set)

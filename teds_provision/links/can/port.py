@@ -227,13 +227,8 @@ class CanPort:
                 found = news
         return found
 
-<<<<<<< HEAD
-    def _settled(self, found: FunctionalAnswers, until: float) -> FunctionalAnswers:
-        """Check unclear answers again: apparent conflicts by asking all once more.
-=======
     def settled(self, found: FunctionalAnswers, until: float) -> FunctionalAnswers:
-        """Look again at what remained unclear: where two seem to be, by asking everyone once more.
->>>>>>> f6210e8c (Two boards with one UUID at one address are named by every command)
+        """Check unclear answers again: apparent conflicts by asking all once more.
 
         A reply to a station that ended a moment ago, by chance under our transaction number, looks like a second node;
         it comes once, a second node each time.
