@@ -154,3 +154,48 @@ def test_what_docstrings_refer_to_exists() -> None:
     ] == []
     here = PACKAGE / "limits.py"
     assert len(unknown_roles(here, "x = 1  # :func:`gone` :mod:`.gone` :func:`x`", every)) == 2
+
+
+# -- the form of a page ------------------------------------------------------------------------------------------------
+
+GUIDES = sorted(page for page in (ROOT / "docs").glob("*.md") if page.name != "README.md")
+
+
+def texts(*folders: str) -> str:
+    """All literal texts of the code, with a mark where a value comes in, and the page's scripts."""
+    found: list[str] = []
+    for folder in folders:
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    found.append(node.value)
+                elif isinstance(node, ast.JoinedStr):
+                    parts = (part.value if isinstance(part, ast.Constant) else "…" for part in node.values)
+                    found.append("".join(map(str, parts)))
+        found += [path.read_text(encoding="utf-8") for path in (ROOT / folder).rglob("page/**/*.[jh]*")]
+    return "\n".join(found)
+
+
+def test_every_page_says_what_for_what_to_type_what_you_will_see_what_can_go_wrong_and_what_is_next() -> None:
+    wrong = []
+    for page in GUIDES:
+        text = page.read_text(encoding="utf-8")
+        lacks = [
+            part for part in ("\n**For** ", "\n```", "**You will see**", "\n## What can go wrong\n") if part not in text
+        ]
+        if lacks or re.findall("^## (.+)", text, re.MULTILINE)[-1] != "Next":
+            wrong.append(f"{page.name}: {lacks or 'the last section is not Next'}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_what_can_go_wrong_quotes_what_the_program_says() -> None:
+    said = texts("teds_provision", "benchmarks", "tests/vectors")
+    wrong = []
+    for page in GUIDES:
+        _, _, part = page.read_text(encoding="utf-8").partition("\n## What can go wrong\n")
+        for row in re.findall(r"^\| (?!what |---)([^|]+) \|", part.partition("\n## ")[0], re.MULTILINE):
+            for quoted in re.findall("`([^`]+)`", row):
+                pieces = [piece.strip(" .") for piece in quoted.split("…")]
+                if not quoted.startswith("tests/") and not all(piece in said for piece in pieces):
+                    wrong.append(f"{page.name}: {quoted}")
+    assert not wrong, "\n".join(wrong)

@@ -93,6 +93,14 @@ def test_a_released_version_is_in_the_changelog_and_others_say_so() -> None:
     assert (heading in (ROOT / "CHANGELOG.md").read_text()) is (".dev" not in version[1])
 
 
+def test_each_version_of_the_changelog_begins_with_a_date_and_a_summary() -> None:
+    for section in re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1:]:
+        heading, _, rest = section.partition("\n")
+        summary = rest.partition("\n### ")[0].strip()
+        assert re.search(r"\d{4}-\d\d-\d\d", heading + summary), heading
+        assert 0 < len(summary.splitlines()) <= 5, heading
+
+
 # -- make test-all -----------------------------------------------------------------------------------------------------
 
 
