@@ -23,6 +23,7 @@ from hypothesis import HealthCheck, settings
 from teds_provision.station.station import Station
 from tests.bench import Board, make_station
 from tests.firmware.c_node import OFFERS
+from tests.passphrase_costs import lower_costs
 
 AT_THE_GATE = os.environ.get("CI", "").lower() not in ("", "0", "false")
 
@@ -66,6 +67,7 @@ def pytest_configure() -> None:
         theirs = name in OF_THE_CALLER or name.lower() in OF_PROXIES or name.startswith(("TEDS_PROVISION_", "ROS_"))
         if theirs:
             del os.environ[name]
+    lower_costs()
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -346,6 +346,7 @@ def _import_all() -> None:
                 importlib.import_module(found.name)
     for name in FOREIGN:
         importlib.import_module(name)
+    importlib.import_module("tests.passphrase_costs").lower_costs()
 
 
 def main() -> None:

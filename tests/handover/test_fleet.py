@@ -34,7 +34,7 @@ from teds_provision.steps.write import write
 from teds_provision.store import WhitelistEntry
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY, Image
-from teds_provision.vault import forget_vaults, passphrase
+from teds_provision.vault import forget_vaults
 from tests.bench import PASSPHRASE, Board, MemoryLink, make_station, talk
 from tests.handover.desk import provisioned, session, trust
 
@@ -44,9 +44,7 @@ def ask(prompt: str, confirm: bool) -> str:
 
 
 @pytest.fixture(autouse=True)
-def cheap(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr("teds_provision.vault.selection.PRODUCT", passphrase.THROWAWAY)
-    monkeypatch.setattr("teds_provision.vault.file_vault.PRODUCT", passphrase.THROWAWAY)
+def vaults_forgotten() -> Iterator[None]:
     yield
     forget_vaults()
 

@@ -21,6 +21,7 @@ from teds_provision.vault.file_vault import FileVault
 from teds_provision.vault.master import Material
 from teds_provision.vault.passphrase import PRODUCT, THROWAWAY
 from tests.pace import costs_at_most
+from tests.passphrase_costs import product_costs
 from tests.vault.passphrase import GOOD, STORE, Person
 
 
@@ -35,7 +36,8 @@ def test_the_keys_come_back_with_the_passphrase(tmp_path: Path, vault: FileVault
 
 
 def test_the_product_pays_64_mib_and_says_so_in_the_file(tmp_path: Path) -> None:
-    vault, why = create_vault(tmp_path, STORE, "file", Person())
+    with product_costs():
+        vault, why = create_vault(tmp_path, STORE, "file", Person())
     content = json.loads((tmp_path / "vault.json").read_text())
     assert (vault.kind, why) == ("file", "as requested")
     assert (content["kdf"], content["memory_kib"], content["iterations"], content["lanes"]) == ("argon2id", 65536, 3, 4)

@@ -21,8 +21,7 @@ from teds_provision.cli.context import App
 from teds_provision.errors import TedsProvisionError
 from teds_provision.station.station import Station, rewrap
 from teds_provision.store import StoreLock
-from teds_provision.vault import agent, forget_vaults, passphrase, selection
-from teds_provision.vault.passphrase import THROWAWAY, SealingKey
+from teds_provision.vault import agent, forget_vaults, selection
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import Outcome, call
 from tests.pace import until
@@ -102,31 +101,19 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A station with keys under its second master key, and a backup with one more, under the first."""
     forget_vaults()
     folder = tmp_path_factory.mktemp("prepared")
-    with pytest.MonkeyPatch.context() as patch:
-        cheap(patch)
-        station = make_station(folder / "home")
-        for uuid in NODES:
-            station.keys.add_pending(uuid, key=uuid + b"first!", key_id=uuid[-8:], epoch=1)
-            station.keys.promote(uuid, uuid[-8:].hex())
-        station.vault.export_ca(folder / "ca.pem", OF_THE_CA)
-        station.close()
-        assert call(folder / "home", "backup", folder / "old.backup").code == 0
-        station = opened(folder / "home", PASSPHRASE)
-        station.keys.remove(NODES[3])
-        rewrap(station)
-        station.close()
+    station = make_station(folder / "home")
+    for uuid in NODES:
+        station.keys.add_pending(uuid, key=uuid + b"first!", key_id=uuid[-8:], epoch=1)
+        station.keys.promote(uuid, uuid[-8:].hex())
+    station.vault.export_ca(folder / "ca.pem", OF_THE_CA)
+    station.close()
+    assert call(folder / "home", "backup", folder / "old.backup").code == 0
+    station = opened(folder / "home", PASSPHRASE)
+    station.keys.remove(NODES[3])
+    rewrap(station)
+    station.close()
     forget_vaults()
     return folder
-
-
-def cheap(patch: pytest.MonkeyPatch) -> None:
-    """Argon2id at its least costs, whatever was asked for."""
-    real = SealingKey.derive.__func__  # type: ignore[attr-defined]
-
-    def derive(cls: type[SealingKey], said: str, *, costs: object, salt: bytes | None = None) -> SealingKey:
-        return real(cls, said, costs=THROWAWAY if costs == passphrase.PRODUCT else costs, salt=salt)
-
-    patch.setattr(SealingKey, "derive", classmethod(derive))
 
 
 @pytest.fixture
@@ -134,7 +121,6 @@ def world(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
     forget_vaults()
     shutil.copytree(prepared, tmp_path, dirs_exist_ok=True)
     world = World(tmp_path / "home")
-    cheap(monkeypatch)
     enter, leave = StoreLock.__enter__, StoreLock.__exit__
 
     def entered(lock: StoreLock) -> StoreLock:
