@@ -7,6 +7,7 @@ Whoever waits for something that has to come waits ``PATIENCE``.
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
@@ -14,6 +15,10 @@ from typing import TypeVar
 T = TypeVar("T")
 
 PATIENCE = 60.0  # seconds; what comes at all comes by then, on any machine
+
+
+class FailedTryWarning(UserWarning):
+    """A try of :func:`best_of` or :func:`succeeds` that failed."""
 
 
 @contextmanager
@@ -31,6 +36,8 @@ def best_of(tries: int, limit: float, attempt: Callable[[], float]) -> None:
     while not took or took[-1] >= limit:
         assert len(took) < tries, f"{took} s, never less than {limit} s"
         took.append(attempt())
+        if took[-1] >= limit:
+            _report_failed_try(len(took), tries, f"{took[-1]:.3f} s, not less than {limit} s")
 
 
 def succeeds(tries: int, attempt: Callable[[], object]) -> None:
@@ -42,6 +49,13 @@ def succeeds(tries: int, attempt: Callable[[], object]) -> None:
     while not wrong or wrong[-1]:
         assert len(wrong) < tries, wrong
         wrong.append(attempt())
+        if wrong[-1]:
+            _report_failed_try(len(wrong), tries, str(wrong[-1]))
+
+
+def _report_failed_try(number: int, tries: int, why: str) -> None:
+    """Warn, so that the summary of the run lists each failed try with its test, even if the next one passed."""
+    warnings.warn(f"try {number} of {tries} failed: {why}", FailedTryWarning, stacklevel=3)
 
 
 def until(found: Callable[[], T], why: object = "", seconds: float = PATIENCE) -> T:

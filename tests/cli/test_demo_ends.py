@@ -1,7 +1,8 @@
-"""The demo leaves nothing behind, however it is ended."""
+"""The demo runs to its end in a process of its own, and leaves nothing behind, however it is ended."""
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -11,6 +12,24 @@ from pathlib import Path
 import pytest
 
 from .shell import clean_environment
+
+
+@pytest.mark.link
+def test_the_whole_story_as_make_demo_starts_it(tmp_path: Path) -> None:
+    """Start an interpreter: what the demo loads late, by name, is loaded by no process that forks."""
+    done = subprocess.run(
+        [sys.executable, "-m", "teds_provision", "--json", "demo"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=240,
+        env=clean_environment(TMPDIR=str(tmp_path)),
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    told = json.loads(done.stdout)
+    assert told["verdict"] == "authentic"
+    assert {"import-keys", "verify", "measure", "set"} <= {step["name"] for step in told["steps"]}
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.link

@@ -1,4 +1,7 @@
-"""Thirty cells of the pair bench at the gate; `make pairs` runs all of them, and bench.py says what it leaves out."""
+"""Cells of the pair bench at the gate: each change, each long run, each time.
+
+`make pairs` runs all cells; bench.py says what it leaves out.
+"""
 
 from __future__ import annotations
 
@@ -13,23 +16,17 @@ pytestmark = pytest.mark.link
 
 CHOSEN = (
     "revoke during ncap run",
-    "revoke during measure",
-    "revoke after registry sync",
     "decommission during ncap run",
     "group remove during ncap run",
     "group add during measure",
     "group delete before ncap run",
     "whitelist remove during measure",
     "vault passphrase during ncap run",
-    "vault passphrase during registry sync",
-    "vault passphrase before provision --watch",
-    "vault rewrap before measure",
     "vault rewrap during provision --watch",
     "vault rewrap during signer run",
     "agree --rotate during ncap run",
     "write --from during ncap run",
     "provision during ncap run",
-    "provision before provision --watch",
     "trust remove during ncap run",
     "export-keys move during measure",
     "replace during measure",

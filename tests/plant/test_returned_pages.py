@@ -79,7 +79,14 @@ def loss(tmp_path: Path, cluster: Cluster) -> Iterator[Loss]:
     made.plant.close()
 
 
-@pytest.mark.parametrize("roles", [("line",), ("sign",), ("base",), ("audit",), ("keeper", "sign")])
+@pytest.mark.parametrize(
+    "roles",
+    [
+        ("line",),
+        ("keeper", "sign"),
+        *(pytest.param(roles, marks=pytest.mark.soak) for roles in [("sign",), ("base",), ("audit",)]),
+    ],
+)
 def test_the_pages_of_a_removed_station_return_whatever_it_was(loss: Loss, roles: tuple[Role, ...]) -> None:
     west = loss.leaver(*roles)
     loss.remove(west)

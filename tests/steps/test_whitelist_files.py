@@ -175,15 +175,15 @@ def test_no_octets_make_anything_but_entries_or_one_of_our_errors(tmp_path: Path
 
 
 @pytest.mark.slow
-def test_a_hundred_thousand_entries_are_quick(tmp_path: Path, station: Station) -> None:
-    entries = [WhitelistEntry(number.to_bytes(10, "big"), KEY, assurance="tap") for number in range(100_000)]
+def test_ten_thousand_entries_are_quick(tmp_path: Path, station: Station) -> None:
+    entries = [WhitelistEntry(number.to_bytes(10, "big"), KEY, assurance="tap") for number in range(10_000)]
     for form in FORMATS:
         (tmp_path / f"big.{form}").write_text("".join(render(entries, form)))
-    with costs_at_most(30):  # some 5 s; ten times as many looked up one by one were hours
+    with costs_at_most(6):  # 1 s on a quiet machine; each looked up among all, one by one, took minutes
         listed = [read_whitelist(tmp_path / f"big.{form}") for form in FORMATS]
-        assert len(listed[0]) == len(listed[1]) == len(listed[2]) == 100_000
+        assert len(listed[0]) == len(listed[1]) == len(listed[2]) == 10_000
         add(station, plan_addition(station, listed[0]), source="big.xml")
-    assert len(station.pins.whitelist()) == 100_000
+    assert len(station.pins.whitelist()) == 10_000
     assert plan_addition(station, listed[1]).write == ()
 
 
