@@ -417,7 +417,7 @@ class Client:
                 connection.request("GET", f"{API}/nodes/{uuid}/let-go?for={quote(command, safe='')}")
                 answer = connection.getresponse()
                 said = answer.readline() if answer.status == 200 else b""
-            except LinkError:  # nobody listens
+            except LinkError:  # no listener
                 yield False
                 return
             except (OSError, http.client.HTTPException) as error:

@@ -75,7 +75,7 @@ def whole_draft(path: Path, *, replace: bool, mode: int = PRIVATE) -> Iterator[t
     descriptor = os.open(draft, os.O_CREAT | os.O_EXCL | os.O_RDWR | NOFOLLOW | CLOSING, mode)
     try:
         with open(descriptor, "w+b") as file:
-            with suppress(OSError):  # some network folders have no locks: then only its age tells a left-over file
+            with suppress(OSError):  # some network folders have no locks: then only its age identifies a left-over file
                 lock(file.fileno())
             yield draft, file
             file.flush()
@@ -238,7 +238,7 @@ def _failing_as(path: Path, failure: type[TedsProvisionError]) -> Iterator[None]
 def _read(descriptor: int, most: int) -> bytes:
     """So many octets at most of an open file, which is closed; raises OSError."""
     parts: list[bytes] = []
-    try:  # by the system's own calls: half of what open() does, where there are thousands of files
+    try:  # by the system's own calls: half of the cost of open(), for thousands of files
         while most and (part := os.read(descriptor, min(most, _PIECE))):
             parts.append(part)
             most -= len(part)

@@ -101,7 +101,7 @@ def rebuild(
 
     def make(known: Ask) -> RestoreResult:
         with StoreLock(home, command="restore"):
-            if (present := open_present(home, content)) is not None:  # the person was told of a home without one
+            if (present := open_present(home, content)) is not None:  # the operator was asked about a home without one
                 present.close()
                 raise VaultChangedError(
                     f"Another command has created the station in {home} in the meantime; this one changed nothing.",
@@ -110,12 +110,12 @@ def rebuild(
             vault, why = bring_vault(home, content, known, wanted, costs)
             kind = wanted if wanted is not None and wanted.startswith("pkcs11:") else vault.kind
             with copy.transaction():
-                # note in a restored store where the secrets lie on this machine
+                # note in a restored store of this machine's keystore
                 facts = copy.facts()
                 if facts is not None:
                     copy.put_facts(replace(facts, keystore=kind, keystore_why=why))
                 due = _demand_rotations(copy, content, known)
-                # Have a home that belongs to a plant look for its own pages before it says anything there
+                # Have a home that belongs to a plant look for its own pages before it states anything there
                 if copy.plant() is not None:
                     station = Station(copy, known)
                     station.adopt(vault)
@@ -146,7 +146,7 @@ def keystore_for(content: Content, asked: str | None) -> str | None:
     The path of a module never comes from a backup: for keys in a token the URI has to be given (UsageError). Raises
     PolicyError if the keys cannot be stored there.
     """
-    # The backup's own keystore where any machine can have it; None for what this machine has.
+    # The backup's own keystore if any machine can have it; None for this machine's default.
     kept = None if content.in_token or content.keystore in ("keyring", "pkcs11") else content.keystore
     wanted = asked or kept
     into_token = wanted is not None and wanted.startswith("pkcs11:")
@@ -204,7 +204,7 @@ def complete_vault(store: Store, content: Content, ask: Ask, *, keystore: str | 
         vault = open_vault(store.home, store.id, wanted or "keyring", ask)
     except (WrongPassphraseError, VaultChangedError):
         raise
-    except VaultError:  # lost, or locked: then making it fails as well and says so
+    except VaultError:  # lost, or locked: then making it fails as well, with the reason
         return bring_vault(store.home, content, ask, wanted)[0]
     if not any(True for _ in content.unopened(vault)):
         return vault

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from teds_provision import files, limits
 else:
-    difflib, files, limits = late("difflib"), late("teds_provision.files"), late("teds_provision.limits")  # where it is
+    difflib, files, limits = late("difflib"), late("teds_provision.files"), late("teds_provision.limits")  # its path
 
 NEVER_IN_FILE: Final = frozenset({"home", "help", "version", "passphrase-fd"})
 BROKERS: Final = "ncap brokers"
@@ -133,7 +133,7 @@ def config_path(home: Path | None) -> Path:
 
 def read_config_text(path: Path) -> str | None:
     """Return the text of the file, None if there is none; raises BadDataError."""
-    if not os.path.lexists(path):  # or a home that cannot be one: whoever opens it says so
+    if not os.path.lexists(path):  # or an invalid home: opening it raises the error
         return None
     try:
         return files.read_text(path, limits.LIMITS.text_file, "config.toml", failure=BadDataError)

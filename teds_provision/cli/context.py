@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from teds_provision.cli import console
     from teds_provision.station.station import Station
 else:
-    client = late("teds_provision.client")  # HTTP: only where a base station runs
+    client = late("teds_provision.client")  # HTTP: only if a base station runs
     json = late("json")
     console = late("teds_provision.cli.console")  # rich
 

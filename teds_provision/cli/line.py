@@ -108,7 +108,7 @@ def new(app: App, /, output: Path | None, dry_run: bool, **told: Any) -> None:
     if not roster.has(station.identity.fingerprint, "keeper"):
         raise PolicyError("This station is not a keeper, so no station would accept its job.", hint="Ask a keeper.")
     drafted = _drafted(station, roster, told)
-    if dry_run:  # what nobody would take is refused in a plan too
+    if dry_run:  # an invalid job is refused in a plan too
         protocol.plant.job.seal_job(drafted, protocol.keys.SoftwareKey.generate())
     else:
         station.unlock()
@@ -127,7 +127,7 @@ def _drafted(station: Station, roster: Roster, told: dict[str, Any]) -> Job:
     path = teds.profile.load.find_profile(told["profile"], teds.profile.load.default_folders(station.home))
     teds.profile.load.load_profile(path, teds.profile.load.default_folders(station.home)).build(
         bytes(10)
-    )  # else nobody could work on the job
+    )  # else no station could work on the job
     boards = _boards(told["listed"]) if told["listed"] is not None else {}
     total = told["count"] or len(boards)
     sign = told["sign"]

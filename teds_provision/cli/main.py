@@ -313,7 +313,7 @@ def _traceback(arguments: list[str]) -> None:
 
 def _fail(arguments: list[str], exit_code: int, code: str, message: str, hint: str) -> int:
     if App.current is not None:
-        App.current.live_line()  # takes it away, before something else is told
+        App.current.live_line()  # removes it before any other output
     if _wants(arguments, "--json"):
         with contextlib.suppress(OSError):
             print(json.dumps({"error": {"code": code, "message": message, "hint": hint}}), flush=True)
@@ -329,7 +329,7 @@ def _print_message(text: str) -> None:
         print_message(text)
 
 
-# Global options may stand before or after the command: they are moved to the front before click reads the line.
+# Global options may be given before or after the command: they are moved to the front before click parses the line.
 
 _FLAGS: Final = frozenset({"--json", "--verbose", "--quiet", "--debug", "--no-input", "-q", "-v", "-vv", "-vvv"})
 _WITH_VALUE: Final = frozenset({"--home", "--passphrase-fd"})
@@ -372,7 +372,7 @@ def _divided(word: str, words: Iterator[str]) -> tuple[list[str], list[str]]:
     if name in _FLAGS or (name in _WITH_VALUE and "=" in word):
         return [word], []
     value = _next(words) if name in _WITH_VALUE else []
-    return ([word, *value], []) if value else ([], [word])  # where the value is missing, click says so
+    return ([word, *value], []) if value else ([], [word])  # if the value is missing, click reports it
 
 
 def _next(words: Iterator[str]) -> list[str]:

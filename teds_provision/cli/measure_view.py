@@ -101,7 +101,7 @@ class StdoutEvents(ThreadedSink):
             sys.stdout.buffer.write(octets)
             sys.stdout.buffer.flush()
         except BrokenPipeError:
-            self._stop.set()  # nobody reads any more: end in order, so that the nodes are let go
+            self._stop.set()  # no reader any more: end in order, so that the nodes are released
             raise
 
     def _finish(self) -> None:

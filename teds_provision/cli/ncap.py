@@ -50,7 +50,7 @@ else:
     matching = late("teds_provision.measure.matching")
 
 
-MOST: Final = 1000  # lines that may wait for somebody to read them
+MOST: Final = 1000  # lines that may wait for a reader
 _MOST_NAMED: Final = 5
 _MOST_REASONS: Final = 5
 LEAVING: Final = 2.0  # seconds for them to leave at the end
@@ -160,12 +160,12 @@ def run(
         unknown = match.unknown_type(station)
         if unknown:
             app.warn(f"Nothing is measured until a node of that type comes: {unknown}.")
-    station.unlock()  # nobody is asked for a passphrase later
+    station.unlock()  # no passphrase prompt later
     lines = DaemonLog(app)
     with tracing(trace) as opened:
         service_run.run(station, replace(wanted, trace=opened), lines.write_event)
     if not lines.end():
-        os._exit(0)  # all has ended in order; a line that nobody takes would hold the end of the process up for ever
+        os._exit(0)  # all has ended in order; a line without a reader would delay the end of the process for ever
 
 
 class DaemonLog:

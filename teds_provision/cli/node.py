@@ -287,7 +287,7 @@ def run(
             running.append(part)
         _say_ready(app, nodes, [links[kind] for kind in ("nfc", "can", "ble") if links[kind]], source)
         lines.start()
-        running.insert(0, lines)  # the last to end: it tells that actuators are safe
+        running.insert(0, lines)  # the last to end: it reports that actuators are safe
         while not stop.wait(0.5):
             pass
     finally:
@@ -528,7 +528,7 @@ class ActuatorLines:
                 self._told[uuid, channel] = state
                 try:
                     self._print_state(uuid, state)
-                except OSError:  # nobody reads, or the disk is full: the node runs on
+                except OSError:  # no reader, or the disk is full: the node runs on
                     self._stop.set()
                     return
 

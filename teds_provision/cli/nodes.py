@@ -152,7 +152,7 @@ _FIELDS = (
 )  # fmt: skip
 
 
-# Title, the text of a cell, and how gladly the column is dropped where a terminal is narrow (0: never).
+# Title, the text of a cell, and the order in which columns are dropped on a narrow terminal (0: never).
 _COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str], int], ...] = (
     ("UUID", lambda node: node["uuid"], 0),
     ("name", lambda node: _cut(shown(node["name"]), _NAME_COLUMNS), 1),

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from teds_provision.links import Trace
     from teds_provision.trace import recorder
 else:
-    client = late("teds_provision.client")  # HTTP: only where a base station runs
+    client = late("teds_provision.client")  # HTTP: only if a base station runs
     recorder = late("teds_provision.trace.recorder")  # most runs have no trace
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -147,7 +147,7 @@ def link_options(function: Function) -> Function:
         if not chosen and (here == {"can"} or (here == {"ble"} and not nfc)):  # the one that is named is meant
             via, chosen = here.pop(), True
         with tracing(trace) as opened, readers_for(via):
-            # a setting of config.toml is patience for a tap; whoever names it here means this very search
+            # a setting of config.toml is the wait for a tap; the option on the command line means this very search
             listen = timeout if said_here("timeout") else LISTEN_SECONDS
             links = LinkSettings(via, nfc or None, named, ble, timeout, opened, listen, chosen)
             return function(*args, links=links, **rest)
@@ -249,9 +249,9 @@ def tracing(path: Path | None) -> Iterator[Trace | None]:
     trace = recorder.open_trace(path, app.warn if app is not None else print)
     try:
         yield trace
-    except BaseException:  # a command that failed before the first frame can be run again as it stands
+    except BaseException:  # a command that failed before the first frame can be repeated unchanged
         trace.close(keep_empty=False)
         raise
     trace.close()
-    if trace.failure:  # it was told when it happened, and the result stands on stdout already
+    if trace.failure:  # it was reported when it happened, and the result is on stdout already
         raise click.exceptions.Exit(StoreError.exit_code)

@@ -237,7 +237,7 @@ def new(
     elif source is not None and mapping is not None:
         rules = read_file(mapping).decode(errors="replace")
         text = profile_from_xml(read_file(Path(source)), rules, name=name, file=source, by=str(mapping))
-        parse_profile(text, name)  # what the XML says is checked like any profile
+        parse_profile(text, name)  # the XML's content is checked like any profile
     elif extends is not None:
         base = find_profile(extends, default_folders(app.home)).stem
         text = (

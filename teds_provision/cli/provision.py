@@ -169,7 +169,7 @@ def provision(
     elif dry_run:
         _tell_plan(app, boards.plan())
     elif request.several:
-        boards.unlock()  # asked for before the screen says what to do
+        boards.unlock()  # asked for before the screen shows instructions
         begun = None if several else reporter  # with several readers one board may be begun while another one ends
         with screen_for(app, boards, begun) as screen:
             questions = _questions(app, yes, strangers=not everything, several=True)
@@ -195,7 +195,7 @@ def _one(app: App, boards: BatchRun, questions: Questions) -> None:
     try:
         done = boards.one(questions)
     except steps_room.build.UnrequestedChangeError as error:
-        # With --json the changes stand beside the error, so that whoever asked can name them.
+        # With --json the changes are beside the error, so that the caller can name them.
         changes = [change.text for change in error.changes]
         app.conclude({"changes": changes}, "\n".join(f"  {text}" for text in changes), error)
         return
@@ -276,7 +276,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
             app.confirm(question, yes=yes)
 
     def take_over(question: str) -> None:
-        with turn:  # whatever --yes says: it locks another station out, and no option of this command names that
+        with turn:  # regardless of --yes: it locks another station out, and no option of this command names that
             if not app.ask_yes_no(question):
                 raise steps_room.batch_sheet.DeclinedError("Cancelled. The node keeps its key; nothing was changed.")
 

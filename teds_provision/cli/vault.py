@@ -53,7 +53,7 @@ def passphrase(app: App, new_passphrase_fd: int | None, dry_run: bool) -> None:
         new = confirm and new_passphrase_fd is not None
         return read_line(new_passphrase_fd or 0) if new else app.ask_new(prompt) if confirm else app.ask_secret(prompt)
 
-    set_it = opened.new_passphrase(ask)  # nobody else waits for the store while a person types
+    set_it = opened.new_passphrase(ask)  # no other process waits for the store while a person types
     with station.lock("vault passphrase", app.note):
         opened.refresh()
         agent.lock(app.home)  # what is held open is of the old one

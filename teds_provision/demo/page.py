@@ -97,7 +97,7 @@ def _daemon(home: Path, secret: str, *options: str) -> Iterator[None]:
     os.write(write, f"{secret}\n".encode())
     os.close(write)
     command = [sys.executable, "-m", "teds_provision", "--home", str(home), "--json", "--passphrase-fd", str(read)]
-    with (home / "events").open("w+b") as events:  # a file: nobody reads what comes after the first line
+    with (home / "events").open("w+b") as events:  # a file: nothing reads what comes after the first line
         try:
             process = subprocess.Popen(
                 [*command, "ncap", "run", *options],

@@ -310,7 +310,7 @@ def _shown(system: System, node: Path) -> str:
 
 # What the doctor looks at around Bluetooth: adapters, switches, the service, roles and connections.
 #
-# Nothing is opened and nobody is connected to; a trouble is a failure only where BLE was asked for.
+# Nothing is opened and no connection made; a fault is a failure only if BLE was requested.
 
 _BLUETOOTH: Final = "bluetooth"
 _MANY: Final = 5

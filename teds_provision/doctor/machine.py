@@ -123,7 +123,7 @@ def _last_entry(system: System) -> datetime | None:
         with store_room.Store.open(system.home) as store:
             latest = store.audit.latest()
         return datetime.strptime(latest, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC) if latest is not None else None
-    except (StoreError, ValueError):  # the checks of the store say so
+    except (StoreError, ValueError):  # the checks of the store report it
         return None
 
 

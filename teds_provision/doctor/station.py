@@ -194,7 +194,7 @@ def _keystore(system: System) -> str | None:
         with Store.open(system.home) as opened:
             facts = opened.facts()
             return facts.keystore if facts is not None else None
-    except StoreError:  # the check of the store says so
+    except StoreError:  # the check of the store reports it
         return None
 
 

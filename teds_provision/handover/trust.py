@@ -178,7 +178,7 @@ def _adopt(station: Station, certificate: Certificate) -> None:
     with station.transaction():
         if fresh:
             identity.complete(own, certificate.ca, certificate.signature)
-        else:  # a station with a CA of its own: certified by another one too, for the nodes of that one
+        else:  # a station with another CA: certified by this one too, for the nodes of that one
             identity.keep_certificate(certificate.ca, station.point, certificate.signature)
         station.audit("init", None, "certified", ca=fingerprint(certificate.ca), own=fresh)
 

@@ -25,7 +25,7 @@ from teds_provision.teds.image import Image
 GAP: Final = 1  # ms between the frames of a reply: of a bus of 500 kbit/s three quarters stay free meanwhile
 SPARING: Final = 4.0  # times as long as an exchange took nothing more is read
 FIRST: Final = 1.0  # seconds from the first value on in which nothing is read: others on the bus are still beginning
-AGAIN: Final = 10.0  # seconds until it is begun anew where the node did not answer, or was busy
+AGAIN: Final = 10.0  # seconds until the next try if the node did not answer, or was busy
 TRIES: Final = 5
 
 

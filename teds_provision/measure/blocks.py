@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from teds_provision.teds.calibration.model import Calibration
 
 Kind = Literal["sensor", "event", "actuator"]
-MOST_TOLD = 3  # reasons that one line tells
+MOST_TOLD = 3  # reasons in one line
 State = Literal["waiting", "running", "lost", "refused", "ended"]
 
 
@@ -36,9 +36,9 @@ class ChannelFacts:
     """
 
     uuid: str  # 20 hex digits, lower case
-    node: str  # name of the node in the store; empty where it has none
+    node: str  # name of the node in the store; empty if it has none
     number: int  # of the TransducerChannel, 1 to 255
-    name: str  # from the datasheet; empty where it has none
+    name: str  # from the datasheet; empty if it has none
     kind: Kind = "sensor"
     unit: str = ""
     units: Units | None = None
@@ -49,15 +49,15 @@ class ChannelFacts:
     calibrated: str | None = None
     due: str | None = None
     overdue: bool = False
-    fingerprint: str = ""  # SHA-256 of the signed datasheet, 64 hex digits; empty where nobody signed it
+    fingerprint: str = ""  # SHA-256 of the signed datasheet, 64 hex digits; empty if it is unsigned
     sample_form: str = ""  # of the raw value, as its SampleForm is called: "unsigned integer, 2 octets"
     period: float | None = None  # seconds between samples as measured; None for events
-    unsigned: bool = False  # nobody has signed the datasheet: there are raw values alone
-    unverified: bool = False  # nobody has signed it, and values are calibrated by it all the same: a person's word
-    quantity: str = ""  # what the profile or the name calls it, e.g. "relative humidity"; empty where nobody said
-    deviation: float | None = None  # standard deviation in `unit`, where the profile knows one
+    unsigned: bool = False  # the datasheet is unsigned: there are raw values alone
+    unverified: bool = False  # it is unsigned, and values are calibrated by it all the same: an operator confirmed
+    quantity: str = ""  # what the profile or the name calls it, e.g. "relative humidity"; empty if unknown
+    deviation: float | None = None  # standard deviation in `unit`, if the profile has one
     own_period: float | None = None  # seconds between samples as the datasheet has it (SPeriod)
-    frame: str = ""  # coordinate frame of its values; {node} in it stands for the node's part of its topics
+    frame: str = ""  # coordinate frame of its values; {node} in it is replaced by the node's part of its topics
     calibration: Calibration | None = None
     vector: tuple[int, ...] = ()  # channels of the vector group that it is in, axis by axis; empty where in none
 
@@ -95,7 +95,7 @@ class Block:
     stream: int
     channels: tuple[int, ...]
     index: int  # sample number of the first row in its run
-    time: NDArray[Any]  # (n) float64, unix seconds; goes back within a stream only where the host's clock is set
+    time: NDArray[Any]  # (n) float64, unix seconds; goes back within a stream only if the host's clock is set
     tick: NDArray[Any]  # (n) uint64, nanoseconds of the node's clock
     raw: NDArray[Any]  # (n, c)
     value: NDArray[Any]  # (n, c) float64

@@ -26,18 +26,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 OWN_DRIFT = 50.0  # ppm that the host's clock may be off beside the node's
-NODE_DRIFT = 100.0  # ppm, until the node has said its own
+NODE_DRIFT = 100.0  # ppm, until the node has reported its own
 AT_FIRST = 5  # exchanges that a station does at once: one alone may have met a long delay
 EXCHANGES = 64  # kept: at one each 3.3 s three and a half minutes
 WINDOW = 30_000_000_000  # ns of arrivals under the hull
-BUCKET = 50_000_000  # ns: the best arrival of each stands for it
+BUCKET = 50_000_000  # ns: the best arrival represents each
 REFIT_AFTER = 10  # buckets
 SLEW = 1_000_000_000  # ns over which a refit's difference is let out
-SPAN_OF_A_HULL = 2_000_000_000  # ns of arrivals before they say something about skew
+SPAN_OF_A_HULL = 2_000_000_000  # ns of arrivals before they are evidence about skew
 END_OF_TICKS = 1 << 63  # 292 years of ns since the node's start: no tick is so late
 ANY_TICK = TickBounds(-(1 << 64), 1 << 64)  # without evidence
 STEP = 1e-3  # seconds by which the system's clock must have been set to count; less belongs to the bound
-SPAN_OF_EXCHANGES = 60_000_000_000  # ns of exchanges before they say more about it than the arrivals
+SPAN_OF_EXCHANGES = 60_000_000_000  # ns of exchanges before they are better evidence about it than the arrivals
 
 
 @dataclass(frozen=True)
@@ -83,13 +83,13 @@ class ClockMap:
         self._exchanges: deque[Exchange] = deque(maxlen=EXCHANGES)
         self._hull = LowerHull()
         self._low, self._high, self._when = -math.inf, math.inf, 0  # what the evidence allows, at tick `_when`
-        self._origin = 0  # tick at which the line's offset stands
+        self._origin = 0  # tick of the line's offset
         self._offset = 0.0
         self._skew = 0.0
         self._residue = 0.0  # what the last refit still lets out
         self._refitted = 0  # tick of that refit
         self._known = False
-        self._handed_out = False  # whether somebody has stamps by now: before that a refit may step
+        self._handed_out = False  # True if stamps were given out: before that a refit may step
 
     @property
     def known(self) -> bool:
@@ -247,7 +247,7 @@ class ClockMap:
 
     def _skew_of(self, at: NDArray[Any], offsets: NDArray[Any], errors: NDArray[Any]) -> float:
         """Of a weighted line through exchanges, held within the drift."""
-        # A round trip's excess over the quickest one is delay that fell on one way or the other: it says little.
+        # A round trip's excess over the quickest one is delay that fell on one way or the other: weak evidence.
         weights = 1.0 / (errors - 0.9 * errors.min() + 1_000.0) ** 2
         middle, level = np.average(at, weights=weights), np.average(offsets, weights=weights)
         skew = float(np.sum(weights * (at - middle) * (offsets - level)) / np.sum(weights * (at - middle) ** 2))
@@ -278,14 +278,14 @@ class LowerHull:
     def __init__(self) -> None:
         self.count = 0
         self._closed: deque[tuple[int, int]] = deque()
-        self._best = (0, 0)  # of the bucket that is still open, where ``count`` says that there is one
+        self._best = (0, 0)  # of the bucket that is still open, if ``count`` shows that there is one
         self._end = 0  # tick at which it ends
         self._hull: list[tuple[int, int]] = []
 
     def add_arrival(self, tick: int, upper: int) -> bool:
         """Take an arrival; whether it begins a new bucket."""
         if tick < self._end:
-            # Of another stream it may be a little older than what came before it: then it tells nothing new.
+            # Of another stream it may be a little older than what came before it: then it adds nothing.
             if upper < self._best[1] and tick >= self._end - BUCKET:
                 self._best = (tick, upper)
             return False

@@ -34,9 +34,9 @@ from teds_provision.protocol.announce import LAST_ADDRESS, Announce, is_announce
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.operation.can_frames import read_ble_frame
 
-# What the look-outs on a bus and in the air have in common: a thread that asks everybody, and when it asks again.
+# The common part of discovery on a bus and over the air: a thread that broadcasts, and when it does so again.
 
-LEAST, MOST = 1.0, 30.0  # seconds between questions while somebody is missing
+LEAST, MOST = 1.0, 30.0  # seconds between questions while a node is missing
 
 
 class BroadcastPace:
@@ -112,11 +112,11 @@ class Discovery:
             self._turn.notify_all()
 
 
-POLL = 30.0  # seconds between questions to everybody, where that was asked for (operation.md section 7)
+POLL = 30.0  # seconds between broadcasts, if requested (operation.md section 7)
 EACH, ALL = 10.0, 0.2  # seconds between questions to one address that announces itself, and to any of them
 PATIENCE = 0.5  # seconds for the answer of one that has just announced itself
-SOON = 0.05  # seconds from a question to everybody, its silence included, to the next: one that missed it costs no more
-BELIEVED = 4  # Announces of a missing node in EACH seconds for which everybody is asked soon: anyone can send them
+SOON = 0.05  # seconds from a broadcast, its silence included, to the next: one that missed it costs no more
+BELIEVED = 4  # Announces of a missing node in EACH seconds for which a broadcast follows soon: any device can send them
 LOOK = 0.05  # seconds between looks at who waits
 
 
@@ -138,7 +138,7 @@ class CanDiscovery(Discovery):
                 self._watch()
             except LinkError as failure:
                 self.failure = failure
-                self._round_begins()  # whoever waits for the next round hears of the failure now
+                self._round_begins()  # a waiter for the next round learns of the failure now
                 self._round_ends()
                 self._stop.wait(LEAST)
 
@@ -169,7 +169,7 @@ class CanDiscovery(Discovery):
         if self._presence.awaits(announce):
             return SOON if self._believes(announce) else math.inf
         if self._presence.is_welcome(announce) and self._believes(announce):
-            self._ask_one(announce.address, PATIENCE)  # it alone: everybody's answers would cost the others' data
+            self._ask_one(announce.address, PATIENCE)  # it alone: the answers of all would cost the others' data
             return math.inf
         if self._poll and announce.address not in self._announcers:
             self._announcers.append(announce.address)
@@ -246,7 +246,7 @@ class CanDiscovery(Discovery):
 
 # Nodes in the air: their data messages, and the look-out that connects to each and asks who it is (operation.md 6).
 
-ROUND = 20.0  # seconds in which somebody must advertise, else the look-out begins anew
+ROUND = 20.0  # seconds in which a node must advertise, else the scan restarts
 
 
 class BleStreamReceiver(StreamReceiver):

@@ -19,7 +19,7 @@ from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-PERIODS_OF_A_VALUE = 2.0  # then it is too old to stand for the channel
+PERIODS_OF_A_VALUE = 2.0  # then it is too old to represent the channel
 LONGEST_BURST = 10_000  # rows at once; a longer gap of all streams is left out
 
 
@@ -27,8 +27,8 @@ LONGEST_BURST = 10_000  # rows at once; a longer gap of all streams is left out
 class _Stream:
     channels: tuple[int, ...]
     columns: list[int]
-    place: slice | list[int]  # the same; as a slice where they lie side by side, which numpy reaches more quickly
-    keeps: float  # seconds that a value stands for its channels
+    place: slice | list[int]  # the same; as a slice if they are adjacent, which numpy reaches more quickly
+    keeps: float  # seconds that a value represents its channels
     times: list[NDArray[Any]] = field(default_factory=list)
     values: list[NDArray[Any]] = field(default_factory=list)
     newest: float = -math.inf
@@ -96,7 +96,7 @@ class Grid:
             stream.newest for stream in self._streams.values() if stream.newest > now - stream.keeps - self.patience
         ]
         ready = min(live) if live else -math.inf
-        # The small number lets a stamp that was rounded stand for the row that it was taken for.
+        # The small number lets a rounded stamp count for the row that it was taken for.
         until = math.floor(max(ready, now - self.patience) / self.period + 1e-6)
         if until < self._next:
             return None

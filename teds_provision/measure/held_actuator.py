@@ -97,7 +97,7 @@ class HeldActuator:
             state, _ = operation(self._verified.node).channels[self.channel.number]
             self.safe = bool(state & ChannelState.SAFE)
         except (TedsProvisionError, SessionLostError, KeyError):
-            self.safe = None  # nobody can say so from here; the node's dead-man sees to it
+            self.safe = None  # it cannot be reported from here; the node's dead-man takes care of it
 
     @property
     def pause(self) -> float:

@@ -209,7 +209,7 @@ def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: Bu
         plans = plan_node(
             sensors_of(sensors, (), request.kind), time, rate=request.rate, kind=request.kind, at_most=True
         )
-    except (BadDataError, PolicyError):  # its session will say so
+    except (BadDataError, PolicyError):  # its session will show it
         return NodeLoad()
     rates = [1 / period for period in plans.periods().values() if period > 0]
     return NodeLoad(plans.load, len(rates), max(rates, default=0.0))

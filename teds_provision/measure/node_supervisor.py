@@ -65,7 +65,7 @@ LOOK = 0.2  # seconds between looks at how it does
 LOOK_FOR_DATA = 0.4  # seconds after an announcement in which data shows that it was not the node's
 ANNOUNCED = 1.0  # seconds until a node without such data is asked after it
 AT_ONCE = 1.0  # seconds between two tries, however often something announces itself as this node
-SLOWER = 10  # halvings of the rate while the firmware says that its shortest period is longer
+SLOWER = 10  # halvings of the rate while the firmware reports that its shortest period is longer
 UNLOCKED = 1.0  # seconds between looks whether the vault is open again
 BUSY = 2.0  # seconds in which a busy node is asked again at once; then it is tried again as after any other error
 
@@ -93,7 +93,7 @@ class NodeSupervisor:
         self.ready = threading.Event()  # streams were asked for
         self.done = threading.Event()
         self._station, self._buses = station, buses
-        self.bus: MeasuredBus | None = None  # where it is, once it was found
+        self.bus: MeasuredBus | None = None  # its place, once it was found
         self._request, self._events, self._common_start = request, events, common_start
         self._stop = threading.Event()
         self._anew = threading.Event()
@@ -103,7 +103,7 @@ class NodeSupervisor:
         self._proven = True  # whether what failed last did so in a session
         self._retry_policy = RetryPolicy(None)
         self._standing: NodeStanding | None = None  # of the present try
-        self.sighting: Sighting | None = None  # where it was last
+        self.sighting: Sighting | None = None  # its last place
         self._halved = 0
         self._lease, self._claimed = request.lease, [0]
         self._driven: TopicActuators | None = None
@@ -272,7 +272,7 @@ class NodeSupervisor:
         except BaseException as error:
             self._lost_at = time.monotonic()
             self._buses.presence.let_announce(self.uuid)
-            # Under its key it said what it is refused for: it is there, and another measurement may want it now.
+            # Its refusal came under its key: it is there, and another measurement may want it now.
             if not (self._proven and isinstance(error, (NotAuthenticError, PolicyError, BadDataError))):
                 self._buses.presence.wrong(sighting)
             if not self._proven and isinstance(error, TedsProvisionError) and self._buses.presence.is_shared(sighting):

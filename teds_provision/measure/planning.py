@@ -19,12 +19,12 @@ from teds_provision.protocol.operation.subscription import StreamPlan, most_inst
 from teds_provision.teds.sheet import Channel, ChannelKind
 
 BLOCK = 20_000_000  # ns of samples in one message, about: what calibrates well in blocks and is not late yet
-UNSTATED = 100_000_000  # ns: the period of a channel whose datasheet says none
+UNSTATED = 100_000_000  # ns: the period of a channel without one in its datasheet
 LONGEST = 10**12  # ns, the contract's
 MILLION = 10**6
 NODE_SHARE = 0.5  # of the node's own budget: room for commands between data frames
 MOST_GAP = 2_000  # µs
-SAYING = 1.0  # seconds that a node waits for the others to say what they want of the bus
+SAYING = 1.0  # seconds that a node waits for the others to report their share of the bus
 AIR_MESSAGES = 160.0  # notifications a second that an adapter is trusted with, all connections together
 
 
@@ -294,7 +294,7 @@ def _plan(
     plan = StreamPlan.for_channels(
         number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern
     )
-    # Fuller messages where the bus is short of room: the overhead of a message is 13 octets.
+    # Fuller messages if the bus is short of room: the overhead of a message is 13 octets.
     while n < most and _load(plan, bus) > MOST_LOAD / 2 and kind != StreamKind.EVENT:
         n = min(most, 2 * n)
         plan = StreamPlan.for_channels(

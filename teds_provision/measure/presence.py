@@ -20,9 +20,9 @@ from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity
 
 RECENT = 30.0  # seconds for which a conflict of addresses is the reason why a node is not found
-MOST = 1024  # UUIDs that are kept: a bus has 239 addresses, and at each of them anybody can give himself a new one
+MOST = 1024  # UUIDs that are kept: a bus has 239 addresses, and a device at each of them can invent new ones
 REPEATED = 600.0  # seconds until the same trouble with addresses is reported again
-ROUND = 0.7  # seconds of two questions to everybody, after which two boards at one address are known
+ROUND = 0.7  # seconds of two broadcasts, after which two boards at one address are known
 TWIN = 0.5  # seconds in which the node itself may answer as well, where one that says it is it was not
 
 
@@ -68,7 +68,7 @@ class Presence:
     _conflicts: dict[Place, float] = field(default_factory=dict)
     _announced: dict[bytes, tuple[Place, Callable[[], None], Callable[[], None]]] = field(default_factory=dict)
     _missing: dict[bytes, int] = field(default_factory=dict)
-    _unseen: set[bytes] = field(default_factory=set)  # those that somebody waited for, and that were not seen since
+    _unseen: set[bytes] = field(default_factory=set)  # those that a thread waited for, and that were not seen since
     _welcome: frozenset[int] = frozenset()  # CRCs of UUIDs that are measured as soon as they come
     _reported: dict[str, float] = field(default_factory=dict)  # what was noted, and when
     gone: int = 0  # how often a node that had been seen, or was never looked for, became missing
@@ -79,7 +79,7 @@ class Presence:
         place = (sighting.port.place, sighting.address)
         with self._turn:
             self._unseen.discard(sighting.uuid)
-            places = self._seen.pop(sighting.uuid, {})  # who was seen last stands last
+            places = self._seen.pop(sighting.uuid, {})  # the latest sighting is last
             places[place] = sighting
             self._seen[sighting.uuid] = places
             while len(self._seen) > MOST:

@@ -88,8 +88,8 @@ class MeasurementRequest:
     actuators: bool = False  # whether set points may come for actuators of nodes on the whitelist
     dead_man: int = DEAD_MAN
     patient: bool = False  # whether a node is waited for, and tried again, for ever: no refusal is final
-    unsigned: bool = False  # whether raw values of a node are wanted whose datasheet nobody has signed
-    unverified: bool = False  # only nodes whose datasheet nobody has signed, calibrated by it and marked so
+    unsigned: bool = False  # raw values are wanted also of a node with an unsigned datasheet
+    unverified: bool = False  # only nodes with an unsigned datasheet, calibrated by it and marked so
     require: Requirements | None = None
     newcomers: bool = False  # nodes come and go: no room is kept for one that is away, and its first error ends it
     by: str = "measure"  # the command that a reading of the datasheet is put down to

@@ -38,7 +38,7 @@ from teds_provision.station.station import Station
 
 BEAT = 0.02  # seconds between rows of the group
 REPORTING = 1.0
-WAITING = 3.0  # seconds without a master or a broker that somebody should know of; rospy needs 2 to start
+WAITING = 3.0  # seconds without a master or a broker before a notice; rospy needs 2 to start
 ENDING = 10.0  # seconds for all nodes to let go
 
 
@@ -91,7 +91,7 @@ class Measurement:
         self._known: dict[tuple[str, int], ChannelFacts] = {}
         self._grids: dict[str, Grid] = {}  # "": of all nodes together; else by UUID, each node's own
         self._for_grid: deque[Block] = deque()
-        self._shown: dict[int, str] = {}  # by id, for two may have one name: what was told of each sink last,
+        self._shown: dict[int, str] = {}  # by id, for two may have one name: the last notice about each sink,
         self._waits: dict[int, float] = {}  # and since when one waits
         self._common_start = CommonStart(self.uuids, trigger=self.request.trigger)
         self._ending = False

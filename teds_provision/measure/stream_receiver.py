@@ -214,7 +214,7 @@ class StreamReceiver:
             try:
                 self._hear()
             except LinkError as failure:
-                # The nodes' own threads meet the same failure, tell it, and open the bus again.
+                # The nodes' own threads meet the same failure, report it, and open the bus again.
                 self.failure = failure
                 self._stop.wait(0.5)
 
@@ -258,7 +258,7 @@ class CanStreamReceiver(StreamReceiver):
                 time.sleep(REST)
 
     def _dispatch(self, frame: Frame) -> ReceivedStream | None:
-        # Whoever is registered has a good address, and other stations' frames do not come here.
+        # A registered stream has a good address, and other stations' frames do not come here.
         key = (frame.identifier & 0xFF, frame.identifier >> 11 & 3)
         heard = self._streams.get(key)
         if heard is not None:

@@ -41,7 +41,7 @@ ECHO = 255  # number of the "stream" in which applied set points are echoed; nod
 class _Actuator:
     interpreter: ChannelInterpreter
     claimed_until: float = 0.0
-    answered: float = 0.0  # when the node last said that it took a value
+    answered: float = 0.0  # when the node last confirmed a value
     count: int = 0
     came: deque[float] = field(default_factory=lambda: deque(maxlen=WATCHED))
     driver: Driver | None = None
@@ -153,7 +153,7 @@ class TopicActuators:
         fast_alone = actuator.fast and sum(actuator.claimed_until > now for actuator in self._actuators.values()) <= 1
         if not fast_alone:
             actuator.driver = None
-        # Nobody answers a Drive message, so now and then a value goes by command: a node that was cut off says so.
+        # A Drive message has no reply, so now and then a value goes by command: a node that was cut off is noticed.
         by_message = fast_alone and now - actuator.answered < self._dead_man / 2000
         if not (by_message and self._is_driven(command, actuator, octets)):
             self._set(command, actuator, octets)

@@ -118,11 +118,11 @@ class VerifiedSession:
     def facts(self, channel: Channel, period: float | None) -> ChannelFacts:
         """Return the facts for every value of a channel that gives one every ``period`` seconds."""
         siblings = tuple((channel.number, channel.name) for channel in self.sheet.channels)
-        if self.unsigned:  # a name to tell channels apart; nothing else that the node says of itself is repeated
+        if self.unsigned:  # a name to distinguish channels; none of the node's other claims is repeated
             kind = facts_of(self.sheet, channel, name=self.name, fingerprint="", period=period).kind
             bare = ChannelFacts(self.uuid, self.name, channel.number, channel.name, kind, period=period, unsigned=True)
             return replace(bare, siblings=siblings)
-        if self.unverified:  # its own name: whatever the store calls it is for the datasheet that somebody signs
+        if self.unverified:  # its own name: the store's name is for a signed datasheet
             known = facts_of(self.sheet, channel, name=self.sheet.meta.name, fingerprint="", period=period)
             return replace(known, siblings=siblings, unverified=True)
         known = facts_of(self.sheet, channel, name=self.name, fingerprint=self.fingerprint, period=period)
@@ -163,7 +163,7 @@ def open_unverified(station: Station, node: Conversation, *, by: str) -> Verifie
     if looked.verified.verdict != "unsigned":
         require_authentic(looked.verified)
     image = looked.image
-    if looked.kept:  # its Security TEDS names no digest of the others: what was read before the start says nothing
+    if looked.kept:  # its Security TEDS names no digest of the others: what was read before the start proves nothing
         c, image = node.open_counter, read_image(node)
         verified = keep(
             station, node, image, by=by, known=freshness_floor_of(station, node.uuid, node.proven), c=c

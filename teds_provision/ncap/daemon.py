@@ -408,7 +408,7 @@ class Daemon:
         Raises NotFoundError, FrozenError (it is measured), NodeBusyError (it is worked on).
         """
         with self.node_locks.hold(uuid, "it is removed"):
-            with self.station.lock("virtual"):  # nobody begins to measure it meanwhile
+            with self.station.lock("virtual"):  # no measurement begins with it meanwhile
                 if self.measurements.measurement_of(uuid) is not None:
                     raise FrozenError(f"Node {uuid} is being measured.", hint="End the measurement first.")
                 one = self.virtuals.forget(uuid)

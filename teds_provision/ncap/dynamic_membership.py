@@ -1,6 +1,4 @@
-"""The nodes of one measurement that takes in nodes as they come (``ncap run --measure``.
-
-ncap.md, "Measure what comes").
+"""The nodes of one measurement that takes in nodes as they come (ncap.md, "Measure what comes").
 
 A selected node that answers on a bus joins: its lock is taken at once, before any other part works on it, its room on
 the bus is known from the stored datasheet, and its supervisor is started. A lost one leaves, gives its lock and its
@@ -42,7 +40,7 @@ from teds_provision.station.station import Station
 
 LOOK: Final = 0.1  # seconds between looks at who has gone
 QUIET, GATHERING = 0.05, 0.3  # seconds without another arrival, and at most, in which those that come together gather
-FIRST_ROUND: Final = 3.0  # seconds for everybody to answer at the beginning, so that all get their fair part
+FIRST_ROUND: Final = 3.0  # seconds for all to answer at the beginning, so that all get their fair part
 FIRST_ASK, LAST_ASK, ASKED = (
     0.2,
     16.0,
@@ -52,7 +50,7 @@ ANSWERING: Final = 1.0
 AGAIN: Final = 30.0  # seconds until one that may not be measured, or has no room, is tried again without other news
 SLOWEST: Final = 50.0  # a newcomer is slowed down so many times at most; then it waits for room
 WELCOMING: Final = 10.0  # seconds between looks at whose keys are held
-FOLLOWING: Final = 2.0  # seconds between looks at whether those who are in are still meant, where the store has changed
+FOLLOWING: Final = 2.0  # seconds between checks whether members are still selected, after a change of the store
 NO_ROOM: Final = "no room on the bus"
 
 
@@ -116,11 +114,11 @@ class DynamicMembership:
         self._guard = threading.Lock()
         self._members: dict[str, _Member] = {}
         self._arrived: dict[str, float] = {}  # whose turn is taken, and who is to be started
-        self._busy: dict[str, float] = {}  # who is worked with by somebody else, and when to look again
+        self._busy: dict[str, float] = {}  # nodes that another part works with, and when to look again
         self._waits: dict[str, _WaitingNode] = {}
         self._lost: dict[str, _LostNode] = {}
         self._others: set[str] = set()  # who is meant, and was another measurement's when it answered
-        self._left: set[str] = set()  # who is not in, and of whom something was told
+        self._left: set[str] = set()  # nodes that are not members, and about which there was a notice
         self._places: dict[str, Sighting] = {}  # where each was measured, or was to be
         self._version: object = None
         self._welcomed, self._followed = -WELCOMING, -FOLLOWING
@@ -195,7 +193,7 @@ class DynamicMembership:
         if measurement is None or not measurement.ready.is_set():
             return
         if measurement is not self._measurement:
-            # It began, or began anew after its sinks had failed: nobody is in it.
+            # It began, or restarted after its sinks had failed: it has no members.
             for uuid in list(self._members):
                 self._release(uuid)
             self._measurement = measurement
@@ -248,7 +246,7 @@ class DynamicMembership:
             return
         self._anew.clear()
         self._version, self._followed = version, now
-        self._others.clear()  # whoever is still meant is seen again below
+        self._others.clear()  # nodes that are still selected are seen again below
         for uuid, member in list(self._members.items()):
             why = self._why_not(uuid)
             if why and member.supervisor is not None:
@@ -290,7 +288,7 @@ class DynamicMembership:
         sighting = self._buses.presence.seen_at(octets)
         if sighting is None or self._why_not(uuid):
             self._release(uuid)
-            if sighting is None and uuid in self._places:  # a session failed there: whoever answers there joins
+            if sighting is None and uuid in self._places:  # a session failed there: a node that answers there joins
                 self._askers.submit(self._ask, self._places[uuid])
             return
         room = self._buses.bus_of(sighting).share.room
@@ -330,7 +328,7 @@ class DynamicMembership:
             self._waits[uuid] = _WaitingNode(now + AGAIN, self._buses.bus_of(sighting).share.room)
         elif isinstance(error, (NotAuthenticError, PolicyError, BadDataError)):
             self._waits[uuid] = _WaitingNode(now + AGAIN)
-            if last is not None and last.identity.state == NodeState.FACTORY:  # whoever adopts hears it, now it is free
+            if last is not None and last.identity.state == NodeState.FACTORY:  # the adopter hears it, now it is free
                 self._askers.submit(self._ask, last)
         elif error is not None and sighting is not None and sighting is not last:  # it was seen elsewhere meanwhile
             self.on_sighting(uuid)

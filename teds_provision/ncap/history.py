@@ -33,11 +33,11 @@ else:
 
 HOUR, MINUTE = 3600, 60
 FINE: Final = 0.01  # seconds of a bin of the last minute
-_WAITING = 4096  # blocks that wait to be taken in; whoever brings more takes them in himself
+_WAITING = 4096  # blocks that wait to be taken in; a thread that brings more takes them in itself
 _EVERY = 0.5  # seconds
 _LATE: Final = 2.0  # seconds by which samples may come behind others; more, and the clock was put back
 
-_EDGE: Final = 1e-6  # of a bin: a moment so short before an edge lies behind it, as 0.01 is no binary fraction
+_EDGE: Final = 1e-6  # of a bin: a moment so short before an edge counts as behind it, as 0.01 is no binary fraction
 
 Key = tuple[str, int]
 
@@ -69,7 +69,7 @@ class _Bins:
         """
         first, last = int(numbers[0]), int(numbers[-1])
         if self.newest >= 0 and first < self.newest - _LATE / self.width:
-            self._forget(first, self.newest)  # the clock was put back: that time is written anew
+            self._forget(first, self.newest)  # the clock was put back: that time is overwritten
             self.newest = first - 1
         self._extend_to(first, segment)
         if last > self.newest:

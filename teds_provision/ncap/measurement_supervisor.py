@@ -48,7 +48,7 @@ from teds_provision.teds.sheet import Sheet
 
 _ADOPTED: Final = "adopted"
 NCAP: Final = "ncap"
-LETTING_GO: Final = 4.0  # seconds for a node's session to end in order; whoever asks waits 5
+LETTING_GO: Final = 4.0  # seconds for a node's session to end in order; the caller waits 5
 ANSWERING: Final = 1.0  # seconds for a node that has another address now
 LONGEST_LOAN: Final = 900.0  # seconds after which a node is measured again, whatever its writer does
 SCALAR_RATE: Final = 10.0
@@ -60,13 +60,13 @@ class RunningMeasurement:
     """One measurement that runs, or tries to."""
 
     kept: KeptMeasurement
-    uuids: tuple[str, ...]  # of one that takes in whoever comes: those that are in
+    uuids: tuple[str, ...]  # members of one that takes in nodes as they come
     membership: DynamicMembership | None = None
     job: MeasurementJob | None = None
     state: str = "starting"
     why: str = ""
     reports: dict[str, dict[str, Any]] = field(default_factory=dict)
-    past: set[str] = field(default_factory=set)  # whose reports say nothing of now
+    past: set[str] = field(default_factory=set)  # whose reports are obsolete
     stop: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
 
@@ -233,7 +233,7 @@ class MeasurementSupervisor:
             kind=kind,
             trigger=trigger,
             sinks=tuple(dict.fromkeys(self._sinks.whole(spec) for spec in sinks)),
-            actuators=actuators and match is None,  # actuators are never claimed for whoever comes
+            actuators=actuators and match is None,  # actuators are never claimed for nodes as they come
             match=match,
             frozen=frozen,
             dead_man=self._dead_man if dead_man is None else dead_man,
@@ -369,7 +369,7 @@ class MeasurementSupervisor:
             if loan.ended:
                 return False
             job = self._job_of(loan.uuid)
-            if job is None:  # and nobody begins to meanwhile
+            if job is None:  # and none begins meanwhile
                 self._loans.setdefault(loan.uuid, []).append(loan)
                 return False
             if job.kept.frozen:
@@ -723,7 +723,7 @@ class MeasurementSupervisor:
         if said.state == "running":
             facts |= {"present": True, "seen": time.time(), "problem": None}
             if before.get("state") != "running":
-                facts |= {"heard": None, "looked": time.time()}  # in a session: what it said outside one is past
+                facts |= {"heard": None, "looked": time.time()}  # in a session: what it sent outside one is obsolete
         elif changed and said.state in ("lost", "refused", "waiting") and said.why and self._is_of(said.uuid, running):
             facts["problem"] = as_problem(TedsProvisionError(said.why))
         if changed:

@@ -99,7 +99,7 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
     watchdog = asyncio.create_task(_watchdog())
     app = build(daemon)
     early: list[dict[str, Any]] = []
-    daemon.live.told = early.append  # the first line says that it is ready
+    daemon.live.told = early.append  # the first line reports that it is ready
 
     async def begin() -> None:
         await servers.serve(Guard(app, daemon.tokens, None), local)

@@ -191,7 +191,7 @@ class VirtualNode:
     ) -> bytes:
         """Run one command frame; see Measuring."""
         simulated = self.board is not None and not self.board.clock.runs_by_itself
-        at = None if simulated else received  # a simulation's tick stands still while a command runs
+        at = None if simulated else received  # a simulation's tick does not advance while a command runs
         with self._core.command():
             port = port_of(link)._replace(fd=fd, mtu=mtu, hears=hears)
             reply = self.tim.handle(frame, link=link, tapped=tapped, port=port, received=at)
@@ -252,7 +252,7 @@ class VirtualNode:
         """Return the present tick, or that of ``at`` (see MeasuringHandler); 0 for a node without clock."""
         if self.board is None:
             return 0
-        # A simulation's clock stands between its lines: what is a moment ago was the same tick.
+        # A simulation's clock does not advance between its lines: a moment ago it was the same tick.
         passed = time.monotonic() - at if at and self.board.clock.runs_by_itself else 0.0
         return max(0, self.board.clock.tick() - max(0, round(passed * 1e9)))
 

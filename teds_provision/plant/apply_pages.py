@@ -74,7 +74,7 @@ def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster,
     for octets in found:
         try:
             roster = open_roster(octets, station.ca)
-        except TedsProvisionError:  # a post holds what anybody put there
+        except TedsProvisionError:  # the transport is untrusted
             continue
         if roster.registry == registry:
             read.setdefault(roster.hash, roster)
@@ -306,7 +306,7 @@ def _judged(
     for uuid, hash, page_of, counts, text in tables.bans_of(uuids):
         try:
             read = open_revocation(text, lambda kid: roster.point_of(kid) or station.policy.station_points().get(kid))
-        except TedsProvisionError:  # of nobody known, or not what it seems: it bans nothing
+        except TedsProvisionError:  # of an unknown signer, or not what it seems: it bans nothing
             continue
         if read.uuid == uuid:
             said.setdefault(uuid, []).append(BanStatement(hash, page_of, counts, read))
@@ -393,7 +393,7 @@ def _own(station: Station, kid: str) -> bytes | None:
     return station.point if kid == station.fingerprint else station.policy.station_points().get(kid)
 
 
-# -- where everybody stands --------------------------------------------------------------------------------------------
+# -- the state of each station -----------------------------------------------------------------------------------------
 
 
 def heads_digest(station: Station) -> tuple[str, int]:

@@ -41,7 +41,7 @@ def backlog(station: Station) -> Iterator[Told]:
     for ban in station.policy.revocations():
         try:
             own = open_revocation(ban.statement, lambda kid: station.point if kid == station.fingerprint else None)
-        except TedsProvisionError:  # another station's word: it tells that itself
+        except TedsProvisionError:  # another station's statement: it reports that itself
             continue
         yield "revoked", ban.uuid, {"statement": own.statement}
 

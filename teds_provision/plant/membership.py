@@ -52,7 +52,7 @@ def found_roster(station: Station, post: Transport, octets: bytes | None) -> Ros
     for roster_octets in post.rosters() if octets is None else ():
         try:
             found.append(open_roster(roster_octets, station.ca))
-        except TedsProvisionError:  # a post holds what anybody put there
+        except TedsProvisionError:  # the transport is untrusted
             continue
     held = station.plant.roster
     if octets is None and held is not None:

@@ -379,7 +379,7 @@ def _expire(station: Station, now: datetime) -> None:
                     bytes.fromhex(uuid_hex) for uuid_hex in pending.BundleNotes.from_json(handover.nodes).uuids
                 )
                 order = outgoing.ExportOrder((row.peer,), nodes, "move")
-                with suppress(PolicyError, NotFoundError):  # revoked or forgotten since: `handover undo` says so
+                with suppress(PolicyError, NotFoundError):  # revoked or forgotten since: `handover undo` reports it
                     send_export(station, outgoing.plan_export(station, order, now), now)
 
 
@@ -423,7 +423,7 @@ def _due(
     clear: list[bytes] = []
     disputed: list[bytes] = []
     own = _with_views(views, tables.unshared(receiver))
-    gone = quiet or roster.removed  # else whoever made a key shares it
+    gone = quiet or roster.removed  # else the maker of a key shares it
     others = _with_views(views, tables.unshared(receiver, imported=True)) if gone else iter(())
     mine = (other for other in others if sharing.sharer(roster, other[3], (other[1], other[2]), quiet) == me)
     for uuid, _, _, view in chain(own, mine):

@@ -100,7 +100,7 @@ union all select 'page', p.station, p.n, p.jws, null, null from registry.page p
 _LOOK: Final = f"""{_LOOK_1}
 union all select 'handed', author, pages, at::text, by, null from registry.handed"""
 
-# Every page of an author, whoever put it there: the author itself (by null), or others.
+# Every page of an author, whoever handed it in: the author itself (by null), or others.
 _OFFERS: Final = """\
 select n, encode(hash, 'hex'), encode(sha256(convert_to(jws, 'UTF8')), 'hex'), null::text
   from registry.page where station = %s
@@ -112,7 +112,7 @@ select id::text, document, expires, sender from registry.parcel
   where recipient = registry.me() and octet_length(document) <= %s and id <> all(%s::uuid[])
   order by received limit %s"""
 
-# What a login of a member may do in a database where the schema was not run by a superuser, or pg_restore undid it.
+# Rights of a member's login in a database whose schema was not run by a superuser, or undone by pg_restore.
 _OPEN_DOORS: Final = """\
 select what from (values
   ('TEMP for PUBLIC', has_database_privilege(current_database(), 'TEMP')),

@@ -157,7 +157,7 @@ class Inbox:
                 else:
                     self._listener.wait(seconds, parcel_to=self._station.identity.fingerprint)
                     return
-            except LinkError:  # the station has no connection left, or the server goes: looking tells
+            except LinkError:  # the station has no connection left, or the server goes: a look shows it
                 self.close()
             self._hears = False
         time.sleep(min(seconds, pause))

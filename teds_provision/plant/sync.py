@@ -181,7 +181,7 @@ def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResul
         _require_all_seen(station, roster, {page.number for page in found})
         if new or connected or joined.url is None:
             station.plant.end_restored()
-        else:  # a stick that knows less than what this home joined by shows nothing: it would say a number twice
+        else:  # a stick that knows less than this home's joined state shows nothing: it would repeat a number
             done.told.append(
                 "this home was restored from a backup and publishes nothing new until it has synced with its"
                 " own registry"
@@ -296,7 +296,7 @@ def _know_again(station: Station, page: Page) -> None:
         node = station.nodes.get(uuid)
         if node is not None:
             station.nodes.remember(uuid, epoch=max(node.epoch, epoch), sequence=max(node.sequence, sequence))
-        elif uuid in signed:  # no sequence says two things, be the board unknown here
+        elif uuid in signed:  # no sequence is used twice, whether the board is known here or not
             station.nodes.remember(uuid, sequence=sequence)
     # Pin boards that this station signed for under the key that it said itself: no other board gets their units.
     for uuid, text in station.plant.tables.claims_of_chain(own_chain(station).chain, sorted(signed)).items():
@@ -378,7 +378,7 @@ def strange(station: Station, post: Transport) -> list[Page]:
 
 
 def _under_our_key(station: Station, post: Transport, roster: Roster) -> list[Page]:
-    post.registry()  # a database is looked at anew
+    post.registry()  # a database is checked again
     found, _ = fetching.read_pages(post.pages(station.fingerprint, 0), roster, station.fingerprint)
     return found + returned.own(station, post.returned, roster, {page.hash for page in found}, always=True)
 

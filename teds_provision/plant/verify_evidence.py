@@ -84,7 +84,7 @@ def _wrong_members(evidence: Evidence, roster: Roster) -> Iterator[str]:
     try:
         shown = security.decode(evidence.teds)
     except BadDataError:
-        return  # told already
+        return  # reported already
     signer = fingerprint(shown.station_key) if shown.station_key is not None else ""
     if signer != station:
         yield from _gone(roster, signer, "the station that signed the datasheet")
@@ -216,7 +216,7 @@ _work: _Work | None = None
 
 
 def _init_worker(work: _Work) -> None:
-    global _work  # noqa: PLW0603 - set once, in a process of its own
+    global _work  # noqa: PLW0603 - set once, in a separate process
     _work = work
     gc.freeze()
     gc.disable()  # documents are trees: their count of references alone frees them, a tenth of the time sooner

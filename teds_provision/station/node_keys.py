@@ -174,7 +174,7 @@ class NodeKeys:
         try:
             return self._unwrapped(fresh, vault)
         except UnknownMasterKeyError:
-            if self._identity.master in vault.masters():  # lost for good, and not only to a look at an earlier moment
+            if self._identity.master in vault.masters():  # lost, and not only for a read at an earlier moment
                 raise
         raise VaultChangedError("Another command has just changed the master key.", hint="Run this again.")
 

@@ -461,7 +461,7 @@ def initialise(
     return station, vaults.asked_first(ask, make)
 
 
-# A new master key: every link key in the store is wrapped anew, and the old master key is forgotten.
+# A new master key: every link key in the store is wrapped again, and the old master key is deleted.
 #
 # Each part is durable before the next begins, so a run that was cut is carried on by the next one: the new master key,
 # a note in the store that says which one it is, the keys (one transaction), the old master keys, the end of the note.

@@ -180,7 +180,7 @@ def agreed_elsewhere(station: Station, node: Conversation) -> str:
     said = node.identity.epoch
     if said <= held:
         return ""
-    how = "keyed elsewhere by tap or rotated by another holder (unverified)"  # a plain Identify cannot tell them apart
+    how = "keyed elsewhere by tap or rotated by another holder (unverified)"  # a plain Identify cannot distinguish them
     hint = f"it reports key epoch {said}, after {held} here: {how}"
     try:
         octets = read_block(node, SECURITY)
@@ -243,7 +243,7 @@ def _agree(
         if entry is None or station.pins.entry(node.uuid) is not None:
             entry = station.policy.require_whitelisted(node.uuid, returning=returning)
     demanded = rotate and not again
-    # of a run that was just cut short the node may have the new key, whatever it said before
+    # of a run that was just cut short the node may have the new key, whatever it reported before
     held = open_session(station, node, word=rotate) if not new or again else None
     if held is not None:
         if newcomer is not None:  # a session under a key of ours is open: it comes onto the list at once
@@ -303,7 +303,7 @@ def _new_key(
     pinned = _pin_for(entry, node, who)
     ca = station.ca if new else station.keys.ca_of(node.uuid)
     try:
-        # outside a session what the identification read stands: on this link, a moment ago
+        # outside a session the result of the identification counts: on this link, a moment ago
         teds = read_block(node, SECURITY) if node.sealed else who.security_teds
         return _agree_anew(station, node, pinned, ca, teds, returning=returning, only_new=new and not demanded)
     except NodeRefusedError as refusal:
@@ -440,7 +440,7 @@ def _request(station: Station, node: Conversation, entry: WhitelistEntry, ca: by
     agreement = StationAgreement(station.identity.credentials(ca), node.uuid)
     reply = node.request_retry_once(
         agreement.request(), "the key agreement"
-    )  # it lies in RAM only, and goes at the next one
+    )  # it is in RAM only, and is dropped at the next one
     with station.reading():
         epoch = station.pins.epoch_to_exceed(node.uuid, entry.fingerprint)
     return agreement.accept(reply, teds, pinned=entry.fingerprint, epoch=epoch)

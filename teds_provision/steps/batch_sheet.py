@@ -549,7 +549,7 @@ class Progress:
     def note(self, row: SheetRow, board: BoardResult) -> None:
         """Note how a board ended."""
         attempted = self.rows[row.number]
-        attempted.tries += board.result != "skipped"  # a "no" says nothing of the board
+        attempted.tries += board.result != "skipped"  # a "no" is no fault of the board
         attempted.result = board.result
         attempted.first = attempted.first or (attempted.tries == 1 and board.result == "passed")
         attempted.seconds, attempted.time = round(board.seconds, 3), board.time

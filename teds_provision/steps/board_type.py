@@ -310,9 +310,7 @@ def check_hardware(node: Conversation, image: Image, shown: Mapping[int, str] | 
 
 
 def _borne(node: Conversation, image: Image, shown: Mapping[int, str] | None) -> HardwareCheck:
-    described = Sheet.from_image(
-        Image(image.uuid, image.unsigned_blocks())
-    )  # what the Security TEDS says is judged already
+    described = Sheet.from_image(Image(image.uuid, image.unsigned_blocks()))  # the Security TEDS is judged already
     sheet, digest = described.shown_in(shown or {}), hashlib.sha256(image.security or b"").digest()
     found = {channel.number: _bears(node, channel, digest) for channel in sheet.channels}
     sensors = [channel for channel in sheet.channels if not channel.actuator and found[channel.number]]
@@ -333,14 +331,14 @@ def _bears(node: Conversation, channel: Channel, digest: bytes) -> bool | None:
     except NodeRefusedError as refusal:
         if refusal.reason == Reason.OUT_OF_RANGE:
             return True
-        if refusal.reason in (Reason.DIGEST_MISMATCH, Reason.BAD_FORM):  # 4: a sensor there where an actuator is meant
+        if refusal.reason in (Reason.DIGEST_MISMATCH, Reason.BAD_FORM):  # 4: a sensor instead of an actuator
             raise WrongBoardError(
                 f"Channel {channel.number} ({channel.name or 'no name'}) of the board does not match this"
                 " datasheet: its hardware is of a different kind, or delivers values in a different format.",
                 hint="The board is of a different type. Provision it with the profile of its own type.",
             ) from refusal
         return None
-    return None  # it claimed something for no time at all: no firmware of this profile
+    return None  # it claimed something for no time: no firmware of this profile
 
 
 def _read(node: Conversation, sheet: Sheet, sensors: list[Channel], digest: bytes) -> Iterator[dict[str, Any]]:

@@ -67,7 +67,7 @@ class BuildOrder:
     name: str | None = None
     drop_calibration: bool = False
     accept_calibration: str | None = None
-    retype: bool = False  # whether the board may become one of another type than it says it is
+    retype: bool = False  # the board may become one of another type than it claims
     adopt: bool = False  # whether the datasheet that the board brought is signed, by a person's yes
 
     @property
@@ -709,7 +709,7 @@ def _only_what_is_named(
             blocks.pop(block, None)
         else:
             blocks[block] = wanted
-    if prepared.order.name is not None:  # also where the profile says the same and the node does not
+    if prepared.order.name is not None:  # also if the profile is unchanged and the node is not
         blocks[0, AccessCode.NAME] = asked.blocks[0, AccessCode.NAME]
     # What else the profile says now stays unwritten, so what is remembered of it is what it said then.
     return Proposal(Image(uuid, blocks), (), True, asked.warnings, asked.wanted, asked.name, asked.calibrations)

@@ -139,7 +139,7 @@ def read_image_file(path: Path) -> Image:
     return security.require_our_wire(image)
 
 
-# -- identify: who lies on the reader or hangs on the bus, once or as they come ----------------------------------------
+# -- identify: the node on the reader or those on the bus, once or as they come ----------------------------------------
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def identify_at(
     as a notice; else the first error is raised.
     """
     if add:
-        station.unlock()  # before a node lies there: a pin is sealed by the vault
+        station.unlock()  # before a node is there: the vault makes a pin's MAC
     if watch:
         yield from watch_nodes(links, lambda node: _identified(station, node, add), reporter, stop or threading.Event())
         return
@@ -208,7 +208,7 @@ def _side_by_side(
     pool = ThreadPoolExecutor(max_parallel, thread_name_prefix="node")
     try:
         yield from zip(nodes, pool.map(one, nodes), strict=True)
-    finally:  # after a Ctrl-C nobody is waited for: the bus is closed next
+    finally:  # after a Ctrl-C there is no wait: the bus is closed next
         pool.shutdown(wait=False, cancel_futures=True)
 
 
@@ -222,7 +222,7 @@ def _identified(station: Station, node: Conversation, add: bool) -> ProvenNode:
     name = (known.name if known else None) or described.name
     facts: dict[str, object] = {}
     read = station.nodes.reading(who.uuid)
-    if read is None or not read.is_datasheet:  # nothing is verified here: it stands for what is not known better
+    if read is None or not read.is_datasheet:  # nothing is verified here: it fills in what is not known better
         facts["channels"] = described.channels
         if name is not None and station.nodes.all_named(name) in ([], [who.uuid]):
             facts["name"] = name

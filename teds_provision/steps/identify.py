@@ -90,7 +90,7 @@ def _facts(station: Station, who: IdentifiedNode, *, counts: bool) -> dict[str, 
     facts: dict[str, object] = {"point": who.point} if counts else {}
     known = station.nodes.get(who.uuid)
     if counts or (known is not None and known.point == who.point):
-        facts["last_seen"] = utc_now()  # its own key signed a moment ago; any other key may be anybody's
+        facts["last_seen"] = utc_now()  # its own key signed a moment ago; any other key may be a stranger's
     return facts
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from teds_provision.steps import readings
     from teds_provision.steps.readings import NodeVerdict
     from teds_provision.teds.fits import Fit, Requirement
-else:  # cryptography: a list of nodes that nobody verified yet needs none
+else:  # cryptography: a list of unverified nodes needs none
     readings = late("teds_provision.steps.readings")
 
 PAGE = 256

@@ -134,7 +134,7 @@ _work: _Work | None = None
 
 
 def _init_worker(work: _Work) -> None:
-    global _work  # noqa: PLW0603 - set once, in a process of its own
+    global _work  # noqa: PLW0603 - set once, in a separate process
     _work = work
     gc.freeze()  # the whole program is there before the first image: not looked through again for each few of them
 

@@ -139,7 +139,7 @@ def verify_node(
                 station.nodes.remember(image.uuid, **_facts(image, identity))
             station.audit("verify", image.uuid, judged.verified.verdict)
 
-    station.run_in_background(record)  # a run tells its result when it is on the disk, and asks the hardware meanwhile
+    station.run_in_background(record)  # a run prints its result when it is on the disk, and asks the hardware meanwhile
     return judged
 
 

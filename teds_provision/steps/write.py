@@ -125,7 +125,7 @@ def _tell_written(station: Station, image: Image, known: NodeRecord, sequence: i
             epoch=security.decode(octets).key_epoch,
             sequence=sequence,
             teds_sha256=hashlib.sha256(octets).hexdigest(),
-            profile=PurePath(known.profile).name if known.profile else None,  # of a file its name, not where it lies
+            profile=PurePath(known.profile).name if known.profile else None,  # of a file its name, not its path
             profile_sha256=known.profile_digest if known.profile_digest and len(known.profile_digest) == 64 else None,
             due=known.due,
         )
@@ -165,7 +165,7 @@ def _conclude(
                     station.nodes.drop_draft(image.uuid)
                 station.audit("write", image.uuid, "done", octets=octets, sequence=sequence)
 
-    station.run_in_background(record)  # whoever verifies next has the node prove its key meanwhile
+    station.run_in_background(record)  # the next verification has the node prove its key meanwhile
     if differing:
         channel, access_code = differing[0]
         raise NotAuthenticError(
@@ -238,7 +238,7 @@ def _commit(station: Station, node: Conversation, image: Image, has: Image | Non
             if not node.lives():
                 raise
         except SessionLostError:
-            pass  # the new session below tells whether only the reply was lost
+            pass  # the new session below shows whether only the reply was lost
         if _is_there(node, image):
             return 0
     try:

@@ -34,7 +34,7 @@ class BackgroundWriter:
             self._thread = threading.Thread(target=self._work, name="durable steps", daemon=True)
             self._thread.start()
         self._waiting[self._owner] = self
-        context = copy_context()  # who does it stands in the audit log
+        context = copy_context()  # its actor is in the audit log
         self._steps.put(lambda: context.run(step))
 
     def wait(self) -> None:
@@ -58,7 +58,7 @@ class BackgroundWriter:
         while (step := self._steps.get()) is not None:
             try:
                 step()
-            except BaseException as error:  # noqa: BLE001 - raised where the run waits for it
+            except BaseException as error:  # noqa: BLE001 - raised in the waiting thread
                 self._ended.put(error)
             else:
                 self._ended.put(None)

@@ -27,7 +27,7 @@ else:  # loaded with the first store: --help does not wait for it
     sqlite3 = late("sqlite3")
 
 
-# What SQLite and the system say when the store's file fails them, in the words of the tool: cause and cure.
+# Errors of SQLite and the system when the store's file fails, as messages of the tool: cause and remedy.
 
 BUSY_SECONDS = 10.0
 _RESTORE = "Restore a backup (teds-provision restore), or move the file away and run teds-provision init."
@@ -286,7 +286,7 @@ class Connection:
             self.execute("PRAGMA synchronous=NORMAL")
         try:
             self.execute("BEGIN IMMEDIATE")
-        except BaseException:  # also where it was interrupted between BEGIN and the block that would roll it back
+        except BaseException:  # also if it was interrupted between BEGIN and the block that would roll it back
             with suppress(sqlite3.Error):
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")

@@ -36,7 +36,7 @@ else:  # loaded with the first store: --help does not wait for it
     sqlite3 = late("sqlite3")
 
 
-# Before SQLite opens anything in the home of a station: who owns it, who may write, and what lies there.
+# Before SQLite opens anything in the home of a station: its owner, its permissions, and its content.
 
 FILE_NAME: Final = "store.sqlite3"
 
@@ -52,7 +52,7 @@ def prepare_home(home: Path, *, create: bool) -> None:
         home.parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileExistsError):
             home.mkdir(mode=0o700)
-            home.chmod(0o700)  # whatever the umask said
+            home.chmod(0o700)  # whatever the umask was
     try:
         status = home.stat()
     except FileNotFoundError:

@@ -56,7 +56,7 @@ def dump(store: Store) -> Iterator[bytes]:
     database = store._database
     with database._lock, database._translated():
         connection = database._connection
-        connection.execute("BEGIN")  # the first SELECT takes the moment, and holds up nobody
+        connection.execute("BEGIN")  # the first SELECT takes the moment, and blocks no other process
         try:
             version = int(connection.execute("PRAGMA user_version").fetchone()[0])
             tables = _tables(connection)

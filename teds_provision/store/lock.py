@@ -31,7 +31,7 @@ from teds_provision.store.records import utc_now
 if TYPE_CHECKING:
     import fcntl
     import sqlite3
-else:  # no such module on Windows, where no node is worked on
+else:  # no such module on Windows, where nodes are not used
     fcntl, sqlite3 = late("fcntl"), late("sqlite3")
 
 FILE_NAME = "store.lock"
@@ -116,7 +116,7 @@ class StoreLock(_HeldFile):
     def _acquire(self, descriptor: int) -> None:
         self._lock(descriptor)
         with suppress(OSError):  # a full disk must not hide the store's own, better message
-            # over what the last holder left, which says nothing any more: cutting a file off costs more than a step
+            # over the last holder's text, which is obsolete: cutting a file off costs more than a step
             _write_at_start(descriptor, _signature(self._command).ljust(_SIGNATURE_OCTETS))
 
     def _try_to_lock(self, descriptor: int) -> None:

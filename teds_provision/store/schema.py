@@ -143,9 +143,9 @@ _GROUP_NAME: Final = """CASE WHEN each.value IN ('all', '.', '..') OR length(eac
     THEN rtrim('group ' || substr(each.value, 1, 58)) ELSE each.value END"""
 
 _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
-    # what the profile said that a node's datasheet was made of
+    # the content of the profile from which a node's datasheet was made
     8: ("ALTER TABLE nodes ADD COLUMN profile_digest TEXT",),
-    # measurements that take in whoever comes: what a row must name is another rule, so the table is made anew
+    # measurements that take in nodes as they come: the rule for rows differs, so the table is rebuilt
     9: (
         "ALTER TABLE measurements RENAME TO measurements_before",
         """CREATE TABLE measurements(
@@ -163,7 +163,7 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         "INSERT INTO measurements SELECT *, NULL, 0 FROM measurements_before",
         "DROP TABLE measurements_before",
     ),
-    # the plant: what its stations say (contract/plant.md); empty until `registry connect`
+    # the plant: its stations' statements (contract/plant.md); empty until `registry connect`
     10: (
         # -- what this station has to do with it; macs are seals
         """CREATE TABLE plant(
@@ -247,13 +247,13 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         "CREATE INDEX sign_requests_of_unit ON sign_requests(job, uuid)",
     ),
     11: (
-        # the bus or the air on which a session with a node was opened last: where it is looked for if nobody says
+        # the bus or the air on which a session with a node was opened last: searched first by default
         """CREATE TABLE last_places(
         uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), place TEXT NOT NULL CHECK(place <> ''))
         STRICT, WITHOUT ROWID""",
     ),
     12: (
-        # coordinate frames of channels (0: of the whole node), where somebody chose one
+        # chosen coordinate frames of channels (0: of the whole node)
         """CREATE TABLE frames(
         uuid BLOB NOT NULL CHECK(length(uuid) = 10), channel INTEGER NOT NULL CHECK(channel BETWEEN 0 AND 255),
         frame TEXT NOT NULL CHECK(frame <> ''), PRIMARY KEY(uuid, channel)) STRICT, WITHOUT ROWID""",

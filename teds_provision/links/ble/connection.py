@@ -129,7 +129,7 @@ class BleConnection:
     async def _client_with_service(self) -> bool:
         """Connect, and subscribe; return False if the node's service is missing."""
         client = await self._connected()
-        # bleak tells its own retries to the disconnected callback too, before connect() has returned
+        # bleak reports its own retries to the disconnected callback too, before connect() has returned
         self._empty()
         if any(client.services.get_characteristic(uuid) is None for uuid in (ble.WRITE, ble.NOTIFY)):
             return False

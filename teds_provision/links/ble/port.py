@@ -121,7 +121,7 @@ class BlePort:
         self._known = RememberedNodes(cache_file())
         self._data: queue.Queue[DataMessage] = queue.Queue(_MOST_HELD)
         self._heard = self._closed = False
-        self.lost = 0  # data messages for which nobody had time
+        self.lost = 0  # data messages that were dropped for lack of time
         self._transaction = secrets.randbelow(1 << 16)
         self._lock = threading.Lock()
 

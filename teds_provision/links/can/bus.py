@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 
     import can
 else:
-    inspect = late("inspect")  # for a bus with keys of its own
+    inspect = late("inspect")  # for a bus with special keys
 
 
-# Our own frames, given back by an interface that cannot tell them from those of others: udp_multicast, SocketCAN.
+# Our own frames, returned by an interface that cannot distinguish them: udp_multicast, SocketCAN.
 #
 # A frame is taken for our own once for each time that it was sent, within three seconds.
 
@@ -156,7 +156,7 @@ class Bus:
             self._pacer.wait(frame.identifier, frame.data, fd=frame.fd)
         if self._echoes:
             self._echoes.sent(frame)
-        if self._trace is not None:  # before it goes, so that no answer stands before it
+        if self._trace is not None:  # before it goes, so that no answer precedes it
             self._trace.frame("can", "out", frame.data, identifier=frame.identifier, fd=frame.fd)
         if multicast is None:
             self._send_message(frame)
@@ -244,7 +244,7 @@ class Bus:
         descriptor = self._descriptor
         if descriptor < 0:
             return
-        with contextlib.suppress(OSError, ValueError):  # closed meanwhile: receive() tells
+        with contextlib.suppress(OSError, ValueError):  # closed meanwhile: receive() reports it
             select.select([descriptor, wake.fileno()], [], [], seconds)
 
     @property

@@ -148,7 +148,7 @@ class BusReader:
         return True
 
 
-# Another base station under our own source address: noticed by the frames that nobody here sent or asked for.
+# Another base station under our own source address: noticed by frames that this process neither sent nor requested.
 #
 # Two stations of one address get each other's replies, so that commands fail in ways that look like noise. Seen are
 # frames *from* our address that we did not send, and replies to us that we did not ask for.
@@ -592,7 +592,7 @@ class BusMultiplexer:
                 self._first(line, frame)
             case 2:
                 self._consecutive(line, frame)
-            case 3 if line.transaction >= 0:  # nobody waits for any other: they would only pile up
+            case 3 if line.transaction >= 0:  # no thread waits for others: they would only pile up
                 line.flows.put(frame.data)
 
     def _single(self, line: AddressPair, frame: Frame) -> None:
@@ -601,7 +601,7 @@ class BusMultiplexer:
             return
         if body[0] == line.transaction:
             line.events.put(ReplyEvent("whole", body, frame.at))
-            line.flows.put(b"")  # whoever waits for a flow control has its answer
+            line.flows.put(b"")  # the waiter for a flow control has its answer
         elif not self._gathered(line, frame, body[0]) and body[0] not in line.asked:
             self.conflicts.unasked(line.node)
 

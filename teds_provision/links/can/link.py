@@ -157,7 +157,7 @@ class CanLink:
             until = time.monotonic() + _HELLO_SECONDS
             while time.monotonic() < until:
                 with suppress(Empty):
-                    if flow := bus.next_of(line.flows, 0.01):  # an empty one only says that a reply has come
+                    if flow := bus.next_of(line.flows, 0.01):  # an empty one only means that a reply has come
                         return flow
                 with suppress(Empty):
                     event = bus.next_of(line.events, 0.01)
@@ -237,7 +237,7 @@ class _Exchange:
             reply = self._reply(self._seconds * share)
             if reply is not None:
                 return reply
-            self._line.partial = None  # given up: when the same reply begins anew it is no doubled frame
+            self._line.partial = None  # abandoned: a second beginning of the same reply is no doubled frame
             if time.monotonic() - began >= self._longest:
                 break
         raise self._failed()

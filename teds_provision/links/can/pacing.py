@@ -24,7 +24,7 @@ from teds_provision.lazy import late
 
 if TYPE_CHECKING:
     import fcntl
-else:  # recordings are read through this room where there is none
+else:  # recordings are read through this room if there is none
     fcntl = late("fcntl")
 
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
@@ -127,7 +127,7 @@ class Wire:
             fcntl.lockf(self._file, fcntl.LOCK_EX)
             try:
                 (taken,) = _UNTIL.unpack(self._shared[:])
-                if taken - begin < _LONGEST_QUEUE:  # else of a clock that began anew
+                if taken - begin < _LONGEST_QUEUE:  # else of a clock that started again
                     begin = max(begin, taken)
                 self._shared[:] = _UNTIL.pack(begin + duration)
             finally:

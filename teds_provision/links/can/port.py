@@ -141,7 +141,7 @@ class CanPort:
         told: set[bytes] = set()
         notice(Notice("waiting", f"Looking for the node on {self.spec.text}.", seconds))
         if self.spec.node is None and address is not None and 1 <= address <= LAST_NODE:
-            # ask where the node was last: there is no random wait, unlike after a question to everyone
+            # ask at the node's last address: there is no random wait, unlike after a broadcast
             identity = self.identify(address, seconds=_GUESS_SECONDS)
             guessed = self._contact(address, identity) if identity is not None and wanted(identity) else None
             if guessed is not None:

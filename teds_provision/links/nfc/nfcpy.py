@@ -30,7 +30,7 @@ _TIMED_OUT = 0x01  # status of the chip: the target has not answered
 
 def _load() -> Any:
     shown, find = warnings.showwarning, ctypes.util.find_library
-    ctypes.util.find_library = lambda name: None  # nobody here speaks LLCP
+    ctypes.util.find_library = lambda name: None  # LLCP is not used here
     try:
         import nfc
         import nfc.clf.udp

@@ -23,7 +23,7 @@ from teds_provision.links.nfc.tag import FieldLostError, ReaderLostError, Reader
 from teds_provision.links.ports import NFC, Capabilities, Contact, Notice, NoticeSink, Trace
 from teds_provision.protocol.messages.identity import Identity
 
-# What lies on the reader: a node with the profile's service, or something else that deserves a word.
+# A tag on the reader: a node with the profile's service, or something else that deserves a notice.
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ _PAUSE, _SHORT_PAUSE = 0.1, 0.03  # seconds between two polls of the field; the 
 _CHANGING = 2.0  # seconds after a node left in which the next one is expected
 _REOPEN = 1.0  # seconds between two tries to open a lost reader
 _DEBOUNCE = 0.7  # seconds: the same node back within them was never away
-_LOOK_AGAIN = 1.0  # seconds until a tag that was not wanted is read anew
+_LOOK_AGAIN = 1.0  # seconds until a tag that was not wanted is read again
 
 
 def open_port(where: str, trace: Trace | None = None) -> NfcPort:
@@ -192,7 +192,7 @@ class NfcPort:
                 yield _contact(seen, link, self.trace)
                 link.close()
                 seen = link.visit
-            if link is not None and link.lost:  # whoever comes next is a new visit, the same node too
+            if link is not None and link.lost:  # the next tag is a new visit, the same node too
                 notice(_left(seen.identity.uuid))
                 notice(waiting)
                 here, link = None, None
@@ -262,7 +262,7 @@ class NfcPort:
             self.lose_reader()
             self._failures += 1
             if self._failures == 1 and not self._lost:
-                return None  # one error alone: the next look opens it again, and nobody need know
+                return None  # a single error: the next look opens it again, without a notice
             if not self._lost:
                 self._lost = True
                 notice(Notice("reader-lost", f"{error.message} Waiting for it."))
@@ -286,7 +286,7 @@ class NfcPort:
                     if self._reader is None or not seen.tag.is_present:
                         return
             except ReaderLostError:
-                return  # the next look finds out and says so
+                return  # the next look reports it
             stop.wait(_SHORT_PAUSE)
 
 
@@ -340,7 +340,7 @@ class NfcLink:
         attempt = 0
         while True:
             try:
-                poller = self._ready_poller()  # a node that is gone for good ends it here
+                poller = self._ready_poller()  # a node that has left ends it here
                 try:
                     return poller.transact(transaction, frame)
                 except (NodeSilentError, GarbledError) as error:

@@ -29,8 +29,8 @@ class Rows:
     channels: tuple[int, ...]
     time: NDArray[Any]  # float64, unix seconds
     index: NDArray[Any]  # int64
-    tick: NDArray[Any]  # uint64; 0 where none is known
-    clock_error: NDArray[Any]  # float64, NaN where none is known
+    tick: NDArray[Any]  # uint64; 0 if none is known
+    clock_error: NDArray[Any]  # float64, NaN if none is known
     test: NDArray[Any]  # bool
     value: Sequence[NDArray[Any]]
     raw: Sequence[NDArray[Any]]

@@ -15,7 +15,7 @@ from teds_provision.measure.clock import ClockMap
 from teds_provision.protocol.operation.stream_commands import SOON, WAITS
 
 WAITING = 2.0  # seconds that the first node waits for the others
-TELLING = 1.0  # seconds until it is told that a trigger waits
+TELLING = 1.0  # seconds until the notice that a trigger waits
 TOGETHER = 15.0  # seconds that a trigger waits for all nodes, from the first one that is ready
 AHEAD, AHEAD_EACH = 0.25, 0.04  # seconds from the choice of a start time to it, and more for each node
 

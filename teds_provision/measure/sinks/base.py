@@ -211,7 +211,7 @@ class ThreadedSink(ABC):
                 return
             if self.recorder:
                 if self._owed + values > RECORDER_WAITING:
-                    # Waiting would stop the measurement, dropping would leave a hole that nobody sees: so it ends.
+                    # Waiting would stop the measurement, dropping would leave an unnoticed hole: so it ends.
                     self._tally.fail(
                         f"The disk is too slow: {self.name} owes {self._owed} values. The recording has ended.",
                         "Record to a faster disk, or fewer channels.",
@@ -257,7 +257,7 @@ class ThreadedSink(ABC):
     def _work(self) -> None:
         try:
             self._first()
-            if self.stats.state == "starting":  # a sink that waits for somebody has said so by now
+            if self.stats.state == "starting":  # a sink that waits for consumers has reported it by now
                 self._set_state("running")
             self._run()
         except TedsProvisionError as error:

@@ -29,7 +29,7 @@ PIECE = 1 << 18  # octets that are handed to the system at once, at most
 PARTS = 100_000
 LARGEST_PART = 1 << 30  # octets; then the next part begins
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
-ROOM = 1 << 20  # octets that are free before a part is begun anew on a disk that was full
+ROOM = 1 << 20  # octets that are free before a part is begun on a disk that was full
 AGAIN = 1.0  # seconds between looks whether there is room
 
 

@@ -194,7 +194,7 @@ class TopicSink(ThreadedSink):
         before = {uuid: self._topics.of_node(uuid, "teds") for uuid in self._described}
         self._topics.learn(changed)
         for uuid, topic in before.items():
-            if topic != self._topics.of_node(uuid, "teds"):  # under another name: nobody may find the old sheet
+            if topic != self._topics.of_node(uuid, "teds"):  # under another name: the old sheet must not be found
                 self._described.discard(uuid)
                 self._retire(topic)
         self._joints = joints_of(self._facts.values(), self._topics)
@@ -253,7 +253,7 @@ class TopicSink(ThreadedSink):
         now = time.monotonic()
         if now < scalars.due:
             return
-        # The next beat, not "now + period": else each delay would slow the topic down for good.
+        # The next beat, not "now + period": else each delay would slow the topic down permanently.
         scalars.due = scalars.due + 1 / rate if now < scalars.due + 1 / rate else now + 1 / rate
         self._publish(block, scalars)
 

@@ -54,7 +54,7 @@ _MOST_OCTETS: Final = 1 << 20
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 _FULL: Final = 15  # what the library answers where WAITING messages wait
 _FAREWELL: Final = 2.0  # seconds for the broker to take that this measurement has ended
-KEEP_ALIVE = 15  # seconds: the broker says offline after one and a half of it
+KEEP_ALIVE = 15  # seconds: the broker reports offline after one and a half of it
 WAITING = 1000  # messages that the library may hold for a slow broker; what it does not take is offered again
 RUNS = "{{ 'online' if value_json.state == 'running' else 'offline' }}"  # a template of Home Assistant
 DEVICE_CLASSES = {"°C": "temperature", "Pa": "pressure", "hPa": "pressure", "kPa": "pressure", "lx": "illuminance"}
@@ -77,7 +77,7 @@ class MqttSink(ThreadedSink):
                 "Passwords are not allowed on the command line.",
                 hint="Store it in a file: mqtt://USER@HOST?password-file=PATH",
             )
-        shown = f":{port}" if port != PORTS[parts.scheme] else ""  # two brokers of one host are told apart
+        shown = f":{port}" if port != PORTS[parts.scheme] else ""  # distinguishes two brokers of one host
         super().__init__(f"{parts.scheme}://{_host(parts.hostname)}{shown}")
         self._parts = parts
         self._host, self._port = parts.hostname, port
@@ -363,7 +363,7 @@ def _files_of(query: str, *, tls: bool) -> dict[str, str]:
 def _octets(key: str, path: str) -> bytes:
     """Return a small regular file that the URL names by this key; raises NotFoundError, BadDataError."""
     try:
-        if not stat.S_ISREG(Path(path).stat().st_mode):  # a pipe would hold the sink up until somebody writes
+        if not stat.S_ISREG(Path(path).stat().st_mode):  # a pipe would block the sink until it has a writer
             raise BadDataError(f"{key}={path} is no regular file.", hint="Check the URL of the broker.")
     except (OSError, ValueError) as error:
         raise NotFoundError(f"{key}={path} cannot be read.", hint="Check its path and mode.") from error

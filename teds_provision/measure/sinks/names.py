@@ -62,7 +62,7 @@ class Topics:
         self._channels: dict[str, dict[int, str]] = {}  # of each node: name of each channel as it calls itself
         self._known = {uuid: slug(name) for uuid, name in station.nodes.items()}  # what each node is called itself
         self._strangers: dict[str, str] = {}
-        self._unverified: dict[str, str] = {}  # nobody signed what they say: a namespace of their own
+        self._unverified: dict[str, str] = {}  # unsigned names: a separate namespace
         self._nodes: dict[str, str] = {}
         self._made: dict[str, dict[int, str]] = {}
         self._name_nodes()
@@ -78,7 +78,7 @@ class Topics:
                 if channel_facts.uuid not in self._known:
                     self._strangers[channel_facts.uuid] = slug(channel_facts.node)
             if channel_facts.chosen is not None:
-                # Names that somebody chose while the node was not measured; nobody else's change by it
+                # Names that were chosen while the node was not measured; they change no other node's
                 self._chosen = {key: name for key, name in self._chosen.items() if key[0] != channel_facts.uuid}
                 self._chosen |= {(channel_facts.uuid, number): name.strip("/") for number, name in channel_facts.chosen}
                 self._whole = {f"/{name}": key for key, name in self._chosen.items() if key[1]}

@@ -208,7 +208,7 @@ def heads_of(known: Sequence[ChannelFacts]) -> list[str]:
     ]
 
 
-# JSON lines: the first says who measures what, then the events of ``measure --json``, one line each.
+# JSON lines: the first describes the station, then the events of ``measure --json``, one line each.
 
 
 class JsonLinesSink(FileSink):

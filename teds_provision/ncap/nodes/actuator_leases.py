@@ -35,7 +35,7 @@ from teds_provision.protocol.messages.frames import Reason
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLostError
 
-HOLD: Final = 1.0  # seconds, where a request does not say
+HOLD: Final = 1.0  # seconds, if a request has none
 _STARTING: Final = 15.0
 _OPENING, _LOOK = 5.0, 0.05  # seconds for a session that is being opened, and between looks at it
 Measured = Callable[[str], AbstractContextManager[VerifiedSession | None]]
@@ -269,7 +269,7 @@ class ActuatorLeases:
                     order = held.order
                     if time.monotonic() >= held.until and answered >= order.number:
                         held.let_go = True
-                    if held.let_go:  # whoever asks from now on has it claimed anew
+                    if held.let_go:  # later requests claim it again
                         return
                 standing.require()
                 with session(held.uuid) as trusted:

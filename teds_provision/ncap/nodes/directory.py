@@ -63,7 +63,7 @@ class NodeDirectory:
         self._rows: dict[str, dict[str, Any]] = {}
         self._judged: dict[str, NodeVerdict | None] = {}  # as the store and today's trust have it, beside each row
         self._channels: dict[str, tuple[str, list[dict[str, Any]]]] = {}
-        self._own_names: dict[str, str] = {}  # as the datasheet of each says
+        self._own_names: dict[str, str] = {}  # from the datasheet of each
         self.changes = 0  # grows with each change of a node's name or datasheet
         self._strangers: dict[str, set[str]] = {}
         self._texts: dict[str, dict[bool, tuple[tuple[int, int], str]]] = {}  # and whether for who may only read
@@ -114,7 +114,7 @@ class NodeDirectory:
                 self._channels[uuid] = _READ_NOW, [channel_facts(channel) for channel in known.channels]
                 self._own_names[uuid] = sheet.meta.name
 
-    # -- what links and measurements say -----------------------------------------------------------------------------
+    # -- reports of links and measurements ---------------------------------------------------------------------------
 
     def note(self, uuid: str, state: str | None = None, **facts: Any) -> None:
         """Change the facts of a node.

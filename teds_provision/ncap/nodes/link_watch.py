@@ -72,7 +72,7 @@ class PresenceCheck:
             try:
                 first = seconds == PATIENCE[0]
                 identity = self._port.identify(last.address, seconds=seconds, until_announced=first)
-            except AddressConflictError:  # somebody is there, and that two are is told by whoever finds out
+            except AddressConflictError:  # a node is there; a conflict is reported by its finder
                 return Sighting(last.identity, last.address, last.port, time.monotonic())
             except LinkError:
                 return None
@@ -138,7 +138,7 @@ class LinkWatch:
         self._taps, self._transparent, self._buses = taps, transparent, buses
         self._trace = trace
         self._known: dict[str, Sighting] = {}
-        self._looked_for: set[str] = set()  # asked for anew: to be looked at when they answer
+        self._looked_for: set[str] = set()  # requested again: to be inspected when they answer
         self._stop, self._anew = threading.Event(), threading.Event()
         self._workers = ThreadPoolExecutor(WORKERS, thread_name_prefix=f"look {place[:20]}")
         self._for_strangers = ThreadPoolExecutor(STRANGERS, thread_name_prefix=f"stranger {place[:20]}")
@@ -191,7 +191,7 @@ class LinkWatch:
                 self._watch(self.port)
             except TedsProvisionError as error:
                 self._down(error)
-            except Exception:  # noqa: BLE001 - a bug here must not end the watch on a link for good
+            except Exception:  # noqa: BLE001 - a bug here must not end the watch on a link
                 _log.exception("Watching %s failed; starting again.", self.place)
                 self._down(TedsProvisionError("This link failed unexpectedly.", hint="See the log."))
             if self.port is None:
@@ -256,7 +256,7 @@ class LinkWatch:
     def on_sighting(self, sighting: Sighting) -> None:
         """Handle a node that answered on this bus; called from the discovery's thread."""
         uuid, identity = sighting.uuid.hex(), sighting.identity
-        before = self._known.pop(uuid, None)  # who was seen last stands last
+        before = self._known.pop(uuid, None)  # the latest sighting is last
         self._known[uuid] = sighting
         if len(self._known) > MOST_KNOWN:
             oldest, *_ = list(self._known)
@@ -307,7 +307,7 @@ class LinkWatch:
             while self._borrowers and not self._stop.wait(0.1):
                 pass
             self._free.clear()
-            if self._borrowers:  # who came in that instant was told that the reader is free
+            if self._borrowers:  # one that came in that instant was told that the reader is free
                 self._free.set()
 
     def _close(self) -> None:
@@ -397,7 +397,7 @@ class LinkWatch:
             with self._node_locks.hold(uuid, "it is looked at"), Conversation(contact, notice=self._notice) as node:
                 if not self._taps.serve_node(node):
                     self._look(node)
-        except FrozenError:  # its measurement verified it, and says how it does
+        except FrozenError:  # its measurement verified it, and reports its state
             if contact.identity.state == NodeState.FACTORY:  # so it may be let go: who adopts looks at it then
                 self._looked_for.add(uuid)
             return
@@ -407,7 +407,7 @@ class LinkWatch:
             self._directory.note(uuid, "problem", problem=as_problem(lost.cause))
         except TedsProvisionError as error:
             self._directory.note(uuid, "problem", problem=as_problem(error))
-        except Exception:  # noqa: BLE001 - a worker has nobody else who would tell of it
+        except Exception:  # noqa: BLE001 - a worker has no caller to raise to
             _log.exception("Looking at node %s failed.", uuid)
             self._directory.note(
                 uuid, "problem", problem=as_problem(TedsProvisionError("Unexpected failure: see the log."))
@@ -419,7 +419,7 @@ class LinkWatch:
 
     def _look(self, node: Conversation) -> None:
         if not self._wanted(node.contact):
-            return  # a tap shows who lies there, and no more
+            return  # a tap shows which node is there, and no more
         found: NodeInspection = look(self._station, node)
         uuid = node.uuid.hex()
         self._directory.show_sheet(uuid, found.sheet)
@@ -450,7 +450,7 @@ class LinkWatch:
                 found = read_anew(self._station, node)
         except (TedsProvisionError, SessionLostError):
             return  # it was not read: what is shown stays as it was kept, and is read at the next look
-        except Exception:  # noqa: BLE001 - a worker has nobody else who would tell of it
+        except Exception:  # noqa: BLE001 - a worker has no caller to raise to
             _log.exception("Reading the rest of node %s failed.", uuid)
             return
         self._directory.refresh([uuid])

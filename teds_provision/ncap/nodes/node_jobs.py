@@ -120,7 +120,7 @@ class NodeJob(Generic[Result]):
         except TedsProvisionError as error:
             self.error = error
         except Exception as error:
-            self.error = as_program_error(error)  # else whoever waits takes it for done
+            self.error = as_program_error(error)  # else the waiter takes it for done
             raise
         finally:
             self.done.set()

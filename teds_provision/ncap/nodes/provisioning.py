@@ -147,7 +147,7 @@ class Provisioning:
         who = ACTOR.get()
 
         def work(node: Conversation) -> None:
-            before = ACTOR.set(who)  # whoever asked, when a node comes to another thread
+            before = ACTOR.set(who)  # the requester, when a node comes to another thread
             try:
                 self._work(run, node, order)
             finally:
@@ -232,7 +232,7 @@ class Provisioning:
         self._publish(run)
         reporter = _RunReporter(run, self._live)
         try:
-            # Whoever asks for this very node, or for the one that they are about to tap, has accepted its key.
+            # A request for this very node, or for the one that is about to be tapped, has accepted its key.
             done: ProvisionResult = provision(
                 self._station, node, order, accept=lambda _who: None, reporter=reporter, adopt=lambda _brought: None
             )

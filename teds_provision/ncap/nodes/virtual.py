@@ -148,7 +148,7 @@ class Virtuals:
         teds: Path | None = None
         if content is not None:
             teds = folder / "datasheet"
-            placed(content.encode())  # what is wrong with it is told in its own words, not in the file's
+            placed(content.encode())  # its own message names the fault, not the file's
             teds.write_text(content, encoding="utf-8")
         uuid_ = None if content is not None and stated_uuid(placed(content.encode())) else self._new_uuid()
         folders = default_folders(self._station.home)

@@ -200,7 +200,7 @@ async def _end_in_time(socket: WebSocket, tokens: Tokens, caller: Caller, leavin
 def _is_good(tokens: Tokens, digest: str) -> bool:
     try:
         return tokens.is_good(digest)
-    except StoreError:  # a file that cannot be read lets nobody in, nor stay
+    except StoreError:  # an unreadable file admits no client, nor lets one stay
         return False
 
 

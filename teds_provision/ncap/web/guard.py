@@ -192,7 +192,7 @@ class Guard:
         if len(self._wrong) > _WRONG_TOKENS:
             if len(self._wrong) > 10 * _WRONG_TOKENS:
                 self._wrong.popleft()
-            await self._slow_down()  # a right token is never slowed down: nobody can lock the others out
+            await self._slow_down()  # a right token is never slowed down: no client can lock the others out
             return RequestRefusedError(429, "too-many", "Too many wrong tokens.", headers=((b"retry-after", b"60"),))
         return RequestRefusedError(
             401, "wrong-token", "This token is invalid or has expired.", "Get a new one: teds-provision ncap open"

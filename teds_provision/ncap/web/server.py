@@ -17,7 +17,7 @@ from teds_provision.errors import LinkError
 from teds_provision.ncap.settings import Settings
 from teds_provision.ncap.web.guard import CALLER, App
 
-# One connection of HTTP: who opens it and says nothing, or says it slowly, loses it.
+# One connection of HTTP: a client that opens it and sends nothing, or sends slowly, loses it.
 #
 # uvicorn waits without end for the end of a request's head and body. Its limit of connections would then keep everybody
 # out, by no more than so many sockets of a program that has no token. So where there are too many, those that have not
@@ -58,7 +58,7 @@ class HttpConnection(H11Protocol):
         if useless:
             min(useless, key=lambda http_connection: http_connection._began).end()
         else:
-            self.limit_concurrency = MOST  # all of them work for somebody: 503
+            self.limit_concurrency = MOST  # all of them have a running request: 503
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Handle the end of a connection."""

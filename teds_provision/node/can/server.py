@@ -367,7 +367,7 @@ class CanServer:
         pair.handle_frame(frame)
         while (body := pair.received()) is not None:
             if pair.waits_for_flow:
-                pair.stop_sending()  # whoever asks again has not taken that answer up
+                pair.stop_sending()  # a station that repeats its request has not taken that answer
             received = seat.measuring.tick(frame.at) if seat.measuring is not None else 0
             line.put(functools.partial(self._run_request, line, pair, EndpointRequest(body, frame.fd, received)))
         self._note(seat, pair)

@@ -16,7 +16,7 @@ from teds_provision.teds.calibration.samples import DataModel, SampleReader
 from teds_provision.teds.sheet import Channel, Sheet
 
 _KNOTS: Final = 257
-_INTEGER_TOLERANCE: Final = 0.01  # of a step: what lies so near a rounding edge may go either way
+_INTEGER_TOLERANCE: Final = 0.01  # of a step: a value this near a rounding edge may go either way
 _FLOAT_TOLERANCE: Final = 1e-9
 _MOST_FLOAT: Final = 3e38
 _PACKING: Final = {DataModel.FLOAT32: struct.Struct(">f"), DataModel.FLOAT64: struct.Struct(">d")}
@@ -43,7 +43,7 @@ class Converter:
         self._most = (1 << bits) - 1 if self.form.integer or self.form.model == DataModel.BITS else None
         self._packing = _PACKING.get(DataModel(self.form.model))
         self._turn = self._interpreter.turn
-        # Where values wrap, those that the curve gives begin where its raw numbers do, not at LowLimit.
+        # If values wrap, those that the curve gives begin with its raw numbers, not at LowLimit.
         self._from, self._to = self.low, self.high
         if self._turn < math.inf and not self._interpreter.problem:
             self._from, high = self._interpreter.given or (self.low, self.high)

@@ -65,7 +65,7 @@ class AirTime:
 
 
 _LISTEN = 0.25  # seconds after which the server looks around: stop, renewal of the initial message
-_QUEUE = 0.2  # seconds between two tries to lie down on a reader on which another node lies
+_QUEUE = 0.2  # seconds between two tries to be placed on an occupied reader
 _LEAVING = 1.0  # seconds that a node before is given to leave
 _SENS_RES = {4: b"\x04\x00", 7: b"\x44\x00", 10: b"\x84\x00"}
 TYPE4_MAX_NDEF = 4160  # a frame of 4094 octets in one message

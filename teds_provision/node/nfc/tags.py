@@ -156,7 +156,7 @@ class IsoDepTag:
 
     def _information_block(self, pcb: int, octets: bytes) -> bytes:
         self._number ^= 1
-        self._parts = []  # a reader that begins anew wants no more of the answer before
+        self._parts = []  # a reader that starts over wants no more of the answer before
         self._received = (self._received + octets)[:_LONGEST_APDU]
         if pcb & 0x10:
             return self._remember(bytes((0xA2 | self._number,)))

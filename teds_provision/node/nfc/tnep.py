@@ -125,7 +125,7 @@ class TnepTag:
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._worker = threading.Thread(target=self._work, name="nfc-node", daemon=True)
         self._initial = b""
-        self._shown: bytes | None = None  # the initial message that stands in the mailbox, None for any other
+        self._shown: bytes | None = None  # the initial message in the mailbox, None for any other
         memory.written = self._written
 
     def start(self) -> None:

@@ -107,7 +107,7 @@ class LineSource:
             return ""
         if not _is_seconds(time):
             return '"t" is not a number of seconds of 0 or more'
-        if self._last is None:  # where the node's clock is further already, this one goes on from there
+        if self._last is None:  # if the node's clock is further already, this one goes on from there
             self._drive.own_clock()
             self._offset = max(0.0, self._drive.now() - time)
         elif time < self._last:

@@ -137,7 +137,7 @@ class OperationRole:
         self.streams.session_ended(session)
         self._ports.pop(session, None)
 
-    # -- what links tell and ask -----------------------------------------------------------------------------------
+    # -- events and questions of links -----------------------------------------------------------------------------
 
     def poll(self) -> float | None:
         """Take what is due; return seconds until a sample, lease or dead-man is due again, None if none is known.

@@ -130,7 +130,7 @@ class StreamMessage(NamedTuple):
     Sample i of it was taken at ``tick`` + i · period (kinds periodic and free). For events ``index`` counts events.
     """
 
-    # A NamedTuple, since one is made for every message; it hides tuple.index, which nobody asks of a message.
+    # A NamedTuple, since one is made for every message; it hides tuple.index, which no caller needs of a message.
     counter: int
     index: int  # type: ignore[assignment]
     tick: int
@@ -233,7 +233,7 @@ class Receiver:
             if message.flags & TEST_PATTERN != pattern:
                 self.counts.unasked += 1
             elif not dated:
-                # keep a message whose time is not known yet; the oldest goes where there are too many
+                # keep a message whose time is not known yet; the oldest goes if there are too many
                 if len(self._held) == MOST_HELD:
                     self._held.popleft()
                     self.counts.overflow += 1

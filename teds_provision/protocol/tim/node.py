@@ -148,7 +148,7 @@ class Tim:
         now. When the reply has left, call :meth:`reply_left`.
         """
         tick = received if received is not None else self._role.now() if self._role is not None else 0
-        self.poll()  # what ran out before this frame is over, and is told: it revives no lease, hides no dead-man
+        self.poll()  # what ran out before this frame is over, and is reported: it revives no lease, hides no dead-man
         reply = self._run(frame, Origin(link, tapped, port or port_of(link), tick)).encode()
         while self._ending:  # what ends with the reply: sessions after Close, Confirm, Reset
             self._ending.pop()()
@@ -366,7 +366,7 @@ class Tim:
         _length(payload, 1)
         if not 1 <= payload[0] <= LAST_ADDRESS:
             raise CommandRefusedError(Reason.BAD_FORM)
-        if payload[0] != self._flash.can_address:  # what stands there already is not written again
+        if payload[0] != self._flash.can_address:  # an equal value is not written again
             now, last = self.clock(), self._address_written_at
             if last is not None and now - last < _ADDRESS_SECONDS:
                 raise CommandRefusedError(Reason.BUSY)

@@ -67,7 +67,7 @@ class Permission:
     def check(self, command: Command, origin: Origin) -> None:
         """Raise CommandRefusedError if the command may not be run now, or is not known."""
         if command.command_class == SECURITY:
-            # class 128 goes to channel 0; a function that nobody knows gets 1 in every state
+            # class 128 goes to channel 0; an unknown function gets 1 in every state
             unknown = command.function not in _FUNCTIONS or (
                 command.function == Function.SET_CAN_ADDRESS and not self.has_can
             )

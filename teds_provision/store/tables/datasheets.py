@@ -22,7 +22,7 @@ else:  # commands that only list decode no TEDS
     security = late("teds_provision.teds.codec.security")
 
 
-# Images as they lie in the store: octets, deflated, with what their Security TEDS says beside them.
+# Images in the store: octets, deflated, with facts of their Security TEDS beside them.
 
 _BLOCK = struct.Struct(">HBI")
 _MAX_OCTETS = 64 << 20

@@ -123,7 +123,7 @@ class ParcelTables:
         )
         return [(uuid, epoch, set(receivers.split(","))) for uuid, epoch, receivers in rows]
 
-    # -- what somebody who left has had ------------------------------------------------------------------------------
+    # -- what a removed station has had ------------------------------------------------------------------------------
 
     def review(self) -> str | None:
         """Return what was found when the keys were looked through last, JSON."""

@@ -46,10 +46,10 @@ from teds_provision.measure.sinks.mcap.zstandard_frames import ZstdError, decomp
 from teds_provision.portable import CLOSING, NONBLOCK, lock
 
 LARGEST_RECORD: Final = 1 << 28  # a length beyond it is damage
-_PRIVATE: Final = 0x80  # op codes from here on are free for anybody
+_PRIVATE: Final = 0x80  # op codes from here on are free for private use
 _FOOTER_OCTETS: Final = HEAD.size + 20
 _ZSTD: Final = text("zstd")
-_IN_A_CHUNK: Final = HEAD.size + CHUNK_HEAD.size  # where the name of the compression stands
+_IN_A_CHUNK: Final = HEAD.size + CHUNK_HEAD.size  # offset of the compression's name
 
 
 @dataclass(frozen=True)

@@ -50,10 +50,10 @@ def environment(*, sourced: bool) -> dict[str, str]:
 
 
 NO_MASTER, NAME_TAKEN = 3, 4  # exit codes of a child whose master is gone, whose name another program took
-STUCK = 2.0  # seconds without a taken octet: then the child is dead, whatever its process says
+STUCK = 2.0  # seconds without a taken octet: then the child is dead, whatever its process state is
 ENDING = 5.0  # seconds for the child to publish what it has, and end
 BACK_OFF = (1.0, 30.0)
-COMPLAINT = 200  # characters of the last line of stderr that are told
+COMPLAINT = 200  # characters of the last line of stderr that are reported
 
 
 class ChildSink(TopicSink):
@@ -93,7 +93,7 @@ class ChildSink(TopicSink):
             [*self._program(), self._node + self._suffix],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,  # warnings; the last line is told where the child dies
+            stderr=subprocess.PIPE,  # warnings; the last line is reported if the child dies
             env=self._environment(),
             start_new_session=True,  # a Ctrl-C at the terminal is for the parent, which ends its child in order
         )

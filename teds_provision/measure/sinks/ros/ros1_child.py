@@ -49,7 +49,7 @@ def wait_for_master(rosgraph: Any) -> None:
     told, parent = False, os.getppid()
     while not rosgraph.is_master_online():
         if os.getppid() != parent:
-            os._exit(0)  # a parent that was killed closes our stdin, which nobody reads yet
+            os._exit(0)  # a parent that was killed closes our stdin, which is not read yet
         if not told:
             say(event="waiting", master=os.environ.get("ROS_MASTER_URI", "http://localhost:11311"))
             told = True
