@@ -4,7 +4,8 @@
 What a whole module shares is visited by each of its tests (``SHARED``): what a test leaves there is ended after it,
 however it ended, so that one failure is one failure.
 
-At the gate (``CI`` is set) a test marked ``system`` that is skipped has failed: what it needs is to be installed there.
+At the gate (``CI`` is set), and where ``make test`` could install its packages (``TEST_PACKAGES``), a test marked
+``system`` that is skipped has failed. Elsewhere the run ends with a line that counts what was not tested.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import os
 import signal
 import tempfile
 from collections.abc import Generator, Iterator
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, nullcontext, suppress
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,9 @@ from tests.bench import Board, make_station
 from tests.firmware.c_node import OFFERS
 from tests.passphrase_costs import lower_costs
 
+ROOT = Path(__file__).resolve().parents[1]
 AT_THE_GATE = os.environ.get("CI", "").lower() not in ("", "0", "false")
+COMPLETE = AT_THE_GATE or os.environ.get("TEST_PACKAGES") == "installed"
 
 ALL_IN_C = os.environ.get("TEDS_NODE", "python") == "c"
 
@@ -116,12 +119,22 @@ def _needed(item: pytest.Item) -> set[str]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Fail what is skipped at the gate although the gate has to have what it needs."""
+    """Fail what is skipped although what it needs could be installed."""
     report = yield
-    if AT_THE_GATE and report.skipped and item.get_closest_marker("system") and not hasattr(report, "wasxfail"):
+    if COMPLETE and report.skipped and item.get_closest_marker("system") and not hasattr(report, "wasxfail"):
         why = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
-        report.outcome, report.longrepr = "failed", f"skipped at the gate, where nothing may be missing: {why}"
+        report.outcome, report.longrepr = "failed", f"skipped although its packages can be installed: {why}"
     return report
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print what was not tested for want of a package; ``make test`` repeats it as its last line."""
+    skipped = [report for report in terminalreporter.stats.get("skipped", []) if "system" in report.keywords]
+    if skipped:
+        line = f"Not tested: {len(skipped)} tests that need Debian packages. As root: sh scripts/install-test-packages"
+        terminalreporter.write_line(line)
+        with suppress(OSError), (ROOT / "build" / "not-tested").open("a", encoding="utf-8") as file:
+            file.write(f"{line}\n")
 
 
 @pytest.fixture(autouse=True)
