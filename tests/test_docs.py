@@ -16,6 +16,7 @@ from tests.cli.test_help import chain
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "firmware" / "README.md"]
+PAGES += sorted((ROOT / "firmware" / "docs").glob("*.md"))
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 PROMPT = re.compile(r"^(?:[a-z]+)?\$ ")
 
