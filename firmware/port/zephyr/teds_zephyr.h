@@ -17,7 +17,7 @@ extern "C" {
 /** What an application hands over of its board. Both must outlive the node. */
 typedef struct teds_zephyr_board {
     teds_port *port;     /**< channel functions as in teds_port, called from the node's thread; the rest is filled in here */
-    teds_config *config; /**< a UUID of zeros is replaced by one made of the chip's own number (hwinfo) */
+    teds_config *config; /**< a UUID of zeros is replaced: the chip's own number (hwinfo), or random octets if it has none */
 } teds_zephyr_board;
 
 /** Fill in the port, start the node and its thread. Return 0, TEDS_E_…, or Zephyr's negative errno if a device is not

@@ -61,6 +61,9 @@ int main(void)
     if (failed == 0) {
         failed = teds_zephyr_start(&board);
     }
+    if (failed != 0) {
+        printk("The node does not start: %d\n", failed);
+    }
     while (failed == 0) {
         convert();
         held = gpio_pin_get_dt(&pad) != 1 ? 0 : held < 0 ? held : held + 2;

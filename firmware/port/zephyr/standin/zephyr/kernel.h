@@ -11,6 +11,7 @@
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
+#include <stdio.h>
 #include <sys/types.h>
 
 #define BIT(n) (1UL << (n))
@@ -27,6 +28,7 @@ typedef struct {
 #define K_USEC(us) ((k_timeout_t){(int64_t)(us) * 1000})
 #define K_MSEC(ms) ((k_timeout_t){(int64_t)(ms) * 1000000})
 #define SYS_FOREVER_MS (-1)
+#define printk printf
 #define CONFIG_TIMER_HAS_64BIT_CYCLE_COUNTER 1
 
 uint64_t k_cycle_get_64(void);
