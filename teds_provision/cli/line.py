@@ -137,7 +137,7 @@ def _drafted(station: Station, roster: Roster, told: dict[str, Any]) -> Job:
         roster.registry,
         told["title"],
         path.stem,
-        plant.jobs.digest_of_file(path),
+        teds.profile.load.files_digest(path, teds.profile.load.default_folders(station.home)),
         _rule(told, boards),
         told["count"],
         boards,

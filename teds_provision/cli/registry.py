@@ -609,7 +609,7 @@ def _shown(station: Station, found: PlantStatus) -> str:
     elif review is not None and review.alone:
         need = "needs" if review.alone == 1 else "need"
         lines.append(f"{_count(review.alone, 'node')} {need} a tap: only a station that left held the key")
-    lines += [f"{'alarm' if alarm.seen else 'ALARM'} {_alarm_line(station, alarm)}" for alarm in found.alarms]
+    lines += [f"ALARM {_alarm_line(station, alarm)}" for alarm in found.alarms if not alarm.seen]
     doors = station.plant.tables.doors()
     if doors:
         lines.append(f"The database allows what it should not: {', '.join(doors)}")
@@ -765,16 +765,16 @@ def resume(app: App, files: Path | None, yes: bool, dry_run: bool) -> None:
 @command("teds-provision registry seen", name="seen")
 @pass_app
 def seen(app: App) -> None:
-    """Acknowledge all alarms so far.
+    """Acknowledge all alarms so far, and what others reported of pages that are missing here.
 
-    They are still shown, but commands no longer exit 4 because of them.
+    They are no longer shown (--json lists alarms with "seen"), and commands no longer exit 4 because of them.
     """
     station = app.station()
     plant.apply_pages.require_roster(station)
     with station.lock("registry seen", app.note):
-        done = station.plant.tables.see_alarms()
-        station.audit("registry", None, "seen", alarms=done)
-    app.emit({"done": done}, f"{_count(done, 'alarm')} seen.")
+        alarms, heads = plant.sync.acknowledge(station)
+    also = f", {_count(heads, 'report')} of missing pages" if heads else ""
+    app.emit({"done": alarms + heads}, f"{_count(alarms, 'alarm')} seen{also}.")
 
 
 @command(

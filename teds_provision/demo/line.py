@@ -20,7 +20,7 @@ from teds_provision.demo.story import PROFILE, Demo, make_node, new_station, run
 from teds_provision.errors import LinkError, PolicyError
 from teds_provision.handover import trust
 from teds_provision.plant.evidence import export
-from teds_provision.plant.jobs import digest_of_file, take_job
+from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import answer
 from teds_provision.plant.verify_evidence import EvidenceAnchors, EvidenceTotals, judge_file
@@ -34,7 +34,7 @@ from teds_provision.steps.provision import ProvisionResult, provision, verify_on
 from teds_provision.steps.verify import require_authentic
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter, SilentReporter, StepResult
-from teds_provision.teds.profile.load import find_profile
+from teds_provision.teds.profile.load import default_folders, files_digest, find_profile
 
 OTHER = "tactile-finger-sensor"
 BOARDS = 3
@@ -132,7 +132,7 @@ def _job(demo: Demo, office: Station, bench: Station) -> LineRun:
             plant.jobs.roster_of(office).registry,
             "three angles",
             PROFILE,
-            digest_of_file(find_profile(PROFILE)),
+            files_digest(find_profile(PROFILE), default_folders()),
             CalibrationRule(),
             BOARDS,
             {},

@@ -50,10 +50,13 @@ def require_roster(station: Station) -> Roster:
     return roster
 
 
-def alarm(station: Station, code: str, about: str, n: int, why: str) -> None:
-    """Keep an alarm; an existing one keeps its time. A new one is reported to other stations."""
+def alarm(station: Station, code: str, about: str, n: int, why: str, *, again: bool = False) -> None:
+    """Keep an alarm; an existing one keeps its time. A new one is reported to other stations.
+
+    ``again``: it happened once more, so an alarm that was seen is raised again.
+    """
     with station.transaction():
-        if station.plant.tables.put_alarm(Alarm(code, about, n, why)):
+        if station.plant.tables.put_alarm(Alarm(code, about, n, why), again=again):
             station.audit("registry", None, f"alarm: {code}", about=about[:16], n=n, why=why)
             station.plant.record_event("alarm", code=code, about=about or None, n=n)
 
@@ -82,7 +85,8 @@ def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster,
     for roster in sorted(read.values(), key=lambda roster: (roster.version, roster.hash)):
         own = station.plant.roster
         how, why = taking(roster, own, registry)
-        if roster.created > now() + MOST_AHEAD:
+        at = now() if own is None else max(now(), own.created)  # the roster here shows a clock that was put back
+        if how not in ("same", "older") and roster.created > at + MOST_AHEAD:
             how, why = "refused", "it is dated in the future: check this machine's clock"
         if how in ("same", "older") and (how == "same" or roster.hash in known):
             continue

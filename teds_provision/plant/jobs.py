@@ -16,7 +16,7 @@ from teds_provision.protocol.plant.job import Job, open_job
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.station import Station
 from teds_provision.store import JobRow
-from teds_provision.teds.profile.load import default_folders, find_profile
+from teds_provision.teds.profile.load import default_folders, files_digest, find_profile
 
 CLOSED: Final = "closed"
 _MAX_PROFILE_OCTETS: Final = 1 << 20
@@ -160,15 +160,26 @@ def close_job(station: Station, job: Job) -> None:
 def profile_file(station: Station, job: Job) -> Path:
     """Return the file of the job's profile.
 
-    Raises NotFoundError, and PolicyError if it is not the one that the job names.
+    Raises NotFoundError, BadDataError, and PolicyError if it, or a profile that it extends, is not the one in the job.
     """
     path = find_profile(job.profile, default_folders(station.home))
-    if digest_of_file(path) != job.profile_sha256:
-        raise PolicyError(
-            f"Profile {job.profile} is not the one in the job: {path} has a different SHA-256.",
-            hint=f"Copy the job's profile to {station.home / 'profiles'}.",
-        )
+    require_profile(station, job, path)
     return path
+
+
+def require_profile(station: Station, job: Job, path: Path) -> None:
+    """Raise PolicyError unless a profile's file, with all that it extends, is the one in the job."""
+    if files_digest(path, default_folders(station.home)) == job.profile_sha256:
+        return
+    if digest_of_file(path) == job.profile_sha256:
+        raise PolicyError(
+            f"The job names the file of profile {job.profile} alone, without the profiles that it extends.",
+            hint="An earlier version created it. Ask its keeper for a new job.",
+        )
+    raise PolicyError(
+        f"Profile {job.profile} is not the one in the job: {path}, with all that it extends, has a different SHA-256.",
+        hint=f"Copy the job's profile, and those that it extends, to {station.home / 'profiles'}.",
+    )
 
 
 def digest_of_file(path: Path) -> str:

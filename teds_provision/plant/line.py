@@ -25,7 +25,7 @@ from teds_provision.station.label import label_of, read_label, write_label
 from teds_provision.station.station import Station
 from teds_provision.steps.batch_sheet import BoardResult
 from teds_provision.steps.board_type import WrongBoardError
-from teds_provision.steps.build import BuildOrder, PreparedOrder, Proposal, prepare
+from teds_provision.steps.build import BuildOrder, PreparedOrder, Proposal, prepare, profile_files_digest
 from teds_provision.steps.identify import IdentifiedNode
 from teds_provision.steps.provision import ProvisionResult
 from teds_provision.steps.sign import SignResult
@@ -400,6 +400,7 @@ class LineUnit:
             read_limited(path, _MAX_CALIBRATION, "calibration") if path is not None else None,
             present.identity.epoch,
             present.identity.sequence,
+            proposal.profile,
         )
         intact = present.image.unsigned_blocks() == proposal.image.unsigned_blocks()
         return by_office(station, self.run.office, node, keys, wanted, present.image.security if intact else None)
@@ -441,7 +442,7 @@ class LineUnit:
             unit=self.row.unit if self.row is not None else None,
             attempt=self.attempt,
             profile=job.profile if job is not None else row.profile if row is not None else None,
-            profile_sha256=job.profile_sha256 if job is not None else None,
+            profile_sha256=job.profile_sha256 if job is not None else profile_files_digest(station, row),
             calibration_sha256=self.run.calibration_digest(uuid),
             epoch=shown.key_epoch,
             sequence=shown.sequence,

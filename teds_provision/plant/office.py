@@ -15,18 +15,19 @@ from typing import Final
 
 from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError, TedsProvisionError
 from teds_provision.plant.jobs import (
-    digest_of_file,
     now_of,
     profile_file,
     read_job,
     require_adopted,
     require_open,
+    require_profile,
     roster_of,
 )
 from teds_provision.plant.sign_requests import Inbox, name_of, send
 from teds_provision.plant.transport import Transport
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.fingerprints import same_key
+from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint, node_key_good, prove_message, verify
 from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.job import Job
@@ -48,6 +49,10 @@ MOST_JUMP: Final = 65_535
 _MAX_CALIBRATION: Final = 1 << 20
 
 
+class RequestAheadError(PolicyError):
+    """A request is dated further in the future than two clocks differ: it is not taken yet, and no answer is due."""
+
+
 class _RefusedError(Exception):
     """The office signs nothing: one word of the contract, and why."""
 
@@ -61,8 +66,8 @@ def answer(station: Station, octets: bytes, jobs: Collection[str] | None = None,
 
     ``jobs``: only these ids (None: every job that is kept here). ``jump``: an operator accepts any sequence. A
     datasheet, its unit, its sequence and the ``signed`` event are durable before the answer is returned; the same
-    request (H) gets the same answer again. Raises StoreError, VaultError and PolicyError (this station is no office
-    now).
+    request (H) gets the same answer again. Raises StoreError, VaultError, RequestAheadError and PolicyError (this
+    station is no office now).
     """
     roster = roster_of(station)
     if not roster.has(station.identity.fingerprint, "sign"):
@@ -78,7 +83,11 @@ def answer(station: Station, octets: bytes, jobs: Collection[str] | None = None,
     if request.to != station.identity.fingerprint:
         return None
     if request.created > now_of(roster) + MOST_AHEAD:
-        return None
+        raise RequestAheadError(
+            f"{roster.name_of(request.signer)} dated this request {time_text(request.created)}, and it is"
+            f" {time_text(now_of(roster))} here.",
+            hint=f"Set the clock of {roster.name_of(request.signer)}, or that of this machine, and ask again.",
+        )
     key = station.credentials().key
     if not roster.has(request.signer, "line"):
         return seal_answer(
@@ -108,7 +117,11 @@ def answer_all(
     for come in inbox.collect():
         if stop():
             return
-        sealed = answer(station, come.document, jobs)
+        try:
+            sealed = answer(station, come.document, jobs)
+        except RequestAheadError as ahead:  # it stays where it is until its time has come
+            station.notice(f"Not signed: {ahead.message}")
+            continue
         if sealed is not None:
             request = open_request(come.document, roster_of(station).point_of)
             if roster_of(station).member(request.signer) is not None:
@@ -298,8 +311,7 @@ def _profile(station: Station, job: Job) -> Profile:
     seen = path.stat()
     state = seen.st_mtime_ns, seen.st_ino, seen.st_size
     profile = _loaded(str(path), state, int(time.monotonic()), station.home)
-    if digest_of_file(path) != job.profile_sha256:
-        raise PolicyError(f"The profile {path} changed while it was being read.")
+    require_profile(station, job, path)  # it may have changed while it was read
     return profile
 
 

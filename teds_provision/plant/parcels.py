@@ -18,6 +18,7 @@ from typing import Final
 
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, TedsProvisionError
 from teds_provision.handover import incoming, outgoing, pending
+from teds_provision.plant.folder_transport import LARGEST_PARCEL
 from teds_provision.plant.transport import SMALL, Parcel, Transport
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import CONTENT_TYPE
@@ -252,13 +253,37 @@ class _Reader:
             self.station.audit("import", None, "refused", handover=error.bundle.id, why=error.message)
 
     def _junk(self, parcel: Parcel, error: TedsProvisionError) -> bool:
-        """Drop and report a useless parcel; it would stay until it expires."""
+        """Discard a parcel that is of no use, which would stay there until it expires; an alarm if it is suspicious.
+
+        It is not if a removed station signed it, or if it came too late: both happen in the ordinary course of a theft
+        or of a long absence.
+        """
         if not isinstance(error, (BadDataError, NotAuthenticError, NotFoundError, PolicyError)):
             raise error
+        suspicious = isinstance(error, (BadDataError, NotAuthenticError)) and not self._is_from_removed(parcel)
         with self.station.durable(_COMMAND):
-            self.station.plant.tables.put_alarm(Alarm("parcel", parcel.sender, 0, error.message))
+            if suspicious:
+                self.station.plant.tables.put_alarm(Alarm("parcel", parcel.sender, 0, error.message), again=True)
             self.station.audit("import", None, "parcel discarded", parcel=parcel.id, why=error.message)
         return True
+
+    def _is_from_removed(self, parcel: Parcel) -> bool:
+        """Return True if a station that was removed signed what is in a parcel."""
+        octets = parcel.octets
+        try:
+            if octets.startswith(b"{"):
+                octets = jose.decrypt(
+                    octets, self.station.vault.identity(), cty=CONTENT_TYPE, max_octets=LARGEST_PARCEL
+                )
+            header = load_object(decode_base64url(octets.partition(b".")[0], "The JWS header"), "The JWS header")
+            jose.verify_compact(octets, self._removed_point, typ=str(header.get("typ")), max_octets=LARGEST_PARCEL)
+        except TedsProvisionError:
+            return False
+        return True
+
+    def _removed_point(self, digits: str) -> bytes | None:
+        removed = self.roster.removed_one(digits)
+        return None if removed is None else removed.point
 
     def _row(self, parcel: Parcel, kind: ParcelKind) -> ParcelRow:
         return ParcelRow(parcel.id, "in", parcel.sender or "0" * 64, kind, "later", parcel.expires)

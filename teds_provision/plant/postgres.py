@@ -118,6 +118,9 @@ select what from (values
   ('TEMP for PUBLIC', has_database_privilege(current_database(), 'TEMP')),
   ('CREATE on schema public', coalesce((select has_schema_privilege(oid, 'CREATE') from pg_namespace
     where nspname = 'public'), false)),
+  ('procedural blocks', has_language_privilege('plpgsql', 'USAGE')),
+  ('snapshot files or messages in the WAL', exists (select from pg_proc where pronamespace = 'pg_catalog'::regnamespace
+    and proname in ('pg_export_snapshot', 'pg_logical_emit_message') and has_function_privilege(oid, 'EXECUTE'))),
   ('pg_notify', has_function_privilege('pg_catalog.pg_notify(text, text)', 'EXECUTE')),
   ('advisory locks', exists (select from pg_proc where pronamespace = 'pg_catalog'::regnamespace
     and proname ~ '^pg_(try_)?advisory_' and has_function_privilege(oid, 'EXECUTE'))),

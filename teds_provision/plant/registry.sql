@@ -24,6 +24,8 @@ do $$ begin execute format('revoke all on database %I from public', current_data
   execute format('grant connect on database %I to teds_member, teds_reader', current_database()); end $$;
 create schema if not exists registry authorization teds_owner;
 grant execute on function pg_catalog.pg_notify(text, text) to teds_owner;
+revoke usage on language plpgsql from public; -- no DO block: a loop of a member's own takes locks, subtransactions and NOTIFY as fast as the server can
+grant usage on language plpgsql to teds_owner;
 drop function if exists registry.sweep(); -- it is not teds_owner's, who could not revoke it below
 set local role teds_owner;
 grant usage on schema registry to teds_member, teds_reader;
@@ -89,12 +91,14 @@ declare who bytea := registry.me(); begin
     on conflict (station) do update set version = excluded.version, jws = excluded.jws;
   perform pg_notify('teds', 'roster ' || number); end $$;
 create or replace function registry.send(parcel uuid, receiver bytea, content bytea, until timestamptz) returns void language plpgsql security definer set search_path = pg_catalog, pg_temp as $$
-declare who bytea := registry.me(); waiting bigint; begin
-  if who is null then raise exception 'not a member' using errcode = 'TE001'; end if;
+declare who bytea; waiting bigint; begin
+  select m.station into who from registry.member m where m.role = session_user and m.open for update; -- one at a time: the limit is exact
+  if not found then raise exception 'not a member' using errcode = 'TE001'; end if;
   if until > now() + interval '31 days' then raise exception 'too long' using errcode = 'TE004'; end if;
   delete from registry.parcel where expires < now() and sender = who;
-  select coalesce(sum(octet_length(document)), 0) into waiting from registry.parcel where sender = who;
-  if waiting + octet_length(content) > 268435456 then raise exception 'too much waits' using errcode = 'TE004'; end if;
+  -- a parcel counts for 16 KiB at least: not even empty ones keep a receiver busy for long
+  select coalesce(sum(greatest(octet_length(document), 16384)), 0) into waiting from registry.parcel where sender = who;
+  if waiting + greatest(octet_length(content), 16384) > 268435456 then raise exception 'too much waits' using errcode = 'TE004'; end if;
   insert into registry.parcel(id, recipient, sender, document, expires) values (parcel, receiver, who, content, until);
   perform pg_notify('teds', 'parcel ' || encode(receiver, 'hex')); end $$;
 alter table registry.parcel enable row level security;
@@ -112,14 +116,16 @@ reset role;
 -- what every login may do by default and a thief would like
 do $$ declare f regprocedure; begin
   for f in select oid::regprocedure from pg_proc where pronamespace = 'pg_catalog'::regnamespace
-    and (proname ~ '^pg_(try_)?advisory_' or proname ~ '^(lo_(creat|create|from_bytea|put|truncate|truncate64|import|open)|lowrite)$' or proname = 'pg_notify') loop
+    and (proname ~ '^pg_(try_)?advisory_' or proname ~ '^(lo_(creat|create|from_bytea|put|truncate|truncate64|import|open)|lowrite)$' or proname in ('pg_notify', 'pg_export_snapshot', 'pg_logical_emit_message')) loop
     execute format('revoke execute on function %s from public', f); end loop; end $$;
 -- Settings of a login are only defaults, which it may change, but for temp_file_limit. So members hold each other to the limits: sweep(), which each of them
--- calls now and then, ends a member's transaction that is older than two minutes (a statement of ours takes 60 s at most) or holds more than 1,000 locks.
+-- calls now and then, ends a member's transaction that is older than two minutes (a statement of ours takes 60 s at most), or than ten seconds while the
+-- queue of notifications fills (one that listens keeps it from being emptied), or that holds more than 1,000 locks.
 create or replace function registry.sweep() returns int language sql security definer set search_path = pg_catalog, pg_temp as $$
   select count(*) filter (where pg_terminate_backend(a.pid))::int from pg_stat_activity a
     where a.pid <> pg_backend_pid() and a.usesysid in (select x.member from pg_auth_members x join pg_roles r on r.oid = x.roleid where r.rolname = 'teds_member')
-      and (a.xact_start < clock_timestamp() - interval '120 seconds' or (select count(*) from pg_locks l where l.pid = a.pid) > 1000) $$;
+      and (a.xact_start < clock_timestamp() - interval '120 seconds'
+        or (pg_notification_queue_usage() > 0.1 and a.xact_start < clock_timestamp() - interval '10 seconds') or (select count(*) from pg_locks l where l.pid = a.pid) > 1000) $$;
 alter function registry.sweep() owner to teds_sweeper;
 grant pg_signal_backend, pg_read_all_stats to teds_sweeper;
 revoke all on function registry.sweep() from public;

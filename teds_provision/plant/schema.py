@@ -41,6 +41,21 @@ def registry_sql(registry: str, removed: Iterable[str] = ()) -> str:
     return quiet + text.replace(":'registry'", f"'{UUID(registry)}'") + "".join(map(close_sql, removed))
 
 
+def _after_ending(role: str, change: str, *, attempts: int = 20) -> str:
+    """Return SQL that makes a change (PL/pgSQL) to what a login's open transactions may hold, ending them first."""
+    return f"""\
+do $$ declare attempt int; begin
+  for attempt in 1..{attempts} loop
+    perform pg_stat_clear_snapshot();
+    perform pg_terminate_backend(pid, 2000) from pg_stat_activity where usename = '{role}' and xact_start is not null;
+    begin
+      {change}
+      exit;
+    exception when lock_not_available then if attempt = {attempts} then raise; end if; end;
+  end loop; end $$;
+"""
+
+
 def member_sql(fingerprint: str, verifier: str) -> str:
     """Return the login of one station; run again it sets the password of a newer request. Raises BadDataError."""
     role = role_of(fingerprint)
@@ -48,6 +63,7 @@ def member_sql(fingerprint: str, verifier: str) -> str:
         raise BadDataError(
             "The request's login is not a SCRAM-SHA-256 verifier.", hint="Create it again: registry request"
         )
+    login = f"alter role {role} login connection limit {CONNECTIONS} password '{verifier}';"
     return f"""\
 begin;
 set local lock_timeout = '500ms';
@@ -55,7 +71,7 @@ do $$ begin if exists (select from registry.member where role = '{role}' and not
   raise exception 'this login was closed' using hint = 'To open it: update registry.member set open = true '
     'where role = ''{role}''; then run this again.'; end if; end $$;
 do $$ begin if not exists (select from pg_roles where rolname = '{role}') then create role {role}; end if; end $$;
-alter role {role} login connection limit {CONNECTIONS} password '{verifier}';
+{_after_ending(role, login)}\
 alter role {role} set temp_file_limit = '512MB';
 alter role {role} set statement_timeout = '60s';
 alter role {role} set idle_in_transaction_session_timeout = '60s';
@@ -66,27 +82,17 @@ commit;
 
 
 def close_sql(fingerprint: str) -> str:
-    """Return SQL that closes a station's row, disables its login and ends its connections.
-
-    Connections end first: an open transaction of the station may hold the rows that have to change.
-    """
+    """Return SQL that closes a station's row, disables its login and ends its connections."""
     role = role_of(fingerprint)
-    end = f"pg_terminate_backend(pid, 2000) from pg_stat_activity where usename = '{role}'"
+    change = f"""\
+if exists (select from pg_roles where rolname = '{role}') then alter role {role} nologin; end if;
+      update registry.member set open = false where station = '\\x{fingerprint}';"""
     return f"""\
 begin;
 set local lock_timeout = '500ms';
-do $$ declare attempt int; begin
-  for attempt in 1..20 loop
-    perform pg_stat_clear_snapshot();
-    perform {end};
-    begin
-      if exists (select from pg_roles where rolname = '{role}') then alter role {role} nologin; end if;
-      update registry.member set open = false where station = '\\x{fingerprint}';
-      exit;
-    exception when lock_not_available then if attempt = 20 then raise; end if; end;
-  end loop; end $$;
+{_after_ending(role, change)}\
 commit;
-select {end};
+select pg_terminate_backend(pid, 2000) from pg_stat_activity where usename = '{role}';
 """
 
 
@@ -94,12 +100,15 @@ def mend_sql(fingerprint: str, first: int) -> str:
     """Take off the rows of a station from number ``first`` on, which its key did not sign."""
     if first < 1:
         raise BadDataError("Page numbers start at 1.")
-    station = f"'\\x{role_of(fingerprint) and fingerprint}'"
+    role = role_of(fingerprint)
+    station = f"'\\x{fingerprint}'"
     before = f"(select hash from registry.page p where p.station = {station} and p.n = {first - 1})"
+    change = f"""\
+delete from registry.page where station = {station} and n >= {first};
+      update registry.member set n = {first - 1}, hash = coalesce({before}, '\\x') where station = {station};"""
     return f"""\
 begin;
 set local lock_timeout = '500ms';
-delete from registry.page where station = {station} and n >= {first};
-update registry.member set n = {first - 1}, hash = coalesce({before}, '\\x') where station = {station};
+{_after_ending(role, change)}\
 commit;
 """

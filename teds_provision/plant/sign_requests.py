@@ -282,7 +282,10 @@ class FileOffice:
 
 @dataclass(frozen=True)
 class SignatureOrder:
-    """What an office has to sign: the image without its Security TEDS, for which job, with which name, from what."""
+    """What an office has to sign: the image without its Security TEDS, for which job, with which name, from what.
+
+    ``profile`` is kept with the draft.
+    """
 
     job: str
     office: str
@@ -291,6 +294,7 @@ class SignatureOrder:
     calibration: bytes | None
     epoch: int
     sequence: int
+    profile: str | None = None
 
 
 def by_office(
@@ -301,7 +305,7 @@ def by_office(
     wanted: SignatureOrder,
     on_node: bytes | None,
 ) -> SignResult:
-    """Have the office sign. What it signed before, and what the node has, is not requested again.
+    """Have the office sign, and keep the draft meanwhile; an earlier signature, and the node's, is not requested again.
 
     ``on_node``: the node's Security TEDS if its other TEDS are those of the image. An earlier request for the very same
     datasheet is repeated unchanged, so that no second one is made. Raises OfficeSilentError (5), Refused (6),
@@ -332,6 +336,7 @@ def by_office(
     )
     with station.durable("sign"):
         station.plant.line.put_sign_request(row)
+        station.nodes.keep_draft(Draft(keys.uuid, signed.image, "signed", wanted.profile))
         station.nodes.remember(keys.uuid, sequence=signed.sequence)
         station.audit("sign", keys.uuid, "by office", sequence=signed.sequence, office=wanted.office)
     return signed
@@ -382,7 +387,9 @@ def sign_by_office(station: Station, links: LinkSettings, order: OfficeOrder, re
             keys = SignedNodeKey(uuid, visit.who.point, visit.who.key_signature)
             octets = read_limited(order.calibration, 1 << 20, "calibration") if order.calibration is not None else None
             name = own_name(station, image, draft.profile)
-            wanted = SignatureOrder(job.id, job.office, image, name, octets, identity.epoch, identity.sequence)
+            wanted = SignatureOrder(
+                job.id, job.office, image, name, octets, identity.epoch, identity.sequence, draft.profile
+            )
             signed = by_office(station, office, visit.node, keys, wanted, None)
     with station.durable("sign"):
         station.nodes.keep_draft(Draft(uuid, signed.image, "signed", draft.profile))
@@ -439,6 +446,7 @@ def _new_request(station: Station, node: Conversation, keys: SignedNodeKey, want
         station.plant.line.put_sign_request(
             SignRequestRow(request.hash, "out", wanted.job, keys.uuid, wanted.office, octets)
         )
+        station.nodes.keep_draft(Draft(keys.uuid, wanted.image, "built", wanted.profile))
     return request
 
 

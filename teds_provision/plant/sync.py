@@ -25,6 +25,7 @@ from teds_provision.plant.apply_pages import (
     take_pages,
     take_rosters,
 )
+from teds_provision.plant.membership import FILES
 from teds_provision.plant.transport import Transport
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
@@ -72,8 +73,8 @@ def alone(station: Station) -> Iterator[None]:
 def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncResult:
     """Bring this station and what carries to the same state, as far as signatures go.
 
-    ``connected``: it is what the station joined by; how far that came is remembered. Raises LinkError, NotMemberError,
-    Fork, PolicyError.
+    ``connected``: it is what the station joined by; how far its database came is remembered. Raises LinkError,
+    NotMemberError, ForkError, PolicyError.
     """
     station.unlock()
     with alone(station):
@@ -93,13 +94,13 @@ def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncRe
         done.fetched += fetching.fetch(station, post, roster)
         _return_pages(station, post, roster, done)
         done.judged = apply_claims(station)
-        unseen_heads(station, roster, done)
+        acknowledged = station.plant.tables.seen_heads()
+        done.told += [said for head, said in unseen_heads(station, roster).items() if head not in acknowledged]
         _parcels(station, post, roster, done)
-        if connected:
-            with station.transaction():
-                joined = station.plant.joined
-                assert joined is not None
-                station.plant.tables.put_plant(replace(joined, synced=utc_now()))
+        with station.transaction():
+            joined = station.plant.joined
+            assert joined is not None
+            station.plant.tables.put_plant(replace(joined, synced=utc_now()))
         return done
 
 
@@ -190,7 +191,7 @@ def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResul
     if connected and there < joined.acknowledged and not post.everybody:
         there = post.heads().get(station.fingerprint, 0)
         why = f"page {joined.acknowledged} was there, and now {there} is the last"
-        alarm(station, "rolled-back", station.fingerprint, joined.acknowledged, why)
+        alarm(station, "rolled-back", station.fingerprint, joined.acknowledged, why, again=True)
         done.told.append(f"{post.where} was rolled back: {why}; it is being refilled")
 
 
@@ -455,24 +456,42 @@ def _push(station: Station, post: Transport, roster: Roster, done: SyncResult, *
             done.pushed += own
     joined, newest = station.plant.joined, own_chain(station).counted[0]
     assert joined is not None
-    if connected and joined.acknowledged != newest:
+    # to a station that uses folders each of them is the registry: a stick has another path on each machine
+    by_folder = post.everybody and (joined.url or "").startswith(FILES)
+    if (connected or by_folder) and joined.acknowledged != newest:
         station.plant.tables.put_plant(replace(joined, acknowledged=newest))
 
 
-def unseen_heads(station: Station, roster: Roster, done: SyncResult) -> None:
-    """Report heads that members claim to have seen of others and that no station showed this one; it ends nothing."""
+def unseen_heads(station: Station, roster: Roster) -> dict[tuple[str, str, int, str], str]:
+    """Return what members report of others' pages that are not here, in sentences; it ends nothing.
+
+    By who reports, of whom, the number and H of the page; those that a person has acknowledged are among them.
+    """
+    found: dict[tuple[str, str, int, str], str] = {}
     chains = station.plant.tables.chains()
     for who, about, n, hash in station.plant.tables.heads():
         chain = chains.get(about)
         if roster.member(who) is None or about not in roster.by_key or who == station.fingerprint:
             continue
-        if chain is None or n > chain.counted[0]:
-            here = chain.counted[0] if chain is not None else 0
-            names = station.plant.tables.page_names(chain.chain) if chain is not None else []
-            if not any((n, hash) == (number, named) for number, named, _ in names):
-                saw = f"{roster.name_of(who)} saw page {n} of {roster.name_of(about)}"
-                done.told.append(f"{saw}; the last one here is {here}")
-        elif not any((n, hash) == (number, named) for number, named, _ in station.plant.tables.page_names(chain.chain)):
-            done.told.append(
-                f"{roster.name_of(who)} reports a page {n} of {roster.name_of(about)} that differs from the one here"
-            )
+        names = station.plant.tables.page_names(chain.chain) if chain is not None else []
+        if any((n, hash) == (number, named) for number, named, _ in names):
+            continue
+        here = chain.counted[0] if chain is not None else 0
+        if n > here:
+            saw = f"{roster.name_of(who)} saw page {n} of {roster.name_of(about)}"
+            found[who, about, n, hash] = f"{saw}; the last one here is {here}"
+        else:
+            other = f"{roster.name_of(who)} reports a page {n} of {roster.name_of(about)}"
+            found[who, about, n, hash] = f"{other} that differs from the one here"
+    return found
+
+
+def acknowledge(station: Station) -> tuple[int, int]:
+    """Note that a person knows of all alarms and reported heads up to now; returns how many of each were new."""
+    tables, heads = station.plant.tables, unseen_heads(station, require_roster(station))
+    with station.transaction():
+        fresh = len(heads.keys() - tables.seen_heads())
+        tables.see_heads(heads)
+        alarms = tables.see_alarms()
+        station.audit("registry", None, "seen", alarms=alarms, heads=fresh)
+    return alarms, fresh

@@ -46,7 +46,7 @@ class SignerRules:
     roster: roster.Roster
     ca: bytes
     counted: Mapping[str, int]
-    keepers_behind: bool
+    keepers_behind: str
     added: frozenset[str]
     words: Callable[[bytes], Collection[signer.SignatureClaim]]
 
@@ -158,13 +158,18 @@ class Plant:
         if held is None:
             return None
         counted = {station: chain.counted[0] for station, chain in self.tables.chains().items()}
-        behind = any(
-            n > counted.get(about, 0)
-            and about != self._identity.fingerprint  # a keeper knows its own chain
-            and held.member(who) is not None
-            and bool(held.roles_of(who) - {"audit"})
-            and "keeper" in held.roles_of(about)
-            for who, about, n, _ in self.tables.heads()
+        behind = next(
+            (
+                f"{held.name_of(who)} reports page {n} of {held.name_of(about)}, a keeper;"
+                f" the last one here is {counted.get(about, 0)}"
+                for who, about, n, _ in self.tables.heads()
+                if n > counted.get(about, 0)
+                and about != self._identity.fingerprint  # a keeper knows its own chain
+                and held.member(who) is not None
+                and bool(held.roles_of(who) - {"audit"})
+                and "keeper" in held.roles_of(about)
+            ),
+            "",
         )
         added = frozenset(trusted.fingerprint for trusted in self.tables.trusted() if trusted.role == "station")
         return SignerRules(held, self._identity.ca, counted, behind, added - held.by_key.keys(), self._words)

@@ -11,11 +11,19 @@ import hashlib
 import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from teds_provision import teds
-from teds_provision.errors import BadDataError, CalibrationMisfitError, NotFoundError, PolicyError, UsageError
+from teds_provision.errors import (
+    BadDataError,
+    CalibrationMisfitError,
+    NotFoundError,
+    PolicyError,
+    TedsProvisionError,
+    UsageError,
+)
 from teds_provision.lazy import late
 from teds_provision.protocol import datasheet
 from teds_provision.sanitize import printable
@@ -25,12 +33,19 @@ from teds_provision.steps.board_type import Retype, differences, is_remembered, 
 from teds_provision.steps.sign import known_image, known_node_keys, unsigned_security
 from teds_provision.steps.teds_read import NodeSnapshot
 from teds_provision.steps.verify import FreshnessFloor, Verification, verify_image
-from teds_provision.store import Draft
+from teds_provision.store import Draft, NodeRecord
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.image import SECURITY, BlockId, Image
-from teds_provision.teds.profile.load import default_folders, is_profile_name, load_profile, passed_over
+from teds_provision.teds.profile.load import (
+    default_folders,
+    files_digest,
+    find_profile,
+    is_profile_name,
+    load_profile,
+    passed_over,
+)
 from teds_provision.teds.profile.reader import NAME_OCTETS
 from teds_provision.teds.sheet import Sheet, described
 
@@ -252,6 +267,27 @@ def digest_of(profile: Profile) -> str:
     if place not in profile.composed:  # for the first node of this type
         profile.composed[place] = _digest(profile)
     return profile.composed[place].hex()
+
+
+def profile_files_digest(station: Station, record: NodeRecord | None) -> str | None:
+    """Return the SHA-256 (hex) of the files of the profile that a node's datasheet was built of.
+
+    None if no profile is known, its files are gone, or they say something else by now.
+    """
+    if record is None or record.profile is None or record.profile_digest is None:
+        return None
+    folders = default_folders(station.home)
+    try:
+        path = find_profile(record.profile, folders)
+        digest = files_digest(path, folders)
+        return digest if _content_of(digest, path, station.home) == record.profile_digest else None
+    except TedsProvisionError:  # a file that was moved or is being edited is no failure of the node's
+        return None
+
+
+@lru_cache(maxsize=64)
+def _content_of(_files: str, path: Path, home: Path) -> str:
+    return digest_of(load_profile(path, default_folders(home)))
 
 
 def content_digests(prepared: PreparedOrder) -> tuple[str, str]:
@@ -671,8 +707,8 @@ def _composed(
     """Everything by profile; ``resume``: with the calibration of a run that never came to write."""
     uuid, has = present.image.uuid, present.image
     pending = pending_image(station, uuid, has) if resume else None
-    record = station.nodes.get(uuid)
-    name = own_name(station, pending or has, record.profile if record is not None else None)
+    source = station.nodes.draft(uuid) if pending is not None else station.nodes.get(uuid)
+    name = own_name(station, pending or has, source.profile if source is not None else None)
     plan = compose(station, uuid, prepared, pending or has, name=name, as_known=resume)
     image = Image(uuid, {**keep, **plan.blocks})
     named = named and not plan.changed

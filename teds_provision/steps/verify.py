@@ -422,7 +422,7 @@ def require_authentic(verified: Verification) -> None:
     if verified.verdict == "unproven" and _PAGES in failed:
         raise UnprovenError(
             f"Nothing could be proven about the datasheet of node {verified.uuid.hex()}: {failed[_PAGES].why}.",
-            hint="To get them: teds-provision registry sync",
+            hint="To get the missing pages: registry sync, or registry sync --files DIR from a station that has them",
         )
     if verified.verdict == "unproven":
         raise unproven(verified.uuid, failed[_SESSION].why)

@@ -28,6 +28,7 @@ from teds_provision.protocol.messages.frames import Reason, update_teds, write_t
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.commands import POWER, PowerFlag, PowerReply
 from teds_provision.station.station import Station
+from teds_provision.steps.build import profile_files_digest
 from teds_provision.steps.readings import is_known, keep, keep_read
 from teds_provision.steps.sign import known_image, node_keys_of, sign
 from teds_provision.steps.teds_read import NodeSnapshot, read_block, read_identity, read_image
@@ -126,7 +127,7 @@ def _tell_written(station: Station, image: Image, known: NodeRecord, sequence: i
             sequence=sequence,
             teds_sha256=hashlib.sha256(octets).hexdigest(),
             profile=PurePath(known.profile).name if known.profile else None,  # of a file its name, not its path
-            profile_sha256=known.profile_digest if known.profile_digest and len(known.profile_digest) == 64 else None,
+            profile_sha256=profile_files_digest(station, known),
             due=known.due,
         )
 

@@ -8,12 +8,11 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from teds_provision.plant.jobs import digest_of_file
 from teds_provision.protocol.plant.job import CalibrationRule, Job, seal_job
 from teds_provision.protocol.plant.roster import Member, Roster, open_roster, seal_roster
 from teds_provision.station.station import Station
 from teds_provision.store.tables.plant import PlantRecord, RosterRow
-from teds_provision.teds.profile.load import find_profile
+from teds_provision.teds.profile.load import default_folders, files_digest, find_profile
 from teds_provision.vault.base import Vault
 from tests.bench import make_station
 
@@ -69,7 +68,7 @@ def job_of(keeper: Station, **changes: Any) -> bytes:
         REGISTRY,
         "three angles",
         ANGLE,
-        digest_of_file(find_profile(ANGLE)),
+        files_digest(find_profile(ANGLE), default_folders()),
         CalibrationRule(),
         3,
         {},

@@ -141,7 +141,14 @@ class Reader:
         )
         counted = {station: counts.newest[0] for station, counts in self.counting.items()}
         words = self.words.get(digest, [])
-        return signing(self.roster, signer, words, counted=counted, keepers_behind=behind, added=False)
+        return signing(
+            self.roster,
+            signer,
+            words,
+            counted=counted,
+            keepers_behind="a page is missing" if behind else "",
+            added=False,
+        )
 
     def counted(self, station: str) -> int:
         return self.counting[station].newest[0] if station in self.counting else 0

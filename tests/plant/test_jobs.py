@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -40,7 +41,7 @@ from teds_provision.steps.build import BuildOrder, PreparedOrder, prepare
 from teds_provision.steps.provision import ProvisionResult, provision, verify_only
 from teds_provision.store.tables.parcels import ParcelRow
 from teds_provision.talk.progress import SilentReporter
-from teds_provision.teds.profile.load import find_profile
+from teds_provision.teds.profile.load import files_digest, find_profile, shipped_profiles
 from tests.bench import Board, MemoryLink, make_station, talk
 
 from .owner import ALL, ANGLE, NOW, alone, job_of, join, member, roster_of
@@ -264,13 +265,37 @@ def test_a_profile_that_is_edited_beside_a_job_makes_no_board_of_it(tmp_path: Pa
     for built_board in boards:
         (tmp_path / f"{built_board.uuid.hex()}.csv").write_text(f"# date: {NOW:%Y-%m-%d}\n{TABLE}")
     any_date = CalibrationRule("any", max_age_days=30)
-    line = line_of(owner, tmp_path, calibration=any_date, profile_sha256=digest_of_file(own))
+    line = line_of(
+        owner, tmp_path, calibration=any_date, profile_sha256=files_digest(own, [own.parent, shipped_profiles()])
+    )
     build(line, boards[0])
-    own.write_text(own.read_text() + "\n# edited\n")
-    with pytest.raises(PolicyError, match="not the one in the job"):
-        build(line, boards[1])
+    base = own.with_name("smart-sensor.toml")
+    for edited, text in ((base, find_profile("smart-sensor").read_text()), (own, own.read_text())):
+        edited.write_text(text + "\n# edited\n")
+        with pytest.raises(PolicyError, match="not the one in the job"):
+            build(line, boards[1])
+        edited.write_text(text)
+    build(line, boards[0])
     assert len(units(line)) == 1
     assert boards[1].state.state == NodeState.FACTORY
+
+
+def test_a_job_of_an_earlier_version_that_names_the_file_alone_is_refused_by_name(owner: Station) -> None:
+    with pytest.raises(PolicyError, match="without the profiles that it extends"):
+        line_of(owner, profile_sha256=digest_of_file(find_profile(ANGLE)))
+
+
+def test_the_event_and_the_evidence_of_a_board_name_the_jobs_profile_by_the_same_digest(owner: Station) -> None:
+    line, one = line_of(owner), board(1)
+    build(line, one)
+    assert line.job is not None
+    files = [find_profile(name).read_bytes() for name in ("smart-sensor", ANGLE)]
+    framed = b"".join(len(octets).to_bytes(4, "big") + octets for octets in files)
+    assert line.job.profile_sha256 == hashlib.sha256(framed).hexdigest()
+    events = [json.loads(text) for _, _, text in owner.plant.tables.outbox(100)]
+    assert [event["profile_sha256"] for event in events if event["act"] == "written"] == [line.job.profile_sha256]
+    (row,) = owner.plant.line.evidence(uuid=one.uuid)
+    assert codec.read(row.document).facts.profile_sha256 == line.job.profile_sha256
 
 
 def test_a_calibration_of_last_year_is_too_old_for_a_job_that_says_so(tmp_path: Path, owner: Station) -> None:

@@ -10,7 +10,7 @@ import pytest
 from psycopg import errors
 
 from teds_provision.plant.postgres import Registry, parameters
-from teds_provision.plant.schema import close_sql, member_sql, registry_sql
+from teds_provision.plant.schema import close_sql, member_sql, mend_sql, registry_sql
 from teds_provision.plant.scram import verifier
 from tests.plant.postgres import Cluster, Database, Login
 
@@ -46,6 +46,64 @@ def test_no_member_takes_any_of_the_advisory_locks(thief: Login) -> None:
                 connection.execute(f"select {call}")
         with pytest.raises(errors.InsufficientPrivilege):
             connection.execute("select count(pg_try_advisory_lock(g)) from generate_series(1, 200000) g")
+
+
+@pytest.mark.parametrize(
+    "attempt",
+    [
+        "do $$ begin for i in 1..1000000 loop execute 'notify teds'; end loop; end $$",
+        "select pg_export_snapshot() from generate_series(1, 1000000)",
+        "select pg_logical_emit_message(false, 'x', repeat('x', 1000000)) from generate_series(1, 1000)",
+    ],
+    ids=["loop", "snapshot files", "messages in the WAL"],
+)
+def test_no_member_fills_queue_or_disk_by_what_every_login_may_do_by_default(thief: Login, attempt: str) -> None:
+    with thief.connect() as connection, pytest.raises(errors.InsufficientPrivilege):
+        connection.execute(attempt)
+
+
+def test_while_notifications_pile_up_the_next_member_ends_younger_transactions_too(thief: Login) -> None:
+    """A session that listens, in a transaction, keeps the queue that all databases share from being emptied."""
+    database, limit = thief.database, "usage() > 0.1 and a.xact_start < clock_timestamp() - interval '10"
+    with thief.connect() as connection, database.member().connect() as member:
+        connection.execute("listen teds")
+        connection.execute("begin; select 1")
+        for now, ends in ((limit.replace("'10", "'0"), 0), (limit.replace("> 0.1", ">= 0").replace("'10", "'0"), 1)):
+            with stricter(database, limit, now):
+                assert member.execute("select registry.sweep()").fetchone() == (ends,)
+        assert ended(connection)
+
+
+SENDING = "select registry.send(gen_random_uuid(), %s, decode(repeat('00', %s), 'hex'), now() + interval '1 day')"
+
+
+def test_two_sessions_of_one_login_share_the_limit_of_what_waits(thief: Login) -> None:
+    """Each counted what the other had not committed yet: six connections sent six times the limit."""
+    values = bytes.fromhex(thief.fingerprint), 60 << 20
+    with thief.connect() as first, thief.connect() as second:
+        for _ in range(3):
+            first.execute(SENDING, values)
+        first.execute("begin")
+        first.execute(SENDING, values)
+        second.execute("set lock_timeout = '300ms'")
+        with pytest.raises(errors.LockNotAvailable):
+            second.execute(SENDING, values)
+        first.execute("commit")
+        with pytest.raises(psycopg.Error, match="too much waits"):
+            second.execute(SENDING, values)
+        second.execute("delete from registry.parcel")
+
+
+def test_a_parcel_without_content_counts_for_16_kib(thief: Login) -> None:
+    thief.database.sql(
+        "insert into registry.parcel(id, recipient, sender, document, expires) select gen_random_uuid(), station,"
+        " station, '', now() + interval '1 day' from registry.member, generate_series(1, 16384)"
+        f" where role = '{thief.role}'"
+    )
+    with thief.connect() as connection:
+        with pytest.raises(psycopg.Error, match="too much waits"):
+            connection.execute(SENDING, (bytes.fromhex(thief.fingerprint), 0))
+        connection.execute("delete from registry.parcel")
 
 
 def test_a_member_does_not_lift_the_limit_of_its_temporary_files(thief: Login) -> None:
@@ -151,14 +209,37 @@ def test_an_idle_transaction_of_a_member_does_not_stop_its_closing(lasting: tupl
         login.connect()
 
 
+def test_an_idle_transaction_of_a_member_stops_neither_mending_nor_its_new_password(
+    lasting: tuple[Database, Login],
+) -> None:
+    database, login = lasting
+    database.sql(mend_sql(login.fingerprint, 1))
+    with login.connect() as connection:
+        connection.execute("set idle_in_transaction_session_timeout = 0")
+        connection.execute("begin; alter role current_user set work_mem = '1MB'; select registry.post_roster(1, 'x')")
+        login.secret = bytes(32)
+        database.sql(member_sql(login.fingerprint, verifier(login.secret)))
+        assert ended(connection)
+    with login.connect() as connection:
+        assert connection.execute("select count(*) from registry.meta").fetchone() == (1,)
+
+
 def test_the_schema_run_again_brings_the_limits_to_logins_that_were_made_before(cluster: Cluster) -> None:
     database = Database.new(cluster)
     login = database.member()
     database.sql(f"alter role {login.role} reset all; alter role {login.role} connection limit 4")
-    database.sql("grant execute on function pg_try_advisory_lock(bigint) to public")
+    database.sql(
+        "grant execute on function pg_try_advisory_lock(bigint) to public; grant usage on language plpgsql to public;"
+        "grant execute on function pg_export_snapshot() to public"
+    )
     told = parameters(database.url, login.fingerprint, login.secret)
     registry = Registry(told)
-    assert registry.open_doors() == ["advisory locks", "temporary files without limit"]
+    assert registry.open_doors() == [
+        "procedural blocks",
+        "snapshot files or messages in the WAL",
+        "advisory locks",
+        "temporary files without limit",
+    ]
     registry.close()
     database.sql(registry_sql(database.registry))
     assert registry.open_doors() == []

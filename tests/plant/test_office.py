@@ -19,7 +19,7 @@ from teds_provision.plant import jobs, office, parcels
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
-from teds_provision.plant.office import MOST_ANSWERS, answer
+from teds_provision.plant.office import MOST_ANSWERS, RequestAheadError, answer
 from teds_provision.plant.sign_requests import OfficeRefusedError, OfficeSilentError, RemoteOffice, send
 from teds_provision.plant.yield_stats import attempts_of, yield_stats
 from teds_provision.protocol.keys import SoftwareKey, node_key_message, prove_message
@@ -355,6 +355,17 @@ def test_the_line_takes_no_word_but_the_offices(desk: Desk) -> None:
     assert build(run, one).verified.verdict == "authentic"
 
 
+def test_a_board_that_waits_for_the_office_has_a_draft_until_its_datasheet_is_written(desk: Desk) -> None:
+    run, one = desk.run(), board(1)
+    request = desk.request(run, one)
+    waiting = desk.line.nodes.draft(one.uuid)
+    assert waiting is not None
+    assert (waiting.stage, waiting.profile) == ("built", ANGLE)
+    assert waiting.image.unsigned_blocks() == request.image.unsigned_blocks()
+    assert build(run, one).verified.verdict == "authentic"
+    assert desk.line.nodes.draft(one.uuid) is None
+
+
 def test_another_members_answer_neither_ends_the_waiting_nor_hides_the_offices(desk: Desk) -> None:
     east = desk.plant.member("east", "audit")
     desk.plant.round()
@@ -438,7 +449,8 @@ def test_the_known_request_and_answer_are_read(desk: Desk) -> None:
 def test_a_request_from_the_future_waits(desk: Desk) -> None:
     request = desk.request(desk.run(), board(1))
     late = replace(request, created=NOW + timedelta(hours=25))
-    assert answer(desk.office, seal_request(late, desk.line.credentials().key)) is None
+    with pytest.raises(RequestAheadError, match=r"dated this request 20\d\d-.*, and it is 20"):
+        answer(desk.office, seal_request(late, desk.line.credentials().key))
 
 
 def test_a_request_that_waited_a_day_is_judged_by_the_job_of_that_day(

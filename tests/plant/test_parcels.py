@@ -311,6 +311,24 @@ def test_junk_and_what_is_for_others_is_thrown_away_and_told(plant: Plant) -> No
     assert [alarm.code for alarm in station.plant.tables.alarms()] == ["parcel"]
 
 
+@pytest.mark.parametrize("course", ["stolen", "expired"])
+def test_what_comes_from_a_removed_station_or_too_late_is_thrown_away_without_an_alarm(
+    plant: Plant, course: str
+) -> None:
+    plant.roster(ROLES, everything(plant, "south"))
+    board = board_of(plant["west"], os.urandom(10))
+    sync(plant, "west")
+    if course == "stolen":
+        plant.roster({"north": "keeper", "south": "base"}, everything(plant, "south"), removed={"west": (0, "")})
+    sync(plant, "south", at=now(8 if course == "expired" else 0))
+    assert plant.post.there == {}
+    assert plant["south"].plant.tables.alarms() == []
+    assert not plant["south"].keys.held(board.uuid)
+    assert [entry.outcome for entry in plant["south"].audit_log.entries() if entry.act == "import"] == [
+        "parcel discarded"
+    ]
+
+
 def test_the_same_parcel_again_gives_the_same_receipt(plant: Plant) -> None:
     plant.roster(ROLES, everything(plant, "south"))
     board = board_of(plant["west"], os.urandom(10))

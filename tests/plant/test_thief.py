@@ -282,9 +282,8 @@ def test_what_others_ask_is_not_seen(thief: Connection, hall: Hall) -> None:
 
 
 def test_what_is_allowed_hurts_nobody(own: Connection, hall: Hall) -> None:
-    """A DO block, NOTIFY, a lock on a table, time-outs of his own: the victim works on."""
+    """NOTIFY, a lock on a table, time-outs of his own: the victim works on."""
     with own.transaction(force_rollback=True), hall.victim.connect() as victim:
-        own.execute("do $$ begin perform 1; end $$")
         own.execute("notify teds, 'x'")
         own.execute("set local statement_timeout = 0")
         own.execute("lock table registry.page in access share mode")

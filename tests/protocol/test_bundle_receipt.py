@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,7 @@ from teds_provision.errors import BadDataError, NotAuthenticError
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, open_receipt, seal_receipt
 from teds_provision.protocol.handover.revocation import open_revocation, seal_revocation
-from teds_provision.protocol.handover.strict_json import dump, load_object
+from teds_provision.protocol.handover.strict_json import decode_base64url, dump, load_object
 from teds_provision.protocol.keys import fingerprint
 from tests.protocol.handover_parts import NODE_KEY, NOW, RECEIVER, SENDER, STRANGER, trusts
 
@@ -95,3 +96,15 @@ def test_the_reason_is_short_printable_text(why):
         return
     with pytest.raises(BadDataError, match="printable"):
         seal_revocation(SENDER, uuid=bytes(10), node=None, why=why, created=NOW)
+
+
+def test_a_revocation_has_the_members_of_the_contract_and_an_older_one_stays_readable() -> None:
+    """plant.md names ``reason``; versions before it wrote ``why``, and read nothing else."""
+    made = seal_revocation(SENDER, uuid=bytes(10), node=None, why="lost on the ferry", created=NOW)
+    members = json.loads(decode_base64url(made.statement.split(".")[1], "The payload"))
+    assert list(members) == ["format", "uuid", "fingerprint", "from", "reason", "created", "why"]
+    assert members["reason"] == members["why"] == made.why
+    for left_out in ("reason", "why"):
+        kept = {name: value for name, value in members.items() if name != left_out}
+        statement = jose.sign_compact(json.dumps(kept).encode(), SENDER, typ="teds-revocation+jws").decode()
+        assert open_revocation(statement, trusts(SENDER)).why == "lost on the ferry"

@@ -1,9 +1,10 @@
 """A signed statement that a node is no longer trusted; every bundle carries those of its sender (member ``revoked``).
 
-Compact JWS (ES256, ``kid`` the signer's fingerprint), ``typ`` ``teds-revocation+jws``, payload ``{"format":
-"teds-revocation/1", "uuid", "fingerprint", "why", "created", "from"}``; ``fingerprint`` is that of the node's key, null
-if it is not known. Section 6 of the profile does not list it: other readers ignore it, and a bundle without it is as
-good.
+Compact JWS (ES256, ``kid`` the signer's fingerprint), ``typ`` ``teds-revocation+jws``, payload
+``{"format": "teds-revocation/1", "uuid", "fingerprint", "from", "reason", "created", "why"}``; ``fingerprint`` is that
+of the node's key, null if it is not known. ``why`` repeats ``reason`` for earlier versions, whose statements have no
+``reason``; they stay readable (compatibility.md). Section 6 of the profile does not list it: other readers ignore it,
+and a bundle without it is as good.
 """
 
 from __future__ import annotations
@@ -44,9 +45,10 @@ def seal_revocation(signer: PrivateKey, *, uuid: bytes, node: str | None, why: s
         "format": FORMAT,
         "uuid": uuid.hex(),
         "fingerprint": node,
-        "why": why,
-        "created": time_text(created),
         "from": sender,
+        "reason": why,
+        "created": time_text(created),
+        "why": why,
     }
     statement = jose.sign_compact(dump(members), signer, typ=TYPE).decode()
     return open_revocation(statement, lambda kid: signer.point if kid == sender else None)
@@ -68,7 +70,7 @@ def open_revocation(statement: str, trusted: Callable[[str], bytes | None]) -> R
     return Revocation(
         members.uuid("uuid"),
         members.sha256_or_none("fingerprint"),
-        members.text("why"),
+        members.text("why" if members.get("reason") is None else "reason"),
         members.time("created"),
         sender,
         statement,

@@ -42,14 +42,14 @@ def signing(
     words: Collection[SignatureClaim],
     *,
     counted: Mapping[str, int],
-    keepers_behind: bool,
+    keepers_behind: str,
     added: bool,
 ) -> SignerVerdict:
     """Judge the signer (fingerprint) of one datasheet.
 
     ``words`` are those about its digest, of pages that count; ``counted``: how many pages of each chain count here;
-    ``keepers_behind``: a member has seen pages of a keeper that are not here; ``added``: a person trusts the signer's
-    key here.
+    ``keepers_behind``: which member reports which page of a keeper that is not here, "" if none does; ``added``: a
+    person trusts the signer's key here.
     """
     one = roster.by_key.get(signer)
     own = [word.number for word in words if word.station == signer and not word.vouched]
@@ -65,9 +65,10 @@ def signing(
     if limit is not None and any(n <= limit[0] for n in own):
         return SignerVerdict("passed", f"signed by {one.name} while it had the role")
     if limit is not None and counted.get(signer, 0) < limit[0]:
-        return SignerVerdict("unproven", f"pages of {one.name} are missing here")
+        here = counted.get(signer, 0)
+        return SignerVerdict("unproven", f"the roster names page {limit[0]} of {one.name}; the last one here is {here}")
     if isinstance(one, RemovedMember) and keepers_behind:
-        return SignerVerdict("unproven", "pages of a keeper are missing here")
+        return SignerVerdict("unproven", keepers_behind)
     why = "never had the role sign" if limit is None else "this datasheet is not in its pages of that time"
     return SignerVerdict(
         "failed", f"{one.name} {'was removed' if isinstance(one, RemovedMember) else 'may not sign'}: {why}"

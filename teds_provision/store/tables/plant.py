@@ -119,7 +119,7 @@ class PlantTables:
                 "conflicts", "to_judge", "pages", "chains", "parcels", "shared",
             ):  # fmt: skip
                 self._database.execute(f"DELETE FROM {table}")
-            self._database.execute("DELETE FROM meta WHERE name = 'plant-returned'")
+            self._database.execute("DELETE FROM meta WHERE name IN ('plant-returned', 'plant-seen-heads')")
 
     def returned_state(self) -> str:
         """Return the digest of what the database and this store had of stations that left, at the last comparison."""
@@ -154,10 +154,18 @@ class PlantTables:
         """Return every alarm, oldest first."""
         return self._database.read(_alarm, f"SELECT {_ALARM} FROM alarms ORDER BY at, code, about, n")
 
-    def put_alarm(self, alarm: Alarm) -> bool:
-        """Keep an alarm; False if it exists already (it keeps its time, and stays seen)."""
+    def put_alarm(self, alarm: Alarm, *, again: bool = False) -> bool:
+        """Keep an alarm; False if it exists already (it keeps its time, and stays seen).
+
+        ``again``: this is one more occurrence, and no state that lasts, so one that was seen is raised again.
+        """
         values = (alarm.code, alarm.about, alarm.n, alarm.why, alarm.at, int(alarm.seen))
-        return self._database.change(f"INSERT OR IGNORE INTO alarms({_ALARM}) VALUES({places(values)})", values) > 0
+        with self._database.together():
+            if again:
+                self._database.execute(
+                    "DELETE FROM alarms WHERE code = ? AND about = ? AND n = ? AND seen = 1", values[:3]
+                )
+            return self._database.change(f"INSERT OR IGNORE INTO alarms({_ALARM}) VALUES({places(values)})", values) > 0
 
     def end_alarm(self, alarm: Alarm) -> None:
         """Take one alarm away whose cause is gone."""
@@ -176,6 +184,16 @@ class PlantTables:
     def see_alarms(self) -> int:
         """Note that a person knows of every alarm; returns of how many he did not."""
         return self._database.change("UPDATE alarms SET seen = 1 WHERE seen = 0", ())
+
+    def seen_heads(self) -> set[tuple[str, str, int, str]]:
+        """Return the heads (see :meth:`heads`) that a person has acknowledged."""
+        row = self._database.one("SELECT value FROM meta WHERE name = 'plant-seen-heads'")
+        return {(who, about, n, hash) for who, about, n, hash in json.loads(row[0])} if row is not None else set()
+
+    def see_heads(self, heads: Iterable[tuple[str, str, int, str]]) -> None:
+        """Note the heads that a person knows of, in place of those before."""
+        value = json.dumps(sorted(heads), separators=(",", ":"))
+        self._database.execute("INSERT OR REPLACE INTO meta VALUES('plant-seen-heads', ?)", (value,))
 
     def login(self) -> tuple[bytes, bytes] | None:
         """Return the wrapped secret of this station's login and the request that was made with it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -10,7 +11,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.errors import BadDataError, NotFoundError
+from teds_provision.errors import BadDataError, NotFoundError, StoreError
+from teds_provision.files import read_limited
+from teds_provision.limits import LIMITS
 from teds_provision.teds.calibration.model import METHODS
 from teds_provision.teds.profile.interpret import TEXT_CLASSES, interpret
 from teds_provision.teds.profile.keys import (
@@ -177,18 +180,45 @@ def _laid_over(
     table: TomlTable, path: Path, folders: Sequence[Path], chain: tuple[Path, ...]
 ) -> tuple[TomlTable, tuple[str, ...]]:
     """Return the same of a parsed table; ``chain`` are the files so far, its own included."""
+    base = _extended(table, path, folders, chain)
+    if base is None:
+        return table, (path.stem,)
+    below, lineage = _merged(base, folders, chain)
+    inherited = {key: value for key, value in below.entries.items() if key not in ("abstract", "extends")}
+    return TomlTable(inherited, below.where).merged(table), (path.stem, *lineage)
+
+
+def _extended(table: TomlTable, path: Path, folders: Sequence[Path], chain: Sequence[Path]) -> Path | None:
+    """Return the file of the profile that this one extends, None if it extends none; raises BadDataError."""
     entry = table.entries.get("extends")
     if entry is None:
-        return table, (path.stem,)
+        return None
     where = entry.where
     if isinstance(entry, TomlTable) or not isinstance(entry.value, str):
         raise BadDataError(f'{where}: extends: the name of one profile is expected, like extends = "smart-sensor".')
     base = _base(entry.value, where, path, folders, chain)
     if len(chain) > MAXIMUM_DEPTH:
         raise BadDataError(f"{where}: extends: more than {MAXIMUM_DEPTH} profiles extend each other.")
-    below, lineage = _merged(base, folders, chain)
-    inherited = {key: value for key, value in below.entries.items() if key not in ("abstract", "extends")}
-    return TomlTable(inherited, below.where).merged(table), (path.stem, *lineage)
+    return base
+
+
+def files_digest(path: Path, folders: Sequence[Path]) -> str:
+    """Return the SHA-256 (hex) of the files that a profile is made of.
+
+    Of one file its own; of one that extends others, over the files from the outermost base to the file itself, each
+    preceded by its length as u32 (contract/plant.md section 9). Raises NotFoundError, BadDataError.
+    """
+    chain: tuple[Path, ...] = ()
+    octets: list[bytes] = []
+    following: Path | None = path
+    while following is not None:
+        chain = (*chain, following.resolve())
+        octets.append(read_limited(following, LIMITS.text_file, "profile", failure=StoreError))
+        following = _extended(parse(read_text(following), str(following)), following, folders, chain)
+    if len(octets) == 1:
+        return hashlib.sha256(octets[0]).hexdigest()
+    framed = (len(one).to_bytes(4, "big") + one for one in reversed(octets))
+    return hashlib.sha256(b"".join(framed)).hexdigest()
 
 
 def _base(name: str, where: SourcePlace, path: Path, folders: Sequence[Path], chain: Sequence[Path]) -> Path:
