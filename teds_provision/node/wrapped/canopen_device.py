@@ -6,6 +6,7 @@ Channels are the objects that can be mapped into a PDO and only read: what a sen
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -40,6 +41,7 @@ def load(path: Path, node_id: int = 1) -> tuple[bytes, ObjectDictionary]:
         import canopen
     except ImportError as error:
         raise NotFoundError("An EDS file needs the package canopen.", hint=how_to_install("bench")) from error
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # its lines are our reasons
     try:
         objects = canopen.import_od(str(path), node_id=node_id)
     except Exception as error:  # the parser raises configparser's errors, ValueError, KeyError and its own

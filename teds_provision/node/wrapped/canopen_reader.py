@@ -144,7 +144,6 @@ class CanopenReader:
         """Open the bus and read; raises NoReaderError or UsageError."""
         import canopen
 
-        logging.getLogger("canopen").setLevel(logging.CRITICAL)  # its lines are our reasons
         self._network = canopen.Network(open_bus(self._spec))
         self._network.connect()
         for device in self._devices:

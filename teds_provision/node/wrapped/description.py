@@ -30,7 +30,8 @@ PERIODS_LATE: Final = 3
 MOST_CHANNELS: Final = 255
 _EXACT_BITS: Final = 24
 _MOST_BITS: Final = 64
-_LARGEST: Final = 3.4e38
+_LARGEST: Final = 1e30
+"""Limit of a float that states none: its limits in SI units still fit a Float32."""
 _MOST_TABLE: Final = 64
 """Rows of a value table that are put into the datasheet."""
 _NAME_OCTETS: Final = 120
@@ -310,7 +311,7 @@ class WrappedSensor:
 
 def _channel_lines(number: int, channel: WrappedChannel) -> list[str]:
     form, (low, high) = channel.sample, channel.limits
-    step = abs(channel.scale) if not channel.is_float else max(abs(low), abs(high)) * 1e-7 if abs(high) < 1e30 else 1e-7
+    step = abs(channel.scale) if not channel.is_float else max(abs(low), abs(high)) * 1e-7 if abs(high) < _LARGEST else 1e-7
     lines = [
         "",
         f"[channel.{number}]",

@@ -1,0 +1,352 @@
+"""Wrapped CANopen and IIO devices.
+
+The CANopen device is python-canopen's own LocalNode in another process. The IIO devices are FIXTURES: folders that look
+like sysfs, and a FIFO in place of the character device, as this machine has no such hardware.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.errors import BadDataError, NotFoundError, UsageError
+from teds_provision.links.can.spec import parse_spec
+from teds_provision.node.wrapped import canopen_device, iio_device
+from teds_provision.node.wrapped.canopen_reader import CanopenReader, DeviceReader
+from teds_provision.node.wrapped.iio_device import ScanElement
+from teds_provision.node.wrapped.iio_reader import IioReader, layout, raw_of
+from teds_provision.node.wrapped.latest_values import LatestValues
+from teds_provision.node.wrapped.reading import describe
+from teds_provision.node.wrapped.running import SensorPlace, WrappedRun, require_match
+from teds_provision.teds.image import Image
+from teds_provision.teds.sheet import Sheet
+from tests.e2e.desk import ROOT
+from tests.pace import until
+from tests.places import free_bus
+
+EDS = ROOT / "examples" / "bench" / "cell.eds"
+UUID = bytes(range(10))
+
+
+def shown(values: LatestValues) -> float | str:
+    """The value now in the channel's unit, or why there is none."""
+    reading, why = values.at(time.monotonic())
+    if why or reading is None or reading.raw is None:
+        return why
+    form, channel = values.channel.sample, values.channel
+    return channel.value(reading.raw - form.shift) if form.raw else channel.written.from_si(reading.raw)
+
+
+# -- CANopen -----------------------------------------------------------------------------------------------------------
+
+
+class Device:
+    """A CANopen torque cell in a process of its own."""
+
+    def __init__(self, bus: str) -> None:
+        group, port = bus.removeprefix("udp_multicast:").split("?port=")
+        words = [sys.executable, str(Path(__file__).parent / "canopen_player.py"), group, port, str(EDS), "5"]
+        self.process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.answer()
+
+    def answer(self) -> Any:
+        assert self.process.stdout is not None
+        return json.loads(self.process.stdout.readline())
+
+    def tell(self, **what: object) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps(what) + "\n")
+        self.process.stdin.flush()
+        self.answer()
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@pytest.fixture
+def bus() -> str:
+    return free_bus()
+
+
+@pytest.fixture
+def device(bus: str) -> Iterator[Device]:
+    made = Device(bus)
+    yield made
+    made.close()
+
+
+def test_an_eds_gives_channels_with_range_factor_and_period() -> None:
+    sensor = describe(f"eds:{EDS}")
+    torque, temperature = sensor.channels
+    assert (torque.name, torque.unit, torque.scale, torque.limits, torque.period) == (
+        "torque",
+        "N·m",
+        0.1,
+        (-200, 200),
+        0.5,
+    )
+    assert torque.sample.raw
+    assert (temperature.name, temperature.unit, temperature.is_float, temperature.period) == (
+        "temperature",
+        "degC",
+        True,
+        0.1,
+    )
+    assert "no event timer" in temperature.note
+    assert (sensor.origin.kind, sensor.origin.name) == ("eds", "Torque cell")
+    assert not Sheet.from_image(Image(UUID, sensor.blocks(UUID))).errors
+
+
+@pytest.mark.link
+def test_pdos_are_mapped_as_the_device_says_and_the_rest_is_asked_for(bus: str, device: Device) -> None:
+    told: list[str] = []
+    reader = DeviceReader(EDS, 5, told.append)
+    torque, temperature = reader.values
+    running = CanopenReader(parse_spec(bus), [reader], told.append)
+    running.start()
+    try:
+        device.tell(torque=1234, temperature=36.5)
+        until(lambda: shown(torque) == pytest.approx(123.4))
+        until(lambda: shown(temperature) == pytest.approx(36.5))
+        device.tell(torque=-2001)
+        until(lambda: shown(torque) == "-200.1 N·m is outside -200 to 200 N·m")
+        device.tell(silent=True)
+        until(lambda: shown(torque) == "no PDO for 1500 ms, 3 periods of 500 ms")
+        assert shown(temperature) == pytest.approx(36.5)
+        assert told == []
+    finally:
+        running.stop()
+
+
+@pytest.mark.link
+def test_a_device_that_is_not_there_is_looked_for_until_it_comes(bus: str) -> None:
+    told: list[str] = []
+    reader = DeviceReader(EDS, 5, told.append)
+    running = CanopenReader(parse_spec(bus), [reader], told.append)
+    running.start()
+    try:
+        until(lambda: bool(told))
+        assert told[0].startswith("CANopen device 5: its PDO mapping cannot be read")
+        assert "cannot be read" in str(shown(reader.values[0]))
+        late = Device(bus)
+        try:
+            late.tell(torque=10)
+            until(lambda: shown(reader.values[0]) == pytest.approx(1.0))
+        finally:
+            late.close()
+    finally:
+        running.stop()
+
+
+def test_options_of_a_canopen_run(bus: str) -> None:
+    origin = describe(f"eds:{EDS}").origin
+    require_match(SensorPlace(f"canopen:{EDS}", bus, (5, 6)), [origin, origin], ["a", "b"])
+    for node_ids in ((), (5,)):
+        with pytest.raises(UsageError, match="--node-id"):
+            require_match(SensorPlace(f"canopen:{EDS}", bus, node_ids), [origin, origin], ["a", "b"])
+
+
+@given(st.binary(max_size=300), st.integers(0, 60))
+def test_an_eds_ends_in_a_description_or_in_an_error_of_ours(
+    tmp_path_factory: pytest.TempPathFactory, octets: bytes, share: int
+) -> None:
+    path = tmp_path_factory.mktemp("eds") / "any.eds"
+    known = EDS.read_bytes()
+    path.write_bytes(known[: len(known) * share // 60] + octets)
+    with suppress(BadDataError):
+        canopen_device.read(path).blocks(UUID)
+
+
+# -- IIO: fixtures -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def sysfs(tmp_path: Path) -> Callable[..., Path]:
+    """FIXTURE: a folder that looks like an IIO device in sysfs, under a root of its own."""
+
+    def make(device: str = "iio:device0", /, **files: str) -> Path:
+        folder = tmp_path / "sys" / "bus" / "iio" / "devices" / device
+        for file, text in files.items():
+            path = folder / file.replace("__", "/")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text + "\n")
+        (tmp_path / "dev").mkdir(exist_ok=True)
+        return folder
+
+    return make
+
+
+PRESSURE = {
+    "name": "bmp280",
+    "in_pressure_input": "101.325",
+    "in_temp_input": "23500",
+    "in_voltage0_raw": "512",
+    "in_voltage_scale": "3.222656250",
+    "in_voltage0_offset": "-12",
+    "sampling_frequency": "20.0",
+}
+
+
+def test_iio_channels_have_scale_offset_unit_and_frequency(sysfs: Callable[..., Path], tmp_path: Path) -> None:
+    sysfs(**PRESSURE)
+    for text in (
+        f"iio:device0?root={tmp_path}",
+        f"bmp280?root={tmp_path}",
+        str(tmp_path / "sys/bus/iio/devices/iio:device0"),
+    ):
+        sensor = describe(f"iio:{text}")
+        assert (sensor.origin.kind, sensor.origin.name, sensor.origin.sha256) == ("iio", "bmp280", "")
+        assert {c.name: (c.unit, c.period) for c in sensor.channels} == {
+            "pressure": ("kPa", 0.05),
+            "temp": ("degC", 0.05),
+            "voltage0": ("mV", 0.05),
+        }
+    assert not Sheet.from_image(Image(UUID, sensor.blocks(UUID))).errors
+
+
+def test_iio_files_are_read_one_by_one_and_one_that_fails_says_why(sysfs: Callable[..., Path], tmp_path: Path) -> None:
+    folder = sysfs(**PRESSURE)
+    run = WrappedRun(
+        SensorPlace(f"iio:bmp280?root={tmp_path}"),
+        [describe(f"iio:bmp280?root={tmp_path}").origin],
+        lambda _: lambda *_: None,
+        print,
+    )
+    reader = run._reader
+    assert isinstance(reader, IioReader)
+    by_name = {part.channel.name: part for part in reader.values}
+    run.start()
+    try:
+        until(lambda: shown(by_name["voltage0"]) == pytest.approx((512 - 12) * 3.22265625))
+        until(lambda: shown(by_name["temp"]) == pytest.approx(23.5))
+        until(lambda: shown(by_name["pressure"]) == pytest.approx(101.325))
+        (folder / "in_temp_input").write_text("warm\n")
+        until(lambda: "in_temp_input cannot be read: it holds no number" in str(shown(by_name["temp"])))
+        until(lambda: shown(by_name["pressure"]) == pytest.approx(101.325))
+    finally:
+        run.stop()
+
+
+ACCELEROMETER = {
+    "name": "adxl355",
+    "in_accel_x_raw": "0",
+    "in_accel_z_raw": "0",
+    "in_accel_scale": "0.000038245",
+    "sampling_frequency": "5",
+    "scan_elements__in_accel_x_en": "0",
+    "scan_elements__in_accel_x_index": "0",
+    "scan_elements__in_accel_x_type": "be:s20/32>>12",
+    "scan_elements__in_accel_z_en": "0",
+    "scan_elements__in_accel_z_index": "2",
+    "scan_elements__in_accel_z_type": "le:s16/16>>0",
+    "buffer__enable": "0",
+    "buffer__length": "2",
+}
+
+
+def test_iio_scans_come_from_the_buffer(sysfs: Callable[..., Path], tmp_path: Path) -> None:
+    folder = sysfs(**ACCELEROMETER)
+    fifo = tmp_path / "dev" / "iio:device0"
+    os.mkfifo(fifo)
+    reader = IioReader(iio_device.find(f"adxl355?root={tmp_path}"), print)
+    x, z = reader.values
+    stop = threading.Event()
+
+    def write() -> None:
+        with fifo.open("wb", buffering=0) as out:
+            while not stop.wait(0.05):
+                out.write((-1000 << 12 & 0xFFFFFFFF).to_bytes(4, "big") + struct.pack("<h2x", 500))
+
+    reader.start()
+    try:
+        assert (folder / "buffer" / "enable").read_text() == "1"
+        assert (folder / "scan_elements" / "in_accel_z_en").read_text() == "1"
+        writer = threading.Thread(target=write)
+        writer.start()
+        until(lambda: shown(x) == pytest.approx(-1000 * 0.000038245))
+        until(lambda: shown(z) == pytest.approx(500 * 0.000038245))
+        stop.set()
+        writer.join()
+        until(lambda: "the buffer has ended" in str(shown(x)))
+    finally:
+        stop.set()
+        reader.stop()
+    assert (folder / "buffer" / "enable").read_text() == "0"
+
+
+def test_a_buffer_that_may_not_be_used_is_left_alone(sysfs: Callable[..., Path], tmp_path: Path) -> None:
+    folder = sysfs(**ACCELEROMETER)
+    (tmp_path / "dev" / "iio:device0").mkdir()  # cannot be read, whoever runs this test
+    (folder / "buffer" / "length").unlink()
+    (folder / "buffer" / "length").mkdir()
+    told: list[str] = []
+    reader = IioReader(iio_device.find(f"adxl355?root={tmp_path}"), told.append)
+    (folder / "in_accel_x_raw").write_text("1000\n")
+    reader.start()
+    try:
+        until(lambda: shown(reader.values[0]) == pytest.approx(1000 * 0.000038245))
+    finally:
+        reader.stop()
+    assert "its files are read one by one" in told[0]
+    assert (folder / "scan_elements" / "in_accel_x_en").read_text() == "0"
+
+
+@given(
+    st.sampled_from(["be", "le"]),
+    st.booleans(),
+    st.sampled_from([8, 16, 32, 64]),
+    st.data(),
+)
+def test_an_element_of_a_scan_gives_back_its_number(
+    order: str, signed: bool, storage: int, data: st.DataObject
+) -> None:
+    bits = data.draw(st.integers(1, storage))
+    shift = data.draw(st.integers(0, storage - bits))
+    low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+    number = data.draw(st.integers(low, high))
+    noise = data.draw(st.integers(0, (1 << shift) - 1))
+    octets = ((number & (1 << bits) - 1) << shift | noise).to_bytes(storage // 8, "big" if order == "be" else "little")
+    assert raw_of(ScanElement(0, order, signed, bits, storage, shift), octets) == number
+
+
+def test_a_scan_is_aligned_as_the_kernel_does_it() -> None:
+    def element(storage: int) -> ScanElement:
+        return ScanElement(0, "le", True, storage, storage, 0)
+
+    assert layout([element(16), element(16), element(16), element(64)]) == ([0, 2, 4, 8], 16)
+    assert layout([element(32), element(16)]) == ([0, 4], 8)
+    assert layout([element(8)]) == ([0], 1)
+
+
+def test_iio_devices_that_cannot_be_wrapped(sysfs: Callable[..., Path], tmp_path: Path) -> None:
+    sysfs(**PRESSURE)
+    with pytest.raises(NotFoundError, match="no IIO device 'adxl'"):
+        describe(f"iio:adxl?root={tmp_path}")
+    with pytest.raises(UsageError, match="unknown key"):
+        describe(f"iio:bmp280?path={tmp_path}")
+    sysfs("iio:device1", name="empty")
+    with pytest.raises(BadDataError, match="no channels"):
+        describe(f"iio:empty?root={tmp_path}")
+    sysfs("iio:device2", name="broken", in_temp_raw="1", in_temp_scale="a lot")
+    with pytest.raises(BadDataError, match="in_temp_scale holds 'a lot'"):
+        describe(f"iio:broken?root={tmp_path}")
+    origin = describe(f"iio:bmp280?root={tmp_path}").origin
+    for place in (SensorPlace("iio:bmp280", "socketcan:can0"), SensorPlace("iio:bmp280", None, (1,))):
+        with pytest.raises(UsageError):
+            require_match(place, [origin], ["a"])
+    with pytest.raises(UsageError, match="one node only"):
+        require_match(SensorPlace("iio:bmp280"), [origin, origin], ["a", "b"])
