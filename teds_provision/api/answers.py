@@ -142,6 +142,14 @@ class Verdict(_Origin):
     by: str
 
 
+class Wrapped(TypedDict):
+    """The sensor that a node wraps; its own proof ends at the wrapper."""
+
+    kind: Literal["dbc", "eds", "iio"]
+    name: str
+    sha256: str | None
+
+
 class Node(TypedDict):
     """A node, as far as it is known."""
 
@@ -158,6 +166,7 @@ class Node(TypedDict):
     mode: NotRequired[Literal["idle", "measuring"] | None]
     whitelisted: bool
     virtual: bool
+    wrapped: Wrapped | None
     unverified: Annotated[
         bool, Meta(description="name, channels and values are what it says itself; nobody signed that")
     ]

@@ -204,6 +204,8 @@ def _cut(text: str, limit: int | None) -> str:
 
 def _remarks(node: dict[str, Any]) -> str:
     remarks = []
+    if node["wrapped"]:
+        remarks.append(f"wrapped: {node['wrapped']['name']} ({node['wrapped']['kind']})")
     if node["revoked"]:
         remarks.append(f"revoked: {node['revoked']['why']}")
     if node["moved_to"]:

@@ -64,6 +64,7 @@ def facts_of(sheet: Sheet, channel: Channel, *, name: str, fingerprint: str, per
         own_period=_if_finite(channel.period),
         calibration=channel.calibration,
         period=None if channel.kind == ChannelKind.EVENT_SENSOR else period,
+        wrapped=sheet.meta.origin.text if sheet.meta.origin is not None else "",
         vector=next((group for group in sheet.meta.vectors if channel.number in group), ()),
     )
 

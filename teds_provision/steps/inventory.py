@@ -101,6 +101,7 @@ def _described(known: NodeOverview, judged: NodeVerdict | None) -> dict[str, Any
         "rotation_due": known.rotation,
         "moved_to": moved and {"fingerprint": moved["to_fingerprint"], "handover": moved["handover_id"]},
         "holders": known.holders,
+        "wrapped": known.origin.to_json() if known.origin is not None else None,
         "revoked": revoked and {"why": revoked["why"], "since": revoked["created"]},
     }
 

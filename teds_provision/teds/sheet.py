@@ -30,6 +30,7 @@ from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import AccessCode, Conformity, DecodedTeds, Severity
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.image import BlockId, Image
+from teds_provision.teds.origin import Origin, origin_of
 
 __all__ = [
     "NOT_STATED",
@@ -68,7 +69,7 @@ class Meta:
     """The node as a whole: Meta-TEDS and its name. Times in seconds, NaN where not stated.
 
     ``uuid`` has 10 octets (2007) or 16 (2024), ``channels`` is MaxChan; None where not stated. ``vectors`` are the
-    members of each vector group, in their order.
+    members of each vector group, in their order. ``origin`` is what a wrapped node has its values from.
     """
 
     uuid: bytes | None = None
@@ -78,6 +79,7 @@ class Meta:
     slow_access_timeout: float = NOT_STATED
     self_test_time: float = NOT_STATED
     vectors: tuple[tuple[int, ...], ...] = ()
+    origin: Origin | None = None
 
 
 @dataclass(frozen=True)
@@ -188,7 +190,7 @@ class _Reader:
     def meta(self) -> Meta:
         teds = self.decoded(0, AccessCode.META)
         if teds is None:
-            return Meta(name=self.name(0))
+            return Meta(name=self.name(0), origin=origin_of(self.blocks))
         uuid, channels = teds.get("UUID"), teds.get("MaxChan")
         return Meta(
             uuid if isinstance(uuid, bytes) else None,
@@ -198,6 +200,7 @@ class _Reader:
             number_of(teds, "SHoldOff"),
             number_of(teds, "TestTime"),
             vectors=tuple(_vectors(teds)),
+            origin=origin_of(self.blocks),
         )
 
     def sheet(self) -> Sheet:

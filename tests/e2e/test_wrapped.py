@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import subprocess
@@ -14,6 +15,7 @@ import pytest
 
 from tests.bench import make_station
 from tests.e2e.desk import ROOT, Desk, Running
+from tests.ncap.service import Service
 from tests.pace import until
 from tests.places import free_bus
 
@@ -160,6 +162,35 @@ def test_origin_is_signed_and_cannot_be_written(bench: WrappedBench) -> None:
     assert flash["provisioned"]
     seen = bench.ask("verify", "torque", "--via", "can")
     assert seen["verdict"] == "authentic"
+
+
+def test_it_is_shown_as_wrapped_everywhere(bench: WrappedBench, tmp_path: Path) -> None:
+    origin = bench.made["Torque"]["origin"]
+    assert origin["sha256"] == hashlib.sha256(bench.dbc.read_bytes()).hexdigest()
+    nodes = {node["uuid"]: node for node in bench.station.ask("nodes")["nodes"]}
+    assert nodes[bench.made["Torque"]["uuid"]]["wrapped"] == origin
+    assert "wrapped: Torque (dbc)" in bench.station.run("nodes").out
+    assert "wrapped: Torque (dbc)" in bench.station.run("nodes", "torque").out
+    bench.player.play(GOOD, SPINNING)
+    files = [tmp_path / f"run.{kind}" for kind in ("csv", "jsonl", "mcap")]
+    where = [word for file in files for word in ("--to", file)]
+    assert bench.station.run("measure", "torque", *bench.can, "--duration", "2", *where).code == 0
+    for file in files:
+        assert b"CAN message Torque (dbc)" in file.read_bytes(), file
+    image = tmp_path / "image.json"
+    bench.ask("read", "torque", "--via", "can", "--output", image)
+    assert "the node's proof ends at the wrapper, not at the sensor" in bench.station.run("show", image).out
+
+
+def test_the_service_and_its_page_have_the_mark(bench: WrappedBench) -> None:
+    service = Service(bench.desk, bench.station).start()
+    try:
+        asked = service.client()
+        uuid, origin = bench.made["Torque"]["uuid"], bench.made["Torque"]["origin"]
+        assert asked.request("GET", f"/nodes/{uuid}")["wrapped"] == origin
+        assert {node["uuid"]: node["wrapped"] for node in asked.request("GET", "/nodes")["nodes"]}[uuid] == origin
+    finally:
+        service.end()
 
 
 def test_what_does_not_go_together_is_refused(bench: WrappedBench, tmp_path: Path) -> None:

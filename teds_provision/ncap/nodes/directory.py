@@ -64,6 +64,7 @@ class NodeDirectory:
         self._judged: dict[str, NodeVerdict | None] = {}  # as the store and today's trust have it, beside each row
         self._channels: dict[str, tuple[str, list[dict[str, Any]]]] = {}
         self._own_names: dict[str, str] = {}  # from the datasheet of each
+        self._origins: dict[str, dict[str, Any] | None] = {}  # what each wraps
         self.changes = 0  # grows with each change of a node's name or datasheet
         self._strangers: dict[str, set[str]] = {}
         self._texts: dict[str, dict[bool, tuple[tuple[int, int], str]]] = {}  # and whether for who may only read
@@ -101,6 +102,7 @@ class NodeDirectory:
             self.changes += 1
             self._channels[uuid] = digest, channels
             self._own_names[uuid] = sheet.meta.name if sheet is not None else ""
+            self._origins[uuid] = _origin(sheet)
         return channels
 
     def show_sheet(self, uuid: str, sheet: Sheet | None) -> None:
@@ -113,6 +115,7 @@ class NodeDirectory:
                 known = sheet.shown_in(shown_units(self._station, bytes.fromhex(uuid)))
                 self._channels[uuid] = _READ_NOW, [channel_facts(channel) for channel in known.channels]
                 self._own_names[uuid] = sheet.meta.name
+                self._origins[uuid] = _origin(sheet)
 
     # -- reports of links and measurements ---------------------------------------------------------------------------
 
@@ -134,7 +137,7 @@ class NodeDirectory:
                     if not node_presence.present and other not in self._rows
                 ]
                 for stranger in gone[:-MOST_GONE]:
-                    for kept in (self._seen, self._channels, self._own_names, self._texts):
+                    for kept in (self._seen, self._channels, self._own_names, self._origins, self._texts):
                         kept.pop(stranger, None)
         if state is not None:
             told = {key: value for key, value in facts.items() if key in ("problem", "place", "busy")}
@@ -273,6 +276,7 @@ class NodeDirectory:
         if unverified:  # what it calls itself, marked
             out["name"] = out["name"] or called or None
         out["virtual"] = self.virtual(uuid)
+        out["wrapped"] = self._origins.get(uuid) or row.get("wrapped")
         out["mode"] = "measuring" if seen.measurement else "idle" if seen.present else None
         out["channels"] = [{**channel, **self._now(uuid, channel["number"])} for channel in channels]
         return out
@@ -307,6 +311,11 @@ class NodeDirectory:
 def for_reader(node: dict[str, Any]) -> dict[str, Any]:
     """Return a node for a read-only token: its errors name no file of this machine."""
     return node | {name: for_readers(node[name]) for name in ("problem", "measuring")}
+
+
+def _origin(sheet: Sheet | None) -> dict[str, Any] | None:
+    origin = sheet.meta.origin if sheet is not None else None
+    return dict(origin.to_json()) if origin is not None else None
 
 
 def channel_facts(channel: Channel) -> dict[str, Any]:

@@ -28,6 +28,7 @@ DEFAULT_PERIOD: Final = 0.1
 PERIODS_LATE: Final = 3
 """A value becomes invalid if the next frame is so many periods late."""
 MOST_CHANNELS: Final = 255
+_RESOLUTION: Final = 1e-7  # of a Float32, about
 _EXACT_BITS: Final = 24
 _MOST_BITS: Final = 64
 _LARGEST: Final = 1e30
@@ -191,14 +192,18 @@ class WrappedChannel:
         return (unit.scale, unit.offset) == (1.0, 0.0)
 
     def _held_by_float32(self, coefficients: tuple[float, float]) -> bool:
-        """True if rounding the coefficients to Float32 moves no value by as much as half a step."""
+        """True if rounding to Float32 moves no value by half a step: of the coefficients, and of the way into SI."""
+        unit = self.written
+        exact = (*coefficients, unit.scale, unit.offset)
         try:
-            intercept, slope = struct.unpack(">2f", struct.pack(">2f", *coefficients))
+            intercept, slope, scale, offset = struct.unpack(">4f", struct.pack(">4f", *exact))
         except (OverflowError, struct.error):
             return False
         top = (1 << self.bits) - 1
-        moved = [abs(intercept + slope * raw - coefficients[0] - coefficients[1] * raw) for raw in (0, top)]
-        return bool(slope != 0 and max(moved) < abs(self.scale) / 2)
+        values = [coefficients[0] + coefficients[1] * raw for raw in (0, top)]
+        moved = max(abs(intercept + slope * raw - value) for raw, value in zip((0, top), values, strict=True))
+        converted = (max(map(abs, values)) * abs(scale - unit.scale) + abs(offset - unit.offset)) / abs(unit.scale)
+        return bool(slope != 0 and moved + converted < abs(self.scale) / 2)
 
     @property
     def raw_limits(self) -> tuple[float, float] | None:
@@ -311,7 +316,9 @@ class WrappedSensor:
 
 def _channel_lines(number: int, channel: WrappedChannel) -> list[str]:
     form, (low, high) = channel.sample, channel.limits
-    step = abs(channel.scale) if not channel.is_float else max(abs(low), abs(high)) * 1e-7 if abs(high) < _LARGEST else 1e-7
+    widest = max(abs(low), abs(high))
+    resolution = widest * _RESOLUTION if widest < _LARGEST else _RESOLUTION
+    step = resolution if channel.is_float else abs(channel.scale)
     lines = [
         "",
         f"[channel.{number}]",

@@ -11,6 +11,8 @@ from typing import Any
 
 from teds_provision.store.database import PAGE, Database, places
 from teds_provision.store.records import UUID_OCTETS
+from teds_provision.store.tables.datasheets import unpacked
+from teds_provision.teds.origin import ORIGIN, Origin, origin_of
 
 _TABLES = ("nodes", "whitelist", "keys", "tombstones", "revocations")
 _KNOWN = f"({' UNION '.join(f'SELECT uuid FROM {table}' for table in _TABLES)})"
@@ -48,6 +50,7 @@ class NodeOverview:
     keys: list[dict[str, Any]] = field(default_factory=list)
     holders: list[dict[str, str]] = field(default_factory=list)
     groups: list[str] = field(default_factory=list)
+    origin: Origin | None = None
 
 
 @dataclass(frozen=True)
@@ -123,6 +126,7 @@ class OverviewTables:
         )
         holders = self._lists("holders", ("fingerprint", "mode", "since"), uuids, "since, fingerprint")
         groups = self._lists("group_members", ("name",), uuids, "name")
+        origins = self._origins(uuids)
         for uuid in uuids:
             yield NodeOverview(
                 uuid,
@@ -134,7 +138,27 @@ class OverviewTables:
                 keys.get(uuid, []),
                 holders.get(uuid, []),
                 [group["name"] for group in groups.get(uuid, [])],
+                origins.get(uuid),
             )
+
+    def _origins(self, uuids: Sequence[bytes]) -> dict[bytes, Origin]:
+        """Return what the wrapped ones of these nodes wrap, by their last datasheet; few images are read for it.
+
+        Only a node whose reading lists a TEDS at the place of the Origin TEDS has its image looked at.
+        """
+        listed = self._database.execute(
+            f"SELECT uuid FROM readings WHERE uuid IN ({places(uuids)}) AND instr(digests, ?) > 0", [*uuids, _ORIGIN]
+        )
+        found: dict[bytes, Origin] = {}
+        for (uuid,) in listed:
+            row = self._database.one("SELECT blocks FROM datasheets WHERE uuid = ? ORDER BY row DESC LIMIT 1", (uuid,))
+            try:
+                origin = origin_of(unpacked(uuid, row[0]).blocks) if row is not None else None
+            except ValueError:  # whoever reads the datasheet itself reports the damage
+                continue
+            if origin is not None:
+                found[bytes(uuid)] = origin
+        return found
 
     def _rows(self, table: str, columns: Sequence[str], uuids: Sequence[bytes]) -> dict[bytes, dict[str, Any]]:
         return {uuid: rows[0] for uuid, rows in self._lists(table, columns, uuids, "uuid").items()}
@@ -151,6 +175,7 @@ class OverviewTables:
         return found
 
 
+_ORIGIN = ORIGIN[0].to_bytes(2, "big") + bytes([ORIGIN[1]])
 _NODE = (
     "point", "name", "profile", "state", "epoch", "sequence", "can_address", "teds_sha256", "retired",
     "last_seen", "channels", "due", "charging",

@@ -19,6 +19,7 @@ export function facts(node) {
   else if (node.mode === "measuring") out.push(h("span", { class: "busy" }, icon("wave"), "measuring"));
   else if (node.mode) out.push(h("span", { class: "warn" }, icon("clock"), node.mode));
   else if (node.state) out.push(h("span", {}, node.state));
+  if (node.wrapped) out.push(h("span", { class: "warn", title: "The proof ends at the wrapper, not at the sensor." }, icon("warn"), `wrapped: ${node.wrapped.name} (${node.wrapped.kind})`));
   if (node.whitelisted === false) out.push(h("span", { class: "warn" }, icon("warn"), "not on the whitelist"));
   if (node.groups?.length) out.push(h("span", {}, icon("list"), node.groups.join(", ")));
   if (node.power) out.push(power(node.power));
