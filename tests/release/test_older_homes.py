@@ -1,6 +1,6 @@
 """Homes, backups and bundles that earlier versions wrote open with this one (docs/compatibility.md).
 
-Each archive in assets/ holds two homes of one schema (keystore file), a backup and a bundle. Station north
+Each archive in assets/ (make_assets.py) holds two homes of one schema (keystore file), a backup and a bundle. Station north
 provisioned a sensor and a gripper, put both into the group crane, named a topic, and exported both keys to south.
 """
 
@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.store.schema import SCHEMA_VERSION
 from tests.cli.shell import Outcome, call
 
 ASSETS = sorted((Path(__file__).parent / "assets").glob("schema-*.zip"))
@@ -70,3 +71,8 @@ def test_an_earlier_bundle_is_imported(folder: Path) -> None:
         assert done.json["error"]["code"] == "expired"
     else:
         assert done.json["imported"] == sorted([SENSOR, GRIPPER])
+
+
+@pytest.mark.soak
+def test_todays_schema_has_an_archive() -> None:
+    assert ASSETS[-1].stem == f"schema-{SCHEMA_VERSION}", "python -m tests.release.make_assets"
