@@ -299,12 +299,15 @@ class Client:
         name: str | None = None,
         calibration: str | None = None,
         calibration_name: str | None = None,
+        calibration_channel: int | None = None,
+        calibration_item: str | None = None,
         adopt: bool = False,
         accept_calibration: str | None = None,
         cancel: bool = False,
     ) -> Provisioning:
         """Provision a node, or the next that is tapped; ``calibration`` is the content of a file of that name.
 
+        ``calibration_channel`` is the channel that it is for, ``calibration_item`` the result of a certificate.
         ``adopt``: in place of a profile the datasheet that the board brought is signed; ``accept_calibration`` is the
         reason to accept it in spite of findings.
         """
@@ -313,6 +316,8 @@ class Client:
             "name": name,
             "calibration": calibration,
             "calibration_name": calibration_name,
+            "calibration_channel": calibration_channel,
+            "calibration_item": calibration_item,
             "adopt": adopt,
             "accept_calibration": accept_calibration,
             "cancel": cancel,

@@ -33,6 +33,10 @@ class Limits:
     xml_depth: int = 32
     text_file: int = 1 << 20
     """A profile, a calibration, a sheet of requirements (TOML, CSV, JSON)."""
+    certificate: int = 8 << 20
+    """A calibration certificate (DCC), with the documents that it embeds."""
+    certificate_tables: int = 200
+    certificate_values: int = 10_000
     toml_parts: int = 32
     toml_depth: int = 16
     toml_keys: int = 20_000

@@ -57,8 +57,14 @@ class Order:
 
     profile: ProfileName | None = None
     name: str | None = None
-    calibration: Annotated[str, Meta(description="the content of a calibration file")] | None = None
-    calibration_name: Annotated[str, Meta(description="the name of that file")] | None = None
+    calibration: (
+        Annotated[str, Meta(description="the content of a calibration file, or of a certificate (DCC) in UTF-8")] | None
+    ) = None
+    calibration_name: Annotated[str, Meta(description="the name of that file, .xml for a certificate")] | None = None
+    calibration_channel: (
+        Annotated[int, Meta(minimum=1, maximum=255, description="the only channel that it is for")] | None
+    ) = None
+    calibration_item: Annotated[str, Meta(description="the result of the certificate to use")] | None = None
     adopt: (
         Annotated[bool, Meta(description="sign the datasheet that the board brought, in place of a profile")] | None
     ) = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,8 @@ from teds_provision import plant, steps
 from teds_provision import teds as teds_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
+    CalibrationFile,
+    Day,
     FileToRead,
     Function,
     WholeNumber,
@@ -33,18 +36,35 @@ if TYPE_CHECKING:
     from teds_provision.plant.sign_requests import OfficeOrder
     from teds_provision.station.station import Station
     from teds_provision.steps.write import WriteResult
+    from teds_provision.teds.certificate import CertificateReference
 
 MAX_INPUT_OCTETS = 32 << 20
 
 
 def order_options(function: Function) -> Function:
-    """Add --profile, --calibration, --no-calibration, --name, --accept-calibration, --retype: one ``order``."""
+    """Add --profile, --calibration and what belongs to it, --name, --retype: one ``order``."""
     from functools import wraps
 
     @wraps(function)
     def with_order(*args: Any, profile: Any, calibration: Any, no_calibration: bool, name: Any, **rest: Any) -> Any:
         accepted, retype = rest.pop("accept_calibration"), rest.pop("retype")
-        order = steps.build.BuildOrder(profile, calibration, name, no_calibration, accepted, retype)
+        item, trusted, due = rest.pop("item"), rest.pop("trust_dcc"), rest.pop("due")
+        elsewhere = rest.get("batch") is not None or rest.get("job") is not None  # where calibrations are named
+        if calibration is None and (item is not None or due is not None) and not elsewhere:
+            raise UsageError("--item and --due belong to a calibration.", hint="Add --calibration FILE.")
+        channel, file = calibration or (None, None)
+        order = steps.build.BuildOrder(
+            profile,
+            file,
+            name,
+            no_calibration,
+            accepted,
+            retype,
+            channel=channel,
+            item=item,
+            trusted=trusted,
+            due=due,
+        )
         return function(*args, order=order, **rest)
 
     options = [
@@ -54,9 +74,23 @@ def order_options(function: Function) -> Function:
         click.option(
             "--calibration",
             "-c",
+            type=CalibrationFile(),
+            metavar="[N=]FILE",
+            help="CSV of raw, value pairs or coefficients, or a certificate (DCC, .xml); N= for channel N alone.",
+        ),
+        click.option("--item", metavar="ID", help="Result of the certificate to use; see: show CERT.xml"),
+        click.option(
+            "--trust-dcc",
             type=FileToRead(),
-            metavar="FILE",
-            help="CSV file of raw, value pairs, or of coefficients.",
+            multiple=True,
+            metavar="CERT.pem",
+            help="Require a certificate signed by this one, or under this CA; repeatable.",
+        ),
+        click.option(
+            "--due",
+            type=Day(),
+            metavar="DATE",
+            help="When to calibrate again (default: the calibration's date and the interval of file or profile).",
         ),
         click.option("--no-calibration", is_flag=True, help="Drop the node's existing calibration."),
         click.option("--name", help="Node name, written to its XdcrName TEDS."),
@@ -73,7 +107,10 @@ def order_options(function: Function) -> Function:
     return wrapped  # type: ignore[no-any-return]
 
 
-@command("teds-provision build 8d4d --profile magnetic-angular-position-sensor --output angle.json")
+@command(
+    "teds-provision build 8d4d --profile magnetic-angular-position-sensor --output angle.json",
+    "teds-provision build 8d4d --profile magnetic-angular-position-sensor --calibration angle.xml --item as-left",
+)
 @click.argument("uuid")
 @order_options
 @click.option(
@@ -91,6 +128,7 @@ def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, ye
     """Build a node's TEDS from its type and calibration, plus the Security TEDS; nothing is signed yet."""
     station = app.station()
     octets = station.nodes.resolve(uuid)
+    order = replace(order, choose=app.chooses_item())
     built = steps.build.build(
         station, octets, order, edition=int(edition), keep_draft=not dry_run, retype=app.asks_retype(yes=yes)
     )
@@ -115,9 +153,15 @@ def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, ye
             "blocks": blocks,
             "warnings": list(built.warnings),
             "calibrations": calibrations,
+            **calibration_json(steps.build.certificate_brought(built.calibrations)),
         },
         f"Built {octets.hex()} as {built.profile}:\n" + "\n".join(lines) + fits,
     )
+
+
+def calibration_json(certificate: CertificateReference | None) -> dict[str, Any]:
+    """Member ``calibration`` of a command that calibrated by a certificate, nothing for any other."""
+    return {} if certificate is None else {"calibration": certificate.to_json()}
 
 
 def write_file(path: Path, text: str | Iterable[str]) -> None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import measure, steps, teds
+from teds_provision import __version__, measure, steps, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
     ChannelNumber,
@@ -25,7 +26,7 @@ from teds_provision.cli.options import (
 from teds_provision.cli.rendering import print_table, reporter_for, shown
 from teds_provision.cli.sample import over_the_bus
 from teds_provision.errors import UsageError
-from teds_provision.files import read_text
+from teds_provision.files import SHARED, read_text, write_whole
 from teds_provision.limits import LIMITS
 from teds_provision.links import LinkSettings
 from teds_provision.teds.calibration.model import METHODS
@@ -203,18 +204,41 @@ def capture(
 @command(
     "teds-provision calibrate fit joint3.csv --method polynomial",
     "teds-provision calibrate fit joint3.csv --profile magnetic-angular-position-sensor",
+    "teds-provision calibrate fit joint3.csv --dcc joint3.xml --laboratory laboratory.toml",
 )
 @click.argument("file", type=FileToRead(), metavar="FILE.csv")
 @click.option("--method", type=click.Choice(METHODS), help="How to fit (default: as the file says, else table).")
 @click.option("--degree", type=WholeNumber(1, 12), metavar="N", help="Degree of a polynomial (default: 3).")
 @click.option("--profile", "-p", metavar="P", help="Also check it against this transducer type and the guard.")
+@click.option(
+    "--dcc",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="OUT.xml",
+    help="Write the points and the fit as a calibration certificate (DCC 3.2.1), unsigned.",
+)
+@click.option(
+    "--laboratory",
+    type=FileToRead(),
+    metavar="FILE.toml",
+    help="With --dcc: who calibrated, for whom, under which number; see docs/calibration.md.",
+)
 @pass_app
-def fit(app: App, file: Path, method: str | None, degree: int | None, profile: str | None) -> None:
-    """Show how well a calibration fits its points.
+def fit(
+    app: App,
+    file: Path,
+    method: str | None,
+    degree: int | None,
+    profile: str | None,
+    dcc: Path | None,
+    laboratory: Path | None,
+) -> None:
+    """Show how well a calibration fits its points, and certify it.
 
-    Writes nothing to a node. A table passes through every point, so the error at each inner point of a fit without that
-    point is shown as well.
+    Writes nothing to a node; --dcc writes points and fit as a certificate. A table passes through every point, so the
+    error at each inner point of a fit without that point is shown as well.
     """
+    if laboratory is not None and dcc is None:
+        raise UsageError("--laboratory belongs to a certificate.", hint="Add --dcc OUT.xml.")
     text = read_text(file, LIMITS.text_file, "calibration")
     warnings: tuple[str, ...] = ()
     if profile is not None:
@@ -231,7 +255,28 @@ def fit(app: App, file: Path, method: str | None, degree: int | None, profile: s
     for warning in warnings:
         app.warn(warning)
     result = {"file": str(file), **told[0], "channels": told, "warnings": list(warnings)}
+    if dcc is not None:
+        result["dcc"] = _write_dcc(app, dcc, laboratory, fitted, file, text)
     app.emit(result, lambda console: _fits(console, [calibration for _, calibration in sorted(fitted.items())], told))
+
+
+def _write_dcc(
+    app: App, path: Path, laboratory: Path | None, fitted: Mapping[int, Calibration], file: Path, text: str
+) -> str:
+    """Write the certificate, and say what it does not state; returns its path."""
+    write = teds.dcc.write
+    known = write.Laboratory()
+    if laboratory is not None:
+        known = write.read_laboratory(read_text(laboratory, LIMITS.text_file, "description"), str(laboratory))
+    node = teds.calibration.points.node_of(text)
+    certificate = write.write_certificate(
+        fitted, known, node=node, software=__version__, source=text.encode(), today=datetime.now(UTC).date()
+    )
+    write_whole(path, [certificate.encode()], mode=SHARED)
+    if known.missing:
+        app.warn(f"{path} does not state: {', '.join(known.missing)}. Give them in a file: --laboratory FILE.toml")
+    app.note(f"Wrote {path}; it is not signed.")
+    return str(path)
 
 
 def _fit_json(calibration: Calibration) -> dict[str, Any]:

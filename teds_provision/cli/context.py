@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from teds_provision import client
     from teds_provision.cli import console
     from teds_provision.station.station import Station
+    from teds_provision.teds.certificate import ChooseItem
 else:
     client = late("teds_provision.client")  # HTTP: only if a base station runs
     json = late("json")
@@ -206,6 +207,23 @@ class App:
                 raise PolicyError(f"Cancelled. Board {uuid.hex()} keeps its type; nothing was written.")
 
         return ask if self.interactive and not yes else None
+
+    def chooses_item(self) -> ChooseItem | None:
+        """Return who is asked which result of a certificate is meant: a person at a terminal."""
+        answers: dict[str, str] = {}  # the same file is read again when its board comes
+
+        def ask(question: str, items: Sequence[tuple[str, str]]) -> str:
+            if question in answers:
+                return answers[question]
+            self.note(f"{question}:")
+            for known, title in items:
+                self.note(f"  {known}: {title}")
+            self.live_line()
+            choices = click.Choice([known for known, _ in items])
+            answers[question] = click.prompt(_as_question("Which one"), type=choices, err=True)
+            return answers[question]
+
+        return ask if self.interactive else None
 
     def ask_for_key(self, question: str, fingerprint: str) -> bool:
         """Ask a person whether a key counts: yes, no, or its digits (32 to 64, or a scanned label), held against it."""

@@ -78,7 +78,7 @@ def job() -> None:
     "--calibrations",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="Directory with a calibration per board: UUID.csv, .toml or .json.",
+    help="Directory with a calibration per board: UUID.csv, .toml, .json or .xml.",
 )
 @click.option("--calibration-age", type=WholeNumber(1), metavar="DAYS", help="Any calibration no older than this.")
 @click.option(

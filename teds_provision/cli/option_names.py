@@ -9,7 +9,7 @@ from typing import Final
 OPTIONS: Final[dict[str, frozenset[str]]] = {
     "": frozenset({"home", "json", "verbose", "quiet", "debug", "no-input", "passphrase-fd", "version"}),
     "init": frozenset({"name", "keystore", "request", "certificate", "yes"}),
-    "provision": frozenset({"profile", "calibration", "no-calibration", "name", "accept-calibration", "retype", "adopt", "watch", "batch", "report", "all", "job", "calibrations", "files", "only", "label-to", "label-format", "scan", "evidence", "operator", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
+    "provision": frozenset({"profile", "calibration", "item", "trust-dcc", "due", "no-calibration", "name", "accept-calibration", "retype", "adopt", "watch", "batch", "report", "all", "job", "calibrations", "files", "only", "label-to", "label-format", "scan", "evidence", "operator", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "verify": frozenset({"accept-calibration", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "nodes": frozenset({"state", "profile", "group", "due", "since", "fits", "format", "plant"}),
     "measure": frozenset({"rate", "duration", "channel", "kind", "trigger", "test-pattern", "unsigned", "to", "wide", "output", "ros1", "ros2", "mqtt", "actuators", "dead-man", "require", "scalar-rate", "via", "nfc", "can", "ble", "timeout", "trace"}),
@@ -25,7 +25,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "whitelist import": frozenset({"format", "dry-run"}),
     "whitelist remove": frozenset({"yes", "dry-run"}),
     "agree": frozenset({"rotate", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
-    "build": frozenset({"profile", "calibration", "no-calibration", "name", "accept-calibration", "retype", "output", "edition", "yes", "dry-run"}),
+    "build": frozenset({"profile", "calibration", "item", "trust-dcc", "due", "no-calibration", "name", "accept-calibration", "retype", "output", "edition", "yes", "dry-run"}),
     "sign": frozenset({"output", "by", "job", "calibration", "files", "read-node", "accept-calibration", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "write": frozenset({"image", "from", "retype", "sequence-jump", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "draft drop": frozenset({"yes", "dry-run"}),
@@ -35,12 +35,12 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "label": frozenset({"output"}),
     "log": frozenset({"follow", "last", "today", "since", "act", "failed"}),
     "trace show": frozenset({"messages", "whole"}),
-    "show": frozenset({"format", "edition", "diff", "plot", "strict"}),
+    "show": frozenset({"format", "edition", "diff", "plot", "trust-dcc", "strict"}),
     "record convert": frozenset({"wide"}),
     "record show": frozenset({"channel", "limit"}),
     "sample": frozenset({"via", "nfc", "can", "ble", "timeout", "trace"}),
     "calibrate capture": frozenset({"reference", "unit", "to", "via", "nfc", "can", "ble", "timeout", "trace"}),
-    "calibrate fit": frozenset({"method", "degree", "profile"}),
+    "calibrate fit": frozenset({"method", "degree", "profile", "dcc", "laboratory"}),
     "calibrate zero": frozenset({"value", "unit", "accept-calibration", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "set": frozenset({"unit", "hold", "dead-man", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "mode": frozenset({"via", "nfc", "can", "ble", "timeout", "trace"}),
@@ -97,7 +97,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "node create": frozenset({"uuid", "name", "teds", "profile", "from", "message", "max-message"}),
     "node run": frozenset({"nfc", "tag", "can", "ble", "source", "bus", "node-id", "crypto-delay", "flash-delay", "wait-time", "battery", "pace"}),
 }
-FILES: Final = frozenset({"batch", "calibration", "calibrations", "certificate", "csv", "draft", "files", "home", "image", "label-to", "list", "map", "member", "output", "pins", "plot", "receipt", "record", "recovery-key", "report", "request", "require", "roster", "teds", "tls-cert", "tls-key", "trace"})
+FILES: Final = frozenset({"batch", "calibration", "calibrations", "certificate", "csv", "dcc", "draft", "files", "home", "image", "label-to", "laboratory", "list", "map", "member", "output", "pins", "plot", "receipt", "record", "recovery-key", "report", "request", "require", "roster", "teds", "tls-cert", "tls-key", "trace", "trust-dcc"})
 """Options that name a file or a folder, in every command that has them."""
 PARAMETERS: Final[dict[str, dict[str, str]]] = {
     "": {"json": "as_json"},
@@ -132,16 +132,18 @@ PARAMETERS: Final[dict[str, dict[str, str]]] = {
 }
 """Options that the code calls otherwise than the command line does."""
 SEVERAL: Final[dict[str, frozenset[str]]] = {
-    "provision": frozenset({"nfc", "can"}),
+    "provision": frozenset({"trust-dcc", "nfc", "can"}),
     "verify": frozenset({"nfc", "can"}),
     "measure": frozenset({"channel", "to", "nfc", "can"}),
     "identify": frozenset({"nfc", "can"}),
     "agree": frozenset({"nfc", "can"}),
+    "build": frozenset({"trust-dcc"}),
     "sign": frozenset({"nfc", "can"}),
     "write": frozenset({"nfc", "can"}),
     "read": frozenset({"nfc", "can"}),
     "reset": frozenset({"nfc", "can"}),
     "address": frozenset({"nfc", "can"}),
+    "show": frozenset({"trust-dcc"}),
     "record show": frozenset({"channel"}),
     "sample": frozenset({"nfc", "can"}),
     "calibrate capture": frozenset({"nfc", "can"}),

@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -19,6 +20,7 @@ from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings
 from teds_provision.links.ports import LISTEN_SECONDS
 from teds_provision.protocol.fingerprints import read_fingerprint
+from teds_provision.teds.certificate import split_channel
 
 if TYPE_CHECKING:
     from teds_provision import client
@@ -89,6 +91,35 @@ class FileToRead(click.Path):
             raise NotFoundError(f"There is no file {os.fsdecode(path)}.")
         require_no_pipe(Path(os.fsdecode(path)))
         return path
+
+
+class CalibrationFile(FileToRead):
+    """A calibration file, ``FILE`` or ``N=FILE`` for channel N alone: (N or None, path)."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Read a path and the channel before it; raises NotFoundError."""
+        if isinstance(value, tuple):
+            return value
+        channel, file = split_channel(os.fsdecode(value))
+        if channel is not None and not 1 <= channel <= 255:
+            self.fail(f"{channel} is not a channel number, 1 to 255.", param, ctx)
+        return channel, super().convert(value if channel is None else file, param, ctx)
+
+
+class Day(click.ParamType[datetime]):
+    """A day like 2027-10-31, as its first moment in UTC."""
+
+    name = "date"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Read a day; raises BadParameter."""
+        if isinstance(value, datetime):
+            return value
+        try:
+            day = date.fromisoformat(str(value))
+        except ValueError:
+            self.fail(f"{value!r} is not a date; write it like 2027-10-31.", param, ctx)
+        return datetime(day.year, day.month, day.day, tzinfo=UTC)
 
 
 class ChannelNumber(WholeNumber):

@@ -17,7 +17,7 @@ import click
 
 from teds_provision import plant, station
 from teds_provision import steps as steps_room
-from teds_provision.cli.build import order_options
+from teds_provision.cli.build import calibration_json, order_options
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, said_here, yes_option
 from teds_provision.cli.rendering import print_table, reporter_for
@@ -44,6 +44,7 @@ _CHANGES_SHOWN = 20
 @command(
     "teds-provision provision --profile tactile-finger-sensor --nfc udp:localhost:54321",
     "teds-provision provision --profile magnetic-angular-position-sensor --calibration angle.csv --yes",
+    "teds-provision provision --profile load-cell --calibration cell.xml --trust-dcc laboratory.pem",
     "teds-provision provision --watch --yes --profile load-cell --name 'cell {n}'",
     "teds-provision provision --batch boards.csv --report boards.html",
     "teds-provision provision --all --via can --can socketcan:can0 --profile load-cell",
@@ -58,7 +59,7 @@ _CHANGES_SHOWN = 20
     "--batch",
     type=FileToRead(),
     metavar="FILE",
-    help="Sheet of boards: uuid, name, profile, calibration, fingerprint.",
+    help="Sheet of boards: uuid, name, profile, calibration, item, fingerprint.",
 )
 @click.option(
     "--report",
@@ -72,7 +73,7 @@ _CHANGES_SHOWN = 20
     "--calibrations",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="With --job: directory with a calibration per board: UUID.csv, .toml or .json.",
+    help="With --job: directory with a calibration per board: UUID.csv, .toml, .json or .xml.",
 )
 @click.option(
     "--files",
@@ -134,7 +135,8 @@ def provision(
     --yes accepts the node on the reader. A finished node keeps its datasheet: only what you name (--profile,
     --calibration, --name) changes, or what you confirm after seeing the changes.
     """
-    order = replace(order, adopt=adopt and bool(said_here("adopt")))  # a setting of that name is meant for ncap run
+    adopt = adopt and bool(said_here("adopt"))  # a setting of that name is meant for ncap run
+    order = replace(order, choose=app.chooses_item(), adopt=adopt)
     if order.adopt and (batch is not None or job is not None):
         raise UsageError("The sheet or job already defines what each board gets.", hint="Drop --adopt.")
     request = steps_room.batch.ProvisionRequest(uuid, order, watch, everything, batch, report, operator or "")
@@ -365,6 +367,7 @@ def _print_result(app: App, done: ProvisionResult, *, error: TedsProvisionError 
         ],
         "verdict": done.verified.verdict,
         "warnings": list(done.warnings),
+        **calibration_json(done.certificate),
         **{name: value for name, value in more.items() if value is not None and name != "failure"},
     }
     if more.get("failure") is not None:

@@ -1,4 +1,7 @@
-"""``show``: decode TEDS, images, profiles, bundle headers and messages; turn TEDS from any format into any other."""
+"""``show``: decode TEDS, images, profiles, bundle headers, messages and calibration certificates.
+
+It also turns TEDS from any format into any other.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -16,9 +20,9 @@ import click
 from teds_provision import teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.context import to_json as dumps
-from teds_provision.cli.options import command
+from teds_provision.cli.options import FileToRead, command
 from teds_provision.errors import BadDataError, UsageError
-from teds_provision.files import open_to_read
+from teds_provision.files import open_to_read, read_limited
 from teds_provision.lazy import late
 from teds_provision.limits import LIMITS
 from teds_provision.protocol import handover
@@ -45,6 +49,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from teds_provision.protocol.handover.bundle import BundleHeader
+    from teds_provision.teds.dcc.items import CertificateItem
+    from teds_provision.teds.dcc.shown import ShownCertificate
     from teds_provision.teds.formats import Format
     from teds_provision.teds.guard import GuardFinding
 else:
@@ -53,6 +59,9 @@ else:
 CHOICES = ["table", "json", "xml", "hex", "ihex", "toml", "binary", "image"]
 _BAD_DATA = BadDataError.exit_code
 _POLICY = 6
+_MOST_PEM: Final = 1 << 20
+_CERTIFICATE: Final = b"digitalCalibrationCertificate"
+_CERTIFICATE_HEAD: Final = 8192  # a licence may stand before the root
 
 
 @command(
@@ -61,6 +70,7 @@ _POLICY = 6
     "teds-provision show image.json --edition 2024",
     "teds-provision show --diff before.json after.json",
     "teds-provision show image.json --plot curve.svg",
+    "teds-provision show certificate.xml --trust-dcc laboratory.pem",
 )
 @click.argument("files", metavar="FILE…", nargs=-1)
 @click.option("--format", "form", type=click.Choice(CHOICES), default="table", show_default=True, help="Output format.")
@@ -71,6 +81,13 @@ _POLICY = 6
 @click.option(
     "--plot", metavar="FILE", type=click.Path(path_type=Path), help="Plot the calibrations to this file, .png or .svg."
 )
+@click.option(
+    "--trust-dcc",
+    type=FileToRead(),
+    multiple=True,
+    metavar="CERT.pem",
+    help="Require a calibration certificate signed by this one, or under this CA; repeatable.",
+)
 @click.option("--strict", is_flag=True, help="Exit 8 for any error finding, 6 for a harmful calibration.")
 @pass_app
 def show(
@@ -80,11 +97,13 @@ def show(
     edition: str | None,
     diff: tuple[str, str] | None,
     plot: Path | None,
+    trust_dcc: tuple[Path, ...],
     strict: bool,
 ) -> None:
-    """Decode TEDS (binary, hex, Intel HEX, JSON, XML), images, profiles, bundle headers and messages.
+    """Decode TEDS (binary, hex, Intel HEX, JSON, XML), images, profiles, bundle headers, messages and certificates.
 
-    Use - for standard input. Exits 0 if everything could be decoded, 8 if a TEDS is malformed, 3 if a file is missing.
+    Use - for standard input. Exits 0 if everything could be decoded, 8 if a TEDS is malformed, 4 if a certificate's
+    signature is bad, 3 if a file is missing.
     """
     plain = form in {"table", "json"}
     if diff is not None:
@@ -97,7 +116,8 @@ def show(
     if app.json and not plain:
         raise UsageError("--json and --format cannot be combined.", hint="Omit one of them.")
     wanted = cast("Edition", int(edition)) if edition else None
-    shown = [load(name, wanted) for name in files]
+    trusted = tuple(read_limited(path, _MOST_PEM, "certificate") for path in trust_dcc)
+    shown = [load(name, wanted, trusted) for name in files]
     if plot is not None:
         if len(shown) != 1:
             raise UsageError("--plot works with one file.", hint="Run show once per file.")
@@ -125,7 +145,7 @@ def _print_files(app: App, files: Sequence[ShownFile], form: str) -> None:
 
 def _convert(app: App, files: Sequence[ShownFile], form: Format) -> None:
     for file in files:
-        if file.bundle is not None:
+        if file.bundle is not None or file.certificate is not None:
             raise BadDataError(f"{file.name} contains no TEDS that could be written as {form}.")
         for finding in chain.from_iterable(file.conversions.values()):
             if finding.severity == "error":
@@ -195,6 +215,8 @@ def print_files(console: Console, files: Iterable[ShownFile]) -> None:
             _print_message(console, file.message)
         if file.bundle is not None:
             _print_bundle(console, file.bundle)
+        if file.certificate is not None:
+            _print_certificate(console, file.certificate)
         for number, shown in enumerate(file.teds):
             if number:
                 console.print()
@@ -280,6 +302,30 @@ def _print_bundle(console: Console, bundle: BundleHeader) -> None:
         console.print(f"  for the station with fingerprint {recipient[:16] or '(not named)'}")
 
 
+def _print_certificate(console: Console, shown: ShownCertificate) -> None:
+    console.print(f"[bold]calibration certificate[/] · DCC {escape(shown.certificate.schema_version)}")
+    for label, text in shown.lines():
+        console.print(f"  [cyan]{label}[/]: {escape(text)}" if label else f"    {escape(text)}")
+    for item in shown.items:
+        console.print(f"\n[bold]item {escape(item.id)}[/] · {escape(item.title)}")
+        table = rich_table.Table(*_heads(item), box=None, pad_edge=False, header_style="dim")
+        for row in teds.dcc.shown.points_of(item):
+            table.add_row(*row)
+        console.print(table)
+        uncertainty = item.to_json()["uncertainty"]
+        if isinstance(uncertainty, float):
+            console.print(f"  standard uncertainty {uncertainty:.6g} {escape(item.reference.unit.text)}".rstrip())
+
+
+def _heads(item: CertificateItem) -> tuple[str, str]:
+    unit = item.reference.unit.text
+    value = f"value [{unit}]" if unit else "value"
+    if item.indicated is None:
+        return "coefficient", escape(value)
+    of = item.indicated.unit.text
+    return escape(f"indication [{of}]" if of else "raw"), escape(value)
+
+
 # Files are read, recognized and described before anything is printed.
 
 STDIN = "-"
@@ -299,13 +345,14 @@ _OTHERS: Final = {
 
 @dataclass(frozen=True)
 class ShownFile:
-    """One file: its TEDS, or the message or the bundle's header that it holds; ``notes`` go to stderr."""
+    """One file: its TEDS, or the message, bundle header or certificate that it holds; ``notes`` go to stderr."""
 
     name: str
     kind: Kind
     teds: tuple[ShownTeds, ...] = ()
     message: Message | None = None
     bundle: BundleHeader | None = None
+    certificate: ShownCertificate | None = None
     guard: tuple[GuardFinding, ...] = ()
     notes: tuple[str, ...] = ()
     conversions: Mapping[int, tuple[Finding, ...]] = field(default_factory=dict)
@@ -341,8 +388,11 @@ def read_file(name: str) -> bytes:
     return octets
 
 
-def load(name: str, edition: Edition | None = None) -> ShownFile:
-    """Read and describe one file, converted to ``edition`` if one is given."""
+def load(name: str, edition: Edition | None = None, trusted: tuple[bytes, ...] = ()) -> ShownFile:
+    """Read one file and put it into words, converted to ``edition`` if one is given.
+
+    ``trusted`` are those whose signature a certificate must have, as PEM; empty if it need not have any.
+    """
     bundle = _long_bundle(name)
     if bundle is not None:
         return ShownFile(name, "bundle", bundle=bundle)
@@ -350,6 +400,10 @@ def load(name: str, edition: Edition | None = None) -> ShownFile:
     kind: Kind | None = None
     if octets.startswith(tuple(_OTHERS)):
         raise _no_teds(name, octets, "")
+    if looks_like_certificate(octets):
+        certificate = teds.dcc.signature.read_checked(octets, name, trusted, datetime.now(UTC))
+        shown = teds.dcc.shown.ShownCertificate.of(certificate)
+        return ShownFile(name, "xml", certificate=shown, notes=certificate.warnings)
     try:
         kind = detect(octets)
         if kind == "bundle":
@@ -411,6 +465,11 @@ def _described(name: str, kind: Kind, blocks: Sequence[TedsBlock], edition: Edit
     return replace(file, teds=shown, guard=_guard(beside))
 
 
+def looks_like_certificate(octets: bytes) -> bool:
+    """True if a file begins like a calibration certificate."""
+    return octets.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<") and _CERTIFICATE in octets[:_CERTIFICATE_HEAD]
+
+
 def is_message(octets: bytes) -> bool:
     """Return True if octets are a message rather than a TEDS."""
     if looks_like_message(octets):
@@ -435,8 +494,6 @@ def _usual_channel(code: int) -> int:
 def _guard(beside: dict[tuple[int, int], bytes]) -> tuple[GuardFinding, ...]:
     if not any(code == AccessCode.CALIBRATION for _, code in beside):
         return ()
-    from datetime import UTC, datetime
-
     return tuple(check_calibration(beside, now=datetime.now(UTC)))
 
 
@@ -474,7 +531,9 @@ def to_json(files: Sequence[ShownFile]) -> dict[str, Any]:
     out: dict[str, Any] = dict(entries[0]) if len(entries) == 1 else {}
     out |= {"format": FORMAT, "teds": entries}
     guard = [guard_to_json(finding) for file in files for finding in file.guard]
-    return out | ({"guard": guard} if guard else {}) | ({"bundles": bundles} if bundles else {})
+    certificates = [file.certificate.to_json() for file in files if file.certificate is not None]
+    more = {"guard": guard, "bundles": bundles, "certificates": certificates}
+    return out | {name: values for name, values in more.items() if values}
 
 
 def _entries(file: ShownFile) -> list[dict[str, Any]]:

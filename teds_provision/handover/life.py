@@ -130,7 +130,8 @@ def _calibration_of(station: Station, old: NodeRecord) -> dict[BlockId, bytes]:
     blocks = {
         block: octets for block, octets in image.blocks.items() if block[1] == AccessCode.CALIBRATION and block[0]
     }
-    # The channel of its origin decides whether a calibration fits the spare's channel.
+    # The channel of its origin decides whether a calibration fits the spare's channel. Its certificate stays behind:
+    # it is about another sensor.
     described = [(number, AccessCode.CHANNEL) for number, _ in blocks]
     blocks |= {block: image.blocks[block] for block in described if block in image.blocks}
     if not blocks:

@@ -292,11 +292,13 @@ def _calibrations(job: Job, request: SignRequest, profile: Profile) -> dict[int,
 
 
 def _text_of(octets: bytes) -> tuple[str, str]:
-    """Return the text of a calibration file, and a name with its kind: JSON, TOML, else CSV."""
+    """Return the text of a calibration file, and a name with its kind: certificate, JSON, TOML, else CSV."""
     try:
         text = octets.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise BadDataError("The calibration is not UTF-8 text.") from error
+    if text.lstrip()[:1] == "<":
+        return text, "certificate.xml"
     if text.lstrip()[:1] in ("{", "["):
         return text, "calibration.json"
     try:

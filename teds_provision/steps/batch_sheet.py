@@ -1,8 +1,9 @@
 """The sheet of a batch (``--batch FILE``): its rows, how each board ended, how far the sheet is, and the report.
 
 CSV with a header: ``uuid`` (or empty: the rows are taken in the order of the taps), ``name``, ``profile``,
-``calibration`` (a file; a relative path starts at the sheet) and ``fingerprint`` (32 to 64 hex digits, for example from
-a scanned label: it pins the board's key before the tap). Everything is checked before the first tap. Progress is kept
+``calibration`` (a file, ``N=FILE`` for channel N alone; a relative path starts at the sheet), ``item`` (the result of a
+certificate) and ``fingerprint`` (32 to 64 hex digits, for example from a scanned label: it pins the board's key before
+the tap). Everything is checked before the first tap. Progress is kept
 per sheet in the station's home, so the same command carries on after an interruption.
 """
 
@@ -42,6 +43,7 @@ from teds_provision.steps.build import BuildOrder, PreparedOrder, content_digest
 from teds_provision.steps.provision import ProvisionResult
 from teds_provision.steps.verify import require_authentic
 from teds_provision.store import utc_now
+from teds_provision.teds.certificate import split_channel
 
 Result = Literal["passed", "failed", "skipped"]
 
@@ -128,7 +130,7 @@ def _weight(error: TedsProvisionError) -> int:
 
 MAX_SHEET_OCTETS: Final = 4 << 20
 MAX_ROWS: Final = 10_000
-COLUMNS: Final = ("uuid", "name", "profile", "calibration", "fingerprint")
+COLUMNS: Final = ("uuid", "name", "profile", "calibration", "item", "fingerprint")
 _SHOWN: Final = 20
 _DELIMITERS: Final = ",;\t"  # of equals the first
 _UUID = re.compile("[0-9a-f]{20}")
@@ -316,12 +318,14 @@ class _SheetReader:
             self.wrong(line, f"the {what} {value} is already in line {other}")
 
     def _order(self, line: int, values: dict[str, str]) -> PreparedOrder | None:
-        file = values.get("calibration") or None
+        channel, file = split_channel(values.get("calibration") or "")
         order = replace(
             self.order,
             profile=values.get("profile") or self.order.profile,
             name=values.get("name") or self.order.name,
             calibration=self.path.parent / file if file else None,
+            channel=channel,
+            item=values.get("item") or self.order.item,
         )
         shared = replace(order, name=None)  # one fit for all that name the same file
         if shared not in self._prepared:

@@ -11,6 +11,7 @@ import hashlib
 import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -24,6 +25,7 @@ from teds_provision.errors import (
     TedsProvisionError,
     UsageError,
 )
+from teds_provision.files import read_limited
 from teds_provision.lazy import late
 from teds_provision.protocol import datasheet
 from teds_provision.sanitize import printable
@@ -34,6 +36,7 @@ from teds_provision.steps.sign import known_image, known_node_keys, unsigned_sec
 from teds_provision.steps.teds_read import NodeSnapshot
 from teds_provision.steps.verify import FreshnessFloor, Verification, verify_image
 from teds_provision.store import Draft, NodeRecord
+from teds_provision.teds.certificate import CertificateChoice, CertificateReference, ChooseItem
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.diff import Change, diff_blocks
@@ -66,6 +69,7 @@ else:  # numpy: not for a datasheet without calibration
 # -- the order: profile, calibration, name; read, fitted and guarded before any node is waited for ---------------------
 
 _UUID, _COUNT = "{uuid}", "{n}"
+_MOST_PEM: Final = 1 << 20
 _NOBODY: Final = bytes(10)
 
 
@@ -74,7 +78,9 @@ class BuildOrder:
     """What the user ordered: profile (None: the one that the node had), calibration file, name, and overrides.
 
     ``name`` may hold ``{uuid}`` (20 hex digits) or ``{n}`` (the first free number from 1). ``accept_calibration`` is
-    the reason given for a calibration that the guard would refuse.
+    the reason given for a calibration that the guard would refuse. ``channel`` is the one that the calibration is for
+    (None: as its file states), ``due`` when the next one is due. Of a certificate ``item`` is the result to use,
+    ``choose`` is asked where several fit, and ``trusted`` are the files with certificates (PEM) of its signers.
     """
 
     profile: str | None = None
@@ -84,6 +90,11 @@ class BuildOrder:
     accept_calibration: str | None = None
     retype: bool = False  # the board may become one of another type than it claims
     adopt: bool = False  # whether the datasheet that the board brought is signed, by a person's yes
+    channel: int | None = None
+    item: str | None = None
+    trusted: tuple[Path, ...] = ()
+    due: datetime | None = None
+    choose: ChooseItem | None = field(default=None, compare=False)
 
     @property
     def names_nothing(self) -> bool:
@@ -250,6 +261,9 @@ def compose(
     warnings: tuple[str, ...] = ()
     if calibrations is None:
         calibrations, warnings = _kept_calibrations(order, has, profile)
+    elif order.channel is not None:  # it names one channel; the other ones keep theirs
+        others, warnings = _kept_calibrations(order, has, profile, but=order.channel)
+        calibrations = dict(sorted({**others, **calibrations}.items()))
     record = station.nodes.get(uuid)
     kept = order.name or name or (record.name if as_known and record is not None else None)
     made, digest = _built_of(profile, uuid, calibrations, kept, edition), digest_of(profile)
@@ -298,7 +312,8 @@ def content_digests(prepared: PreparedOrder) -> tuple[str, str]:
     if calibrations is None:
         return digest_of(profile), ""
     blocks = _built_of(profile, _NOBODY, calibrations, None, 2007).blocks
-    fitted = [[*block, octets.hex()] for block, octets in sorted(blocks.items()) if block[1] == AccessCode.CALIBRATION]
+    wanted = (AccessCode.CALIBRATION, AccessCode.CERTIFICATE)
+    fitted = [[*block, octets.hex()] for block, octets in sorted(blocks.items()) if block[1] in wanted]
     return digest_of(profile), hashlib.sha256(json.dumps(fitted).encode()).hexdigest()
 
 
@@ -315,15 +330,15 @@ def _absolute_profile(profile: str | None) -> str | None:
 
 
 def _kept_calibrations(
-    order: BuildOrder, has: Image | None, profile: Profile
+    order: BuildOrder, has: Image | None, profile: Profile, *, but: int | None = None
 ) -> tuple[dict[int, Calibration], tuple[str, ...]]:
-    """Return the calibrations that the node has and the order does not drop, and a warning if there are any.
+    """Return the calibrations that the node has (``but`` of this channel) and the order keeps, and a warning if any.
 
     Raises CalibrationMisfitError if one was made for another channel than the profile's.
     """
     if order.drop_calibration or has is None:
         return {}, ()
-    kept = teds_calibrations(has)
+    kept = {number: found for number, found in teds_calibrations(has).items() if number != but}
     if not kept:
         return {}, ()
     require_fit(kept, has, Image(_NOBODY, dict(_built_of(profile, _NOBODY, {}, None, 2007).blocks)), profile)
@@ -347,6 +362,12 @@ def require_fit(kept: Mapping[int, Calibration], has: Image, new: Image, profile
                 hint="Give this channel a calibration (--calibration FILE), or drop the existing one"
                 " (--no-calibration).",
             )
+
+
+def certificate_brought(calibrations: Mapping[int, Calibration]) -> CertificateReference | None:
+    """Return the certificate that was read for these calibrations, None if they come from elsewhere."""
+    found = [known.certificate for known in calibrations.values() if known.certificate is not None]
+    return next((certificate for certificate in found if certificate.signature), None)
 
 
 def teds_calibrations(image: Image) -> dict[int, Calibration]:
@@ -493,7 +514,9 @@ def _passed_over(station: Station, wanted: str) -> tuple[str, ...]:
 def _from_file(order: BuildOrder, profile: Profile) -> Mapping[int, Calibration] | None:
     if order.calibration is None:
         return None
-    return calibration.load_calibrations(order.calibration, profile)
+    pems = tuple(read_limited(path, _MOST_PEM, "certificate") for path in order.trusted)
+    choice = CertificateChoice(order.channel, order.item, pems, order.choose)
+    return calibration.load_calibrations(order.calibration, profile, choice, due=order.due)
 
 
 def _built_of(

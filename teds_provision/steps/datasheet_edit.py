@@ -6,7 +6,8 @@ The document is the whole datasheet. Other TEDS of the node that are read-only s
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadDataError, DatasheetChangedError
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
@@ -25,6 +26,9 @@ from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.formats import stated_uuid, under
 from teds_provision.teds.image import BlockId, Image
+
+if TYPE_CHECKING:
+    from teds_provision.teds.calibration import Calibration
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ def plan_sheet(
             hint="Read it again, or repeat the dry run, and review the changes.",
         )
     keep = {block: present.image.blocks[block] for block in present.read_only}
-    image = Image(node.uuid, {**keep, **under(blocks, node.uuid)})
+    image = without_stale_certificates(present.image, Image(node.uuid, {**keep, **under(blocks, node.uuid)}))
     told = () if retype else differences(present.image.blocks, image)
     if told:
         require_board_type(node.uuid, told)
@@ -95,6 +99,26 @@ def plan_sheet(
     warnings += topic_warnings(station, present.image, image)
     changes = tuple(diff_blocks(present.image.unsigned_blocks(), image.unsigned_blocks()))
     return SheetPlan(image, changes, warnings, present)
+
+
+def without_stale_certificates(before: Image, after: Image) -> Image:
+    """Return the image without the Certificate TEDS of calibrations that another one replaces.
+
+    One that came with the new calibration stays, and so does that of a calibration whose zero offset alone changes.
+    """
+    old, new = teds_calibrations(before), teds_calibrations(after)
+    stale = {
+        (number, AccessCode.CERTIFICATE)
+        for number, calibration in old.items()
+        if calibration.certificate is not None
+        and (number not in new or _unzeroed(new[number]) != _unzeroed(calibration))
+        and after.blocks.get((number, AccessCode.CERTIFICATE)) == before.blocks[number, AccessCode.CERTIFICATE]
+    }
+    return Image(after.uuid, {block: teds for block, teds in after.blocks.items() if block not in stale})
+
+
+def _unzeroed(calibration: Calibration) -> Calibration:
+    return replace(calibration, zero_offset=0.0, zeroed=None, certificate=None)
 
 
 def write_sheet(

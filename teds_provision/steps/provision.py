@@ -33,6 +33,7 @@ from teds_provision.steps.build import (
     Confirm,
     PreparedOrder,
     Proposal,
+    certificate_brought,
     merged,
     named_for,
     no_confirmation,
@@ -51,6 +52,7 @@ from teds_provision.store.records import Assurance
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.progress import DONE, NOTHING, SKIPPED, Reporter, StepResult, Steps
 from teds_provision.teds.calibration.formula import sentence
+from teds_provision.teds.certificate import CertificateReference
 from teds_provision.teds.image import SECURITY, Image
 
 Order = BuildOrder | PreparedOrder | Callable[["IdentifiedNode"], PreparedOrder]
@@ -72,6 +74,8 @@ class ProvisionResult:
     warnings: tuple[str, ...]
     samples: tuple[dict[str, Any], ...] = ()
     """One reading of each sensor at the end: channel, name, value and unit (SI), valid."""
+    certificate: CertificateReference | None = None
+    """The certificate that this run calibrated the node by."""
 
 
 def verify_only(station: Station, node: Conversation, line: ProductionLine, reporter: Reporter) -> ProvisionResult:
@@ -273,7 +277,10 @@ class _Run:
         verified = self._verify(who, written)
         borne = self._check(prepared, written, verified)
         warnings = merged((*proposal.warnings, *further(present.image.blocks, proposal.image), *borne.warnings))
-        return ProvisionResult(who, tuple(self.steps.done), written.on_node, verified, warnings, borne.samples)
+        certificate = certificate_brought(proposal.calibrations)
+        return ProvisionResult(
+            who, tuple(self.steps.done), written.on_node, verified, warnings, borne.samples, certificate
+        )
 
     def _require_its_board(self, who: IdentifiedNode, prepared: PreparedOrder, told: tuple[str, ...]) -> None:
         """Ask, or refuse, if the board claims another type; only the first of the two checks asks."""

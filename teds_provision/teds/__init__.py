@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         calibration,
         codec,
         curve,
+        dcc,
         diff,
         fits,
         formats,

@@ -15,6 +15,7 @@ from typing import Final
 
 from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import Calibration, from_decoded, is_finite
+from teds_provision.teds.certificate import certificate_reference_of
 from teds_provision.teds.channel import (
     NOT_STATED,
     Channel,
@@ -183,6 +184,7 @@ class _Reader:
             found = from_decoded(teds, channel=number, units=own.units, actuator=own.actuator)
         except BadDataError as error:
             return replace(own, calibration_problem=error.message)
+        found = replace(found, certificate=certificate_reference_of(self.blocks, number))
         self.understood[number] = found
         problem = computable(found)
         return replace(own, calibration=None if problem else found, calibration_problem=problem)

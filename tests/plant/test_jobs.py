@@ -41,8 +41,10 @@ from teds_provision.steps.build import BuildOrder, PreparedOrder, prepare
 from teds_provision.steps.provision import ProvisionResult, provision, verify_only
 from teds_provision.store.tables.parcels import ParcelRow
 from teds_provision.talk.progress import SilentReporter
+from teds_provision.teds.certificate import certificate_reference_of
 from teds_provision.teds.profile.load import files_digest, find_profile, shipped_profiles
 from tests.bench import Board, MemoryLink, make_station, talk
+from tests.teds.certificates import ANGLE as CERTIFICATE
 
 from .owner import ALL, ANGLE, NOW, alone, job_of, join, member, roster_of
 from .stations import Plant
@@ -193,12 +195,13 @@ def test_a_board_on_the_bus_is_not_enough_for_a_job_that_asks_for_taps(owner: St
     assert one.state.state == NodeState.FACTORY
 
 
-def test_calibrations_are_those_that_the_job_names(tmp_path: Path, owner: Station) -> None:
+@pytest.mark.parametrize("kind", ["csv", "xml"])
+def test_calibrations_are_those_that_the_job_names(tmp_path: Path, owner: Station, kind: str) -> None:
     one, two = board(1), board(2)
     folder = tmp_path / "calibrations"
     folder.mkdir()
-    file = folder / f"{one.uuid.hex()}.csv"
-    file.write_text("raw, value\n0, 0\n16384, 6.283185307\n")
+    file = folder / f"{one.uuid.hex()}.{kind}"
+    file.write_bytes(b"raw, value\n0, 0\n16384, 6.283185307\n" if kind == "csv" else CERTIFICATE)
     rule = CalibrationRule(
         "list", by_uuid={uuid: hashlib.sha256(file.read_bytes()).hexdigest() for uuid in (one.uuid, two.uuid)}
     )
@@ -209,9 +212,11 @@ def test_calibrations_are_those_that_the_job_names(tmp_path: Path, owner: Statio
     with pytest.raises(PolicyError, match="not the one the job specifies"):
         build(line, two)
     assert units(line) == []
-    build(line, one)
+    done = build(line, one)
     (row,) = owner.plant.line.evidence(uuid=one.uuid)
     assert codec.read(row.document).facts.calibration_sha256 == rule.by_uuid[one.uuid]
+    told = certificate_reference_of(done.image.blocks, 1)
+    assert (told.sha256 if told else None) == (rule.by_uuid[one.uuid] if kind == "xml" else None)
 
 
 TABLE = "raw, value\n0, 0\n16384, 6.283185307\n"

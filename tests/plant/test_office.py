@@ -38,9 +38,11 @@ from teds_provision.station.station import Station
 from teds_provision.store import RevocationRecord
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.profile.load import find_profile
 from tests.bench import Board
+from tests.teds.certificates import ANGLE as CERTIFICATE
 
 from .owner import ANGLE, NOW, job_of
 from .stations import Plant
@@ -200,13 +202,16 @@ def test_the_same_request_gets_the_same_answer_octet_for_octet(desk: Desk) -> No
     assert len(list(desk.office.plant.line.sign_requests(request.job, request.uuid, "in"))) == 1
 
 
-def test_calibrations_come_along_and_are_fitted_by_the_office(desk: Desk, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["csv", "xml"])
+def test_calibrations_come_along_and_are_fitted_by_the_office(desk: Desk, tmp_path: Path, kind: str) -> None:
     one = board(1)
-    file = tmp_path / f"{one.uuid.hex()}.csv"
-    file.write_text("raw, value\n0, 0\n16384, 6.283185307\n")
+    file = tmp_path / f"{one.uuid.hex()}.{kind}"
+    file.write_bytes(b"raw, value\n0, 0\n16384, 6.283185307\n" if kind == "csv" else CERTIFICATE)
     rule = CalibrationRule("list", by_uuid={one.uuid: hashlib.sha256(file.read_bytes()).hexdigest()})
     run = desk.run(tmp_path, calibration=rule)
-    assert build(run, one).verified.verdict == "authentic"
+    done = build(run, one)
+    assert done.verified.verdict == "authentic"
+    assert ((1, AccessCode.CERTIFICATE) in done.image.blocks) == (kind == "xml"), "the office made the same TEDS"
     request = desk.at_hand.asked[-1]
     other = proven(request, desk.line, one, nonce=bytes(16), calibration=b"raw, value\n0, 0\n16384, 7\n")
     assert desk.asks(other).refused == "job"

@@ -49,7 +49,7 @@ from teds_provision.teds.formats import placed
 _log = logging.getLogger(__name__)
 WAITING: Final = 300.0  # seconds for a tap
 NEXT: Final = "next"
-_SUFFIXES: Final = (".csv", ".json", ".toml", ".txt")
+_SUFFIXES: Final = (".csv", ".json", ".toml", ".txt", ".xml")
 
 
 @dataclass
@@ -103,12 +103,15 @@ class Provisioning:
         name: str | None,
         calibration: str | None,
         calibration_name: str | None,
+        channel: int | None = None,
+        item: str | None = None,
         adopt: bool = False,
         accept: str | None = None,
     ) -> dict[str, Any]:
         """Begin a run; ``uuid`` may be ``next``: whichever node is tapped next. Return what it waits for.
 
-        ``adopt``: the board's own datasheet is signed; ``accept`` is the reason to accept it in spite of findings.
+        ``channel`` is the one that the calibration is for, ``item`` the result of a certificate. ``adopt``: the board's
+        own datasheet is signed; ``accept`` is the reason to accept it in spite of findings.
 
         Raises UsageError, NotFoundError, BadDataError, PolicyError for what cannot be built, StoreError if no temporary
         file can be written, before any wait.
@@ -128,6 +131,8 @@ class Provisioning:
                 name=name,
                 adopt=adopt,
                 accept_calibration=accept,
+                channel=channel,
+                item=item,
             )
             prepare(self._station, order, None if uuid == NEXT else bytes.fromhex(uuid))
         except BaseException as error:

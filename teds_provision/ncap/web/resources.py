@@ -304,6 +304,8 @@ class Resources:
                 name=body.name,
                 calibration=body.calibration,
                 calibration_name=body.calibration_name,
+                channel=body.calibration_channel,
+                item=body.calibration_item,
                 adopt=bool(body.adopt),
                 accept=body.accept_calibration,
             )

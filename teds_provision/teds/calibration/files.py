@@ -1,4 +1,4 @@
-"""Calibration files: CSV of measured points or of segments, TOML and JSON of points or ready coefficients.
+"""Calibration files: CSV of points or of segments, TOML and JSON of points or coefficients, certificates (DCC).
 
 Metadata of a CSV are lines ``# key: value``; every error names file, line and field.
 """
@@ -9,19 +9,28 @@ import csv
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from difflib import get_close_matches
 from itertools import count, takewhile
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from teds_provision.errors import BadDataError
+from teds_provision.errors import BadDataError, StoreError
+from teds_provision.files import read_limited
+from teds_provision.lazy import late
 from teds_provision.limits import LIMITS, check_size, load_json
 from teds_provision.teds.calibration.model import PLAIN, Calibration
 from teds_provision.teds.calibration.order import CalibrationOrder, calibration_of
+from teds_provision.teds.certificate import CertificateChoice, CertificateReference
 from teds_provision.teds.profile.model import ChannelProfile, Profile
 from teds_provision.teds.profile.reader import PlacedValue, SourcePlace, TomlTable, parse, read_text
 from teds_provision.teds.units import parse_unit
+
+if TYPE_CHECKING:
+    from teds_provision.teds.dcc import items, signature
+else:  # lxml: not for a calibration that is no certificate
+    items, signature = late("teds_provision.teds.dcc.items"), late("teds_provision.teds.dcc.signature")
 
 # The CSV reader takes delimiter, decimal comma, header, units and metadata as instruments and spreadsheets write them.
 # Columns whose name begins with "#" are remarks.
@@ -270,16 +279,92 @@ CSV_KEYS: Final = KEYS[:12]
 _CHANNELS: Final = re.compile(r"([0-9]{1,5})(?:\s*-\s*([0-9]{1,5}))?\Z")
 
 
-def load_calibrations(path: Path, profile: Profile) -> dict[int, Calibration]:
+CERTIFICATE: Final = ".xml"
+"""Ending of a certificate's name."""
+
+
+def load_calibrations(
+    path: Path, profile: Profile, choice: CertificateChoice | None = None, *, due: datetime | None = None
+) -> dict[int, Calibration]:
     """Read a calibration file for the channels of a profile: by channel number, fitted as file or profile ask.
 
-    Raises NotFoundError (no such file) and BadDataError (file, line, field, and what is wrong).
+    ``choice`` says how a certificate is to be read; ``due`` is when the next calibration is due, whatever the file and
+    the profile state. Raises NotFoundError (no such file) and BadDataError (file, line, field, and what is wrong), and
+    for a certificate UsageError (an unclear item, no lxml) and NotAuthenticError (a bad signature).
     """
-    return read_calibrations(read_text(path), str(path), profile)
+    if path.suffix.lower() == CERTIFICATE:
+        octets = read_limited(path, LIMITS.certificate, "certificate", failure=StoreError)
+        found = read_certified(octets, str(path), profile, choice)
+    else:
+        found = read_calibrations(read_text(path), str(path), profile)
+        found = _for_channel(found, choice, str(path))
+    return {number: _with_due(calibration, due, str(path)) for number, calibration in found.items()}
+
+
+def _for_channel(found: dict[int, Calibration], choice: CertificateChoice | None, file: str) -> dict[int, Calibration]:
+    """What a file holds for the channel that the caller names, all of it if none is named."""
+    if choice is None or choice.channel is None:
+        return found
+    if choice.channel not in found:
+        raise BadDataError(f"{file} holds no calibration of channel {choice.channel}.")
+    return {choice.channel: found[choice.channel]}
+
+
+def _with_due(calibration: Calibration, due: datetime | None, file: str) -> Calibration:
+    if due is None:
+        return calibration
+    if calibration.date is None:
+        raise BadDataError(f"{file} states no date, so it cannot be due on {due:%Y-%m-%d}.", hint="Add # date: to it.")
+    seconds = (due - calibration.date).total_seconds()
+    if not 0 < seconds < 2**32:
+        raise BadDataError(f"A calibration of {calibration.date:%Y-%m-%d} cannot be due on {due:%Y-%m-%d}.")
+    return replace(calibration, interval=seconds)
+
+
+def read_certified(
+    octets: bytes, file: str, profile: Profile, choice: CertificateChoice | None = None
+) -> dict[int, Calibration]:
+    """Read a certificate for the one channel of a profile that it is for; see :func:`load_calibrations`."""
+    wanted = choice or CertificateChoice()
+    certificate = signature.read_checked(octets, file, wanted.trusted, datetime.now(UTC))
+    channel = _certified_channel(certificate.file, profile, wanted.channel)
+    item = items.chosen_item(certificate, channel, wanted)
+    calibration = calibration_of(items.order_of(certificate, item, channel), channel)
+    reference = CertificateReference(
+        certificate.number,
+        certificate.laboratory,
+        certificate.calibrated.isoformat(),
+        certificate.sha256,
+        certificate.signature,
+        (*certificate.warnings, *certificate.unchecked),
+    )
+    reference.encode()  # raises if the number does not fit
+    return {channel.number: replace(calibration, certificate=reference)}
+
+
+def _certified_channel(file: str, profile: Profile, number: int | None) -> ChannelProfile:
+    if number is None:
+        wanting = [channel for channel in profile.channels if channel.calibration.required] or profile.channels
+        if len(wanting) == 1:
+            return wanting[0]
+        raise BadDataError(
+            f"{profile.name} has {len(profile.channels)} channels: say which one {file} is for.",
+            hint=f"Put its number before the file: --calibration {wanting[0].number}={file}" if wanting else "",
+        )
+    channel = profile.channel(number)
+    if channel is None:
+        many = len(profile.channels)
+        raise BadDataError(f"{profile.name} has {'channel 1' if many == 1 else f'channels 1 to {many}'}, not {number}.")
+    return channel
 
 
 def read_calibrations(text: str, file: str, profile: Profile) -> dict[int, Calibration]:
-    """As :func:`load_calibrations`, from text; the ending of the name ``file`` decides: .toml, .json, else CSV."""
+    """As :func:`load_calibrations`, from text.
+
+    The ending of the name ``file`` decides: .toml, .json, .xml for a certificate, else CSV.
+    """
+    if Path(file).suffix.lower() == CERTIFICATE:
+        return read_certified(text.encode(), file, profile)
     match Path(file).suffix.lower():
         case ".toml":
             orders = _from_table(parse(text, file), file)

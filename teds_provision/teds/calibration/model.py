@@ -16,6 +16,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
 
 from teds_provision.errors import BadDataError
+from teds_provision.teds.certificate import CertificateReference
 from teds_provision.teds.codec.model import DecodedTeds, Edition, Field, TimeInstance, Units
 from teds_provision.teds.units import WrittenUnit, parse_unit, recognize
 
@@ -79,8 +80,9 @@ class Calibration:
     ``unit`` is the calibrated unit with its conversion into SI (SIConvrt); limits, uncertainty and zero offset are in
     it. For an actuator the formula runs from calibrated units to raw, and the zero offset is raw. ``points`` are the
     (raw, value) pairs that it was fitted to; they do not go into the TEDS. ``interval`` is in seconds, ``zeroed`` when
-    the zero offset was set where the sensor is mounted. ``monotone`` and ``raw_range`` are what the transducer type
-    demands and delivers, carried along so that the guard knows them without the profile.
+    the zero offset was set where the sensor is mounted. ``certificate`` is where it comes from, in a TEDS beside it.
+    ``monotone`` and ``raw_range`` are what the transducer type demands and delivers, carried along so that the guard
+    knows them without the profile.
     """
 
     channel: int
@@ -100,6 +102,7 @@ class Calibration:
     monotone: Monotone | None = None
     raw_range: tuple[float, float] | None = None
     zeroed: datetime | None = None
+    certificate: CertificateReference | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.inputs) <= MAXIMUM_INPUTS:

@@ -57,6 +57,12 @@ def with_point(text: str, file: str, point: Point, *, node: str, unit: WrittenUn
     return dated + ("" if dated.endswith("\n") else "\n") + _row(point, own)
 
 
+def node_of(text: str) -> str:
+    """UUID of the node that the points are of, 20 hex digits; "" if the file names none."""
+    owner = _NODE.search(text)
+    return owner[1] if owner is not None else ""
+
+
 def _row(point: Point, unit: WrittenUnit) -> str:
     value = f"{unit.from_si(point.reference):.9g}"
     return f"{point.channel}, {point.raw:.9g}, {value}, {point.spread:.3g}, {point.count}\n"

@@ -226,6 +226,7 @@ def _demand(section: Section, unit: WrittenUnit | None) -> CalibrationDemand:
         raw_range=_raw_range(part),
         zero_offset=part.flag("zero-offset"),
         standard_deviation=deviation if isinstance(deviation, float) else None,
+        indication=_indication(part),
     )
     part.finish()
     return demand
@@ -268,6 +269,18 @@ def _raw_range(part: Section) -> tuple[float, float] | None:
         if -FLOAT32_MAXIMUM <= low < high <= FLOAT32_MAXIMUM:
             return float(low), float(high)
     part.error("raw-range", f"two numbers, the lower one first, are expected, like [0, 65535], not {value!r}.")
+    return None
+
+
+def _indication(part: Section) -> tuple[float, float] | None:
+    value = part.item("indication")
+    if value is None:
+        return None
+    if isinstance(value, list) and len(value) == 2 and all(type(number) in (int, float) for number in value):
+        slope, intercept = value
+        if 0 < abs(slope) <= FLOAT32_MAXIMUM and abs(intercept) <= FLOAT32_MAXIMUM:
+            return float(slope), float(intercept)
+    part.error("indication", f"slope and intercept are expected, like [0.01, -40.0], not {value!r}.")
     return None
 
 

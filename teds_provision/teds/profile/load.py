@@ -344,6 +344,7 @@ def template(name: str) -> str:
             '# monotone = "increasing"           # increasing, decreasing, true (either)',
             '# interval = "1 year"               # due again after this time',
             "# raw-range = [0, 65535]            # raw values that the electronics can give",
+            "# indication = [0.01, -40.0]        # slope, intercept: what a raw value indicates before calibration",
             "# zero-offset = false               # the offset may be adjusted in use",
             "# standard-deviation = 0.5          # in the channel's unit; variance of topics",
             "",

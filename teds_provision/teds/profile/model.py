@@ -30,7 +30,8 @@ class CalibrationDemand:
 
     ``raw_range`` is what the channel's electronics can deliver if that is less than its data model allows; ``interval``
     is in seconds; ``zero_offset``: the offset may be adjusted in use; ``standard_deviation`` (in the channel's unit,
-    informative) is a figure that a TEDS has no field for.
+    informative) is a figure that a TEDS has no field for; ``indication`` is slope and intercept from the raw number to
+    the value that the sensor indicates before it is calibrated, in the channel's unit.
     """
 
     required: bool = False
@@ -41,6 +42,8 @@ class CalibrationDemand:
     raw_range: tuple[float, float] | None = None
     zero_offset: bool = False
     standard_deviation: float | None = None
+    indication: tuple[float, float] | None = field(default=None, repr=False)
+    """Not in the profile's digest, which is made of the repr: it changes how a certificate is read, nothing else."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +188,8 @@ def _build(
             blocks[channel.number, AccessCode.CALIBRATION] = compose(
                 AccessCode.CALIBRATION, given.fields(edition), edition=edition
             )
+            if given.certificate is not None:
+                blocks[channel.number, AccessCode.CERTIFICATE] = given.certificate.encode()
         if channel.name:
             blocks[channel.number, AccessCode.NAME] = _name(channel.name, edition)
         warnings += _calibration_warnings(channel, given, now or datetime.now(UTC))
@@ -250,6 +255,8 @@ def _calibration_warnings(channel: ChannelProfile, given: Calibration | None, no
             return []
         return [f"{where} has no calibration, and its type asks for one: give it with --calibration FILE."]
     warnings = [f"{where}: {text}" for text in given.date_warnings(now, demand.interval)]
+    if given.certificate is not None:
+        warnings += [f"{where}: certificate {given.certificate.number}: {text}" for text in given.certificate.notes]
     if channel.calibration_key == _CAL_NONE:
         warnings.append(f"{where} has a calibration, but its calibration key says that there is none.")
     if demand.method and demand.method != given.method:

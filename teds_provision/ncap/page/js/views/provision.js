@@ -21,7 +21,9 @@ export class ProvisionTab {
     this.uuid = uuid;
     this.profile = h("select", {});
     this.name = h("input", { type: "text", maxlength: "120", autocomplete: "off" });
-    this.calibration = h("input", { type: "file", accept: ".csv,.toml,.json,.txt" });
+    this.calibration = h("input", { type: "file", accept: ".csv,.toml,.json,.txt,.xml", onchange: () => this.paint() });
+    this.item = h("input", { type: "text", maxlength: "120", autocomplete: "off", placeholder: "only if several fit" });
+    this.choice = field("Result of the certificate", this.item);
     this.go = button("Provision", { class: "main", onclick: () => this.go.busy(() => this.start()) }, "good");
     this.cancel = button("Cancel", { onclick: () => this.cancel.busy(() => this.end_waiting()) });
     this.waiting = h("div", { class: "waiting", role: "status" });
@@ -37,7 +39,7 @@ export class ProvisionTab {
         { class: "panel", "aria-label": "Provision" },
         h(uuid === "next" ? "h2" : "h3", {}, uuid === "next" ? "Provision the next tapped node" : "Provision"),
         h("p", { class: "hint" }, "Agrees on a key with the node and writes a signed datasheet. If a tap is needed, place the node on the reader when asked."),
-        h("div", { class: "row" }, field("Transducer type", this.profile), field("Name", this.name), field("Calibration file (optional)", this.calibration)),
+        h("div", { class: "row" }, field("Transducer type", this.profile), field("Name", this.name), field("Calibration file or certificate (optional)", this.calibration), this.choice),
         h("div", { class: "row" }, this.go, this.why),
         this.waiting,
         this.steps,
@@ -72,6 +74,7 @@ export class ProvisionTab {
       fill(this.profile, h("option", { value: "" }, "Choose a type"), state.profiles.map((one) => h("option", { value: one.name }, one.title || one.name)));
       this.profile.value = chosen;
     }
+    this.choice.hidden = !this.certified();
     const run = this.run;
     const busy = run?.state === "waiting" || run?.state === "running";
     const blocked = measuring(this.uuid) ? "This node is being measured. Stop the measurement first." : state.status?.write === false ? "This browser has read-only access." : "";
@@ -109,6 +112,11 @@ export class ProvisionTab {
     text(this.clock, `(${short(Math.max(0, Math.ceil(run.until - now())))} s)`);
   }
 
+  /** True if the chosen file is a calibration certificate. */
+  certified() {
+    return this.calibration.files[0]?.name.toLowerCase().endsWith(".xml") ?? false;
+  }
+
   async start() {
     this.outcome.replaceChildren();
     if (!this.profile.value) {
@@ -124,6 +132,7 @@ export class ProvisionTab {
         name: this.name.value.trim() || null,
         calibration: file ? await file.text() : null,
         calibration_name: file?.name ?? null,
+        calibration_item: this.certified() ? this.item.value.trim() || null : null,
       });
       // An event may have come before this answer, be it that of the end, and then knows more.
       if (this.run === before) state.runs.set(this.uuid, { steps: [], ...answer, state: answer.state ?? (answer.waits_for ? "waiting" : "running") });

@@ -1,0 +1,126 @@
+"""Signatures of calibration certificates: who signed what, and that only the signed part is read."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from lxml import etree
+
+from teds_provision.errors import BadDataError, NotAuthenticError
+from teds_provision.teds.dcc.read import DigitalCertificate
+from teds_provision.teds.dcc.signature import read_checked
+
+from .certificates import ANGLE, changed, signer, signer_under_ca
+
+DS = "{http://www.w3.org/2000/09/xmldsig#}"
+
+
+def read(octets: bytes, *trusted: bytes, later: float = 0) -> DigitalCertificate:
+    return read_checked(octets, "c.xml", trusted, datetime.now(UTC) + timedelta(days=later))
+
+
+@pytest.mark.parametrize("xades", [True, False], ids=["XAdES", "XMLDSig"])
+def test_a_signature_is_good_by_the_laboratory_that_is_trusted_and_by_nobody_else(xades: bool) -> None:
+    lab, other = signer(), signer("Another laboratory")
+    signed = lab.sign(ANGLE, xades=xades)
+    good = read(signed, other.certificate, lab.certificate)
+    assert good.signature == "good"
+    assert "revocation" in " ".join(good.unchecked), "what was not checked is stated"
+    assert good.number == "B2-2026-0042"
+    unknown = read(signed)
+    assert unknown.signature == "not checked"
+    assert "--trust-dcc" in unknown.unchecked[0]
+    with pytest.raises(NotAuthenticError, match="CN=Thermolab Example, which is not trusted"):
+        read(signed, other.certificate)
+
+
+def test_a_changed_certificate_is_refused_whoever_is_trusted() -> None:
+    lab = signer()
+    forged = changed(lab.sign(ANGLE), ("91.6", "81.6"))
+    for trusted in ((), (lab.certificate,)):
+        with pytest.raises(NotAuthenticError, match=r"signature of c\.xml is bad"):
+            read(forged, *trusted)
+
+
+def test_a_signature_cannot_be_left_out_where_one_is_required() -> None:
+    lab = signer()
+    assert read(ANGLE).unchecked == ("The certificate has no signature.",)
+    with pytest.raises(NotAuthenticError, match="has no signature"):
+        read(ANGLE, lab.certificate)
+    signed = lab.sign(ANGLE)
+    bare = changed(signed, ("http://www.w3.org/2001/04/xmldsig-more#ecdsa-sha256", "urn:unknown"))
+    assert "cannot be checked" in read(bare).unchecked[0]
+    with pytest.raises(NotAuthenticError, match="cannot be checked"):
+        read(bare, lab.certificate)
+
+
+def test_a_laboratory_below_a_trusted_ca_is_trusted() -> None:
+    lab, ca = signer_under_ca()
+    assert read(lab.sign(ANGLE), ca).signature == "good"
+    with pytest.raises(NotAuthenticError, match="CN=Lab under a CA, which is not trusted"):
+        read(lab.sign(ANGLE), signer().certificate)
+
+
+def test_an_expired_signers_certificate_counts_at_the_time_of_signing_and_is_stated() -> None:
+    lab = signer()
+    late = read(lab.sign(ANGLE), lab.certificate, later=400)
+    assert late.signature == "good"
+    assert late.unchecked[0].startswith("The signer's certificate has expired")
+    with pytest.raises(NotAuthenticError, match="not valid any more"):
+        read(lab.sign(ANGLE, xades=False), lab.certificate, later=400)  # states no time
+    below, ca = signer_under_ca()
+    assert read(below.sign(ANGLE), ca, later=400).unchecked.count(late.unchecked[0]) == 1
+    gone = signer("Expired long ago", (-900, -500))
+    with pytest.raises(NotAuthenticError, match="not valid any more"):
+        read(gone.sign(ANGLE), gone.certificate)
+
+
+def test_a_signature_wrapped_into_another_certificate_covers_nothing() -> None:
+    """The signed certificate goes into a comment of a forged one: the signature must not count for the forged one."""
+    lab = signer()
+    signed = etree.fromstring(lab.sign(ANGLE))
+    signature = signed.find(f"{DS}Signature")
+    signed.remove(signature)
+    for target in ("", "#inner"):
+        forged = etree.fromstring(changed(ANGLE, ("91.6", "11.6")))
+        hidden = etree.SubElement(forged, "{https://ptb.de/dcc}comment")
+        inner = etree.fromstring(etree.tostring(signed))
+        inner.set("Id", "inner")
+        hidden.append(inner)
+        copy = etree.fromstring(etree.tostring(signature))
+        for reference in copy.iter(f"{DS}Reference"):
+            if reference.get("URI") == "":
+                reference.set("URI", target)
+        forged.append(copy)
+        for trusted in ((), (lab.certificate,)):
+            with pytest.raises(NotAuthenticError):
+                read(etree.tostring(forged), *trusted)
+
+
+def test_what_stands_beside_the_signed_part_is_not_read() -> None:
+    """Of a document that was signed as a whole nothing can be added; comments are no part of it, and not read."""
+    lab = signer()
+    commented = changed(lab.sign(ANGLE), ("B2-2026-0042", "B2-<!-- 9 -->2026-0042"))
+    assert read(commented, lab.certificate).number == "B2-2026-0042"
+
+
+def test_two_signatures_or_too_many_references_are_refused_if_one_is_required() -> None:
+    lab = signer()
+    signed = etree.fromstring(lab.sign(ANGLE))
+    signature = signed.find(f"{DS}Signature")
+    signed.append(etree.fromstring(etree.tostring(signature)))
+    assert "2 signatures" in read(etree.tostring(signed)).unchecked[0]
+    with pytest.raises(NotAuthenticError, match="2 signatures"):
+        read(etree.tostring(signed), lab.certificate)
+    many = etree.fromstring(lab.sign(ANGLE))
+    info = many.find(f"{DS}Signature/{DS}SignedInfo")
+    for _ in range(9):
+        info.append(etree.fromstring(etree.tostring(info.find(f"{DS}Reference"))))
+    with pytest.raises(NotAuthenticError, match="references"):
+        read(etree.tostring(many), lab.certificate)
+
+
+def test_a_file_that_holds_no_certificate_is_named_as_such() -> None:
+    with pytest.raises(BadDataError, match="no certificate in PEM"):
+        read(ANGLE, b"-----BEGIN NOTHING-----")
