@@ -537,7 +537,7 @@ def _alarm(station: Station, alarm: Any) -> dict[str, Any]:
 def _alarm_line(station: Station, alarm: Any) -> str:
     held = station.plant.roster
     name = held.name_of(alarm.about) if held is not None and alarm.about else ""
-    return f"{alarm.code}{f' of {name}' if name else ''}, {alarm.n}: {alarm.why}"
+    return f"{alarm.code}{f' of {name}' if name else ''}{f', {alarm.n}' if alarm.n else ''}: {alarm.why}"
 
 
 # -- looking -----------------------------------------------------------------------------------------------------------

@@ -263,7 +263,8 @@ class _Reader:
         suspicious = isinstance(error, (BadDataError, NotAuthenticError)) and not self._is_from_removed(parcel)
         with self.station.durable(_COMMAND):
             if suspicious:
-                self.station.plant.tables.put_alarm(Alarm("parcel", parcel.sender, 0, error.message), again=True)
+                why = f"a parcel was discarded: {error.message.rstrip('.')}"
+                self.station.plant.tables.put_alarm(Alarm("parcel", parcel.sender, 0, why), again=True)
             self.station.audit("import", None, "parcel discarded", parcel=parcel.id, why=error.message)
         return True
 

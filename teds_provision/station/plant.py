@@ -160,8 +160,7 @@ class Plant:
         counted = {station: chain.counted[0] for station, chain in self.tables.chains().items()}
         behind = next(
             (
-                f"{held.name_of(who)} reports page {n} of {held.name_of(about)}, a keeper;"
-                f" the last one here is {counted.get(about, 0)}"
+                signer.missing_pages(f"the keeper {held.name_of(about)}", held.name_of(who), n, counted.get(about, 0))
                 for who, about, n, _ in self.tables.heads()
                 if n > counted.get(about, 0)
                 and about != self._identity.fingerprint  # a keeper knows its own chain

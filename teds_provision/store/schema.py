@@ -282,11 +282,14 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         "DROP TABLE measurements_before",
     ),
     # groups are kept once: what a bundle or `replace` wrote into the row of a node joins the measurement groups. A name
-    # that no group may have gets a word before it, as station/groups.py `valid_name` gives it.
+    # that no group may have gets a word before it, as station/groups.py `valid_name` gives it. Nodes that were taken
+    # out of service leave their groups, as `decommission` and `replace` do today (handover/life.py).
     14: (
         "INSERT OR IGNORE INTO groups"
         f" SELECT DISTINCT {_GROUP_NAME}, strftime('%Y-%m-%dT%H:%M:%SZ', 'now') FROM {_NODES_GROUPS}",
         f"INSERT OR IGNORE INTO group_members SELECT {_GROUP_NAME}, nodes.uuid FROM {_NODES_GROUPS}",
+        "DELETE FROM group_members WHERE uuid IN (SELECT uuid FROM nodes"
+        " WHERE retired LIKE 'decommissioned%' OR retired LIKE 'replaced by%')",
         "ALTER TABLE nodes DROP COLUMN groups",
         "CREATE INDEX groups_of_node ON group_members(uuid)",
     ),

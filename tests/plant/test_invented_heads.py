@@ -37,7 +37,8 @@ def test_an_auditors_word_counts_for_nothing_and_a_keeper_knows_its_own_chain(
         assert said is not None
         assert said.result == ("unproven" if unproven and station is south else "failed")
         if said.result == "unproven":
-            assert said.why == "witness reports page 10000 of north, a keeper; the last one here is 0"
+            why = "pages of the keeper north are missing here: witness names page 10000, and the last one here is 0"
+            assert said.why == why
     made.close()
 
 

@@ -97,6 +97,13 @@ def test_groups_of_an_earlier_schema_are_kept_once(tmp_path: Path) -> None:
         connection.execute("INSERT INTO meta VALUES('id', 'ab')")
         connection.execute("INSERT INTO groups VALUES('arm', '2026-01-01T00:00:00Z')")
         connection.execute("INSERT INTO group_members VALUES('arm', ?)", (nodes[2],))
+        for number, retired in ((8, "decommissioned, unconfirmed"), (9, "replaced by " + nodes[0].hex())):
+            connection.execute(
+                "INSERT INTO nodes(uuid, state, epoch, sequence, can_address, groups, channels, retired)"
+                " VALUES(?, 0, 0, 0, 0, '[\"arm\"]', 0, ?)",
+                (bytes([number]) * 10, retired),
+            )
+            connection.execute("INSERT INTO group_members VALUES('arm', ?)", (bytes([number]) * 10,))
         for uuid, of_node in zip(nodes, labels, strict=True):
             row = (uuid, json.dumps(of_node))
             connection.execute(

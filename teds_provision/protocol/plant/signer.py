@@ -27,6 +27,11 @@ class SignerVerdict(NamedTuple):
     why: str = ""
 
 
+def missing_pages(whose: str, reporter: str, n: int, here: int) -> str:
+    """Return whose pages are missing, who reports which one, and the number of the last one here."""
+    return f"pages of {whose} are missing here: {reporter} names page {n}, and the last one here is {here}"
+
+
 def limit_of(member: Member | RemovedMember) -> Place | None:
     """Return up to which page the ``signed`` events of a station without ``sign`` count; None: it never had it."""
     if isinstance(member, Member):
@@ -65,8 +70,7 @@ def signing(
     if limit is not None and any(n <= limit[0] for n in own):
         return SignerVerdict("passed", f"signed by {one.name} while it had the role")
     if limit is not None and counted.get(signer, 0) < limit[0]:
-        here = counted.get(signer, 0)
-        return SignerVerdict("unproven", f"the roster names page {limit[0]} of {one.name}; the last one here is {here}")
+        return SignerVerdict("unproven", missing_pages(one.name, "the roster", limit[0], counted.get(signer, 0)))
     if isinstance(one, RemovedMember) and keepers_behind:
         return SignerVerdict("unproven", keepers_behind)
     why = "never had the role sign" if limit is None else "this datasheet is not in its pages of that time"
