@@ -87,6 +87,7 @@ bench-measure: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.measure_load --seconds $(SECONDS)
 	$(BIN)/python -m benchmarks.sinks
 	$(BIN)/python -m benchmarks.sensor
+	$(BIN)/python -m benchmarks.wrapped
 	$(BIN)/python -m benchmarks.measure_time
 
 # The base station under load; SECONDS=3600 is the soak.

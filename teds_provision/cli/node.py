@@ -362,6 +362,7 @@ def _boards(
         return hardware_room.board.Board(
             teds.sheet.Sheet.from_image(teds.image.Image(uuid, hardware)),
             source=source if wrapped is None else wrapped.source(next(numbers)),
+            lag=0 if wrapped is None else node_room.wrapped.wrapped_source.LAG,
             battery=None if percent is None else hardware_room.board.Battery(percent),
             shown=lines.observer_of(uuid.hex()),
             tell=app.warn,

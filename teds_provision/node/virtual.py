@@ -285,6 +285,7 @@ class VirtualNode:
             return None
         frame = self._send_frames()
         self._tell_misses(board)
+        wait = max(wait, board.lag / NANOSECONDS / 2)  # what lags is sampled a few instants at a time
         wait = min(max(wait, _COARSE), _EVENTS if board.has_events else wait + _COARSE)
         return wait if frame is None else min(frame, wait)
 
@@ -294,7 +295,7 @@ class VirtualNode:
         So a host that let the process wait for a moment costs no samples; one that is too slow for long does. Returns
         what Tim.poll returns.
         """
-        real = board.clock.tick()
+        real = max(0, board.clock.tick() - board.lag)
         at = max(self._sampled, real - _MOST_BEHIND) if board.clock.runs_by_itself else self._sampled
         while True:
             board.sampling = at

@@ -61,6 +61,11 @@ class SensorBus:
                 [{"can_id": number, "can_mask": mask, "extended": extended} for number, mask, extended in wanted]
             )
 
+    @property
+    def stamped(self) -> bool:
+        """True if this machine's kernel dates the frames, so that they may wait to be read."""
+        return self._clock_is_ours
+
     def receive(self, seconds: float) -> SensorFrame | None:
         """Return the next data frame; None if there is none within ``seconds``. Raises LinkError."""
         try:

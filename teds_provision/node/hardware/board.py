@@ -96,7 +96,8 @@ class ActuatorReading:
 class Board:
     """Channels of ``sheet``; ``source`` is the text of ``--source``, or a source that was made already.
 
-    ``shown`` is called with the state of actuators, from any thread, and must return at once; ``tell`` receives
+    ``lag`` is how many nanoseconds after its tick a sample is taken, for a source that learns of it late. ``shown`` is
+    called with the state of actuators, from any thread, and must return at once; ``tell`` receives
     messages for people. Raises BadDataError if a channel cannot be imitated, and errors of the source.
     """
 
@@ -107,11 +108,12 @@ class Board:
         source: str | Source = "noise",
         clock: NodeClock | None = None,
         battery: Battery | None = None,
+        lag: int = 0,
         shown: Callable[[ActuatorReading], None] = lambda shown: None,
         tell: Tell = lambda text: None,
     ) -> None:
         self.clock = clock or NodeClock()
-        self.battery = battery
+        self.battery, self.lag = battery, lag
         self.shown, self.tell = shown, tell
         self.faults: set[int] = set()
         self.sampling: int | None = None

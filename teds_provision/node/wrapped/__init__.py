@@ -4,9 +4,17 @@ from typing import TYPE_CHECKING
 
 from teds_provision.lazy import lazy
 
-__all__ = ["canopen_device", "dbc_message", "description", "iio_device", "reading", "running"]
+__all__ = ["canopen_device", "dbc_message", "description", "iio_device", "reading", "running", "wrapped_source"]
 
 if TYPE_CHECKING:
-    from teds_provision.node.wrapped import canopen_device, dbc_message, description, iio_device, reading, running
+    from teds_provision.node.wrapped import (
+        canopen_device,
+        dbc_message,
+        description,
+        iio_device,
+        reading,
+        running,
+        wrapped_source,
+    )
 else:
     __getattr__ = lazy(__name__)

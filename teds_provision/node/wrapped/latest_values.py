@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Final, NamedTuple
@@ -18,6 +19,8 @@ from teds_provision.node.wrapped.description import PERIODS_LATE, WrappedChannel
 _KEPT_SECONDS: Final = 0.3
 _LEAST_KEPT: Final = 4
 _ROUNDING: Final = 1e-9
+_UNREAD: Final = 0.01
+"""Seconds for which a frame may have come without having been read: so much later a value is late by the clock."""
 _MISSING: Final = Reading(missing=True)
 
 
@@ -64,7 +67,7 @@ class LatestValues:
         arrival = self._newest(moment)
         if arrival is None:
             return self._silent, self._trouble or f"no {self._what} has come yet"
-        if moment - arrival.at > self._longest:
+        if moment - arrival.at > self._longest and time.monotonic() - arrival.at > self._longest + _UNREAD:
             return self._silent, self._late()
         problem = arrival.problem or self._outside(arrival.raw)
         if problem:

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from teds_provision.node.wrapped.latest_values import LatestValues, ValidityEvents
 
 if TYPE_CHECKING:
     from teds_provision.node.sources.base import Reading, SimulationClock
+
+LAG: Final = 10_000_000
+"""ns after its tick that a sample is taken: the thread that reads the sensors may get the interpreter's lock 5 ms late.
+
+What was read is dated by the kernel, so a sample takes the value that was the last one at its tick.
+"""
 
 Report = Callable[[int, str, str], None]
 """Channel number, name, and the reason why it is invalid ("" once it is valid again)."""
