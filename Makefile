@@ -265,7 +265,7 @@ firmware-arm: $(VENV)/.dev vectors-c
 	$(MAKE) --no-print-directory -C firmware arm others analyse
 	$(BIN)/python -m pytest tests/firmware/test_arm.py -m machine -rs
 
-.PHONY: dist locks docs test-versions test-all
+.PHONY: dist locks docs test-versions test-all container-root
 # What is released, in dist/: wheel and sdist (the wheel is built from the sdist), bills of materials (CycloneDX) of the tool and
 # of the C library, checksums. No time of day and no folder gets into them: two builds of a commit are equal.
 dist: .venv-release/.ready
@@ -281,6 +281,11 @@ docs: $(VENV)/.dev
 # Before a release: the gate, and what proves the same at greater length.
 test-all: test
 	$(BIN)/python -m pytest tests/release tests/plant/test_returned_pages.py -m soak -rs
+
+# The steps of service/Containerfile on a Debian root, and the demo in it as its user on a read-only root. As root, with
+# debootstrap; no container engine is needed. Keeps the bare root in build/container for the next time.
+container-root:
+	$(PYTHON) scripts/container_root.py build/container
 
 # The tests with other versions than the locks have: RESOLUTION=lowest-direct takes the oldest that pyproject.toml
 # allows, highest the newest there are.

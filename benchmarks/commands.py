@@ -12,6 +12,7 @@ import argparse
 import compileall
 import json
 import os
+import resource
 import statistics
 import subprocess
 import sys
@@ -104,6 +105,39 @@ def start_up(rows: Rows) -> None:
     rows.tell("import click, bare", floor * 1e3, "ms")
     for name in ("--help", "--version"):
         rows.tell(f"{name} against it", median(sys.executable, "-m", "teds_provision", name) / floor, "×", aim=1.4)
+    completion(rows)
+
+
+def completion(rows: Rows) -> None:
+    """Time what a shell waits for between Tab and its list: a command's name, an option, a node of a station."""
+    with station(quick=True) as home:
+        words = {
+            "a command": "teds-provision prov",
+            "an option": "teds-provision provision --pro",
+            "a node's name": f"teds-provision --home {home} verify 8d",
+        }
+        for what, line in words.items():
+            asked = {
+                "_TEDS_PROVISION_COMPLETE": "bash_complete",
+                "COMP_WORDS": line,
+                "COMP_CWORD": str(len(line.split()) - 1),
+            }
+            times = []
+            for _ in range(7):
+                began, worked = time.perf_counter(), processor_time()
+                subprocess.run(
+                    [sys.executable, "-m", "teds_provision"], env=os.environ | asked, check=True, capture_output=True
+                )
+                times.append((time.perf_counter() - began, processor_time() - worked))
+            seconds, work = (min(column) * 1e3 for column in zip(*times, strict=True))
+            rows.tell(f"completion of {what}, least of seven", seconds, "ms", aim=150)
+            rows.tell("  of it processor time, whatever else runs", work, "ms")
+
+
+def processor_time() -> float:
+    """Return the seconds that ended child processes worked."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def timed(home: Path, *words: str) -> float:

@@ -53,7 +53,7 @@ def test_provision_names_missing_packages_and_writes_nothing(tmp_path: Path) -> 
     error = json.loads(done.stdout)["error"]
     assert error["code"] == "incomplete-installation"
     assert error["message"] == "The installation is incomplete: numpy, backports.zstd missing."
-    assert error["hint"].endswith("-m pip install numpy backports.zstd")
+    assert error["hint"].endswith(" numpy backports.zstd")
     assert content(home) == before
     done = without("jaraco", "--home", tmp_path / "other", "init")  # keyring needs it
     assert (done.returncode, "jaraco.context missing" in done.stderr) == (1, True), done.stderr

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import sqlite3
-import sys
 import time
 import tomllib
 from collections.abc import Iterator
@@ -22,7 +21,7 @@ from teds_provision.doctor import machine as doctor_machine
 from teds_provision.doctor.checks import CHECKS, Finding, System, examine, exit_code
 from teds_provision.doctor.links import READERS
 from teds_provision.doctor.station import holds_private_key
-from teds_provision.lazy import REQUIRED
+from teds_provision.lazy import REQUIRED, install_command
 from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.store import Draft, KeyFlags, KeyRecord, NodeRecord, StationRecord, Store, StoreLock, WhitelistEntry
 from teds_provision.teds.image import Image
@@ -257,7 +256,7 @@ def test_a_missing_an_old_and_a_shadowing_library_are_told(system: System, monke
     libraries, ndeflib = look(system, "libraries")
     assert libraries.result == "failed"
     assert "msgpack is missing, nfcpy 0.13.5 (needs 1.0.4)" in libraries.why
-    assert libraries.fix == f"{sys.executable} -m pip install 'nfcpy>=1.0.4' 'msgpack>=1.0'"
+    assert libraries.fix == install_command("nfcpy>=1.0.4", "msgpack>=1.0")
     assert (ndeflib.result, "pip uninstall --yes ndef" in ndeflib.fix) == ("failed", True)
 
 

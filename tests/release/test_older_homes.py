@@ -1,6 +1,6 @@
 """Homes, backups and bundles that earlier versions wrote open with this one (docs/compatibility.md).
 
-Each archive in assets/ (make_assets.py) holds two homes of one schema (keystore file), a backup and a bundle. Station north
+Each archive in assets/ (make_assets.py) holds two homes of one schema (keystore file), a backup and a bundle. North
 provisioned a sensor and a gripper, put both into the group crane, named a topic, and exported both keys to south.
 """
 
