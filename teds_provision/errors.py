@@ -212,6 +212,12 @@ class StoreChangedError(StoreError):
     code = "store-changed"
 
 
+class NewerStoreError(StoreError):
+    """The store has a schema that only a newer version of this tool knows."""
+
+    code = "newer-store"
+
+
 class StoreLockedError(StoreError):
     """Another process holds the store."""
 

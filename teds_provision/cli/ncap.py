@@ -31,7 +31,7 @@ from teds_provision.cli.options import (
     tracing,
 )
 from teds_provision.cli.rendering import count_of, shown
-from teds_provision.errors import UsageError
+from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.lazy import how_to_install, late
 from teds_provision.store.records import iso
 
@@ -162,8 +162,12 @@ def run(
             app.warn(f"Nothing is measured until a node of that type comes: {unknown}.")
     station.unlock()  # no passphrase prompt later
     lines = DaemonLog(app)
-    with tracing(trace) as opened:
-        service_run.run(station, replace(wanted, trace=opened), lines.write_event)
+    try:
+        with tracing(trace) as opened:
+            service_run.run(station, replace(wanted, trace=opened), lines.write_event)
+    except TedsProvisionError:  # its message comes after the last event
+        lines.end()
+        raise
     if not lines.end():
         os._exit(0)  # all has ended in order; a line without a reader would delay the end of the process for ever
 

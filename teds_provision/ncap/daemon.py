@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, Final, get_args
 
 from teds_provision import __version__
-from teds_provision.errors import FrozenError, NotFoundError, UsageError, VaultError
+from teds_provision.errors import (
+    FrozenError,
+    NewerStoreError,
+    NotFoundError,
+    StoreError,
+    TedsProvisionError,
+    UsageError,
+    VaultError,
+)
 from teds_provision.links import Port
 from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.buses import Buses
@@ -32,6 +41,7 @@ from teds_provision.ncap.web.tokens import Tokens
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation
 
+_log = logging.getLogger(__name__)
 _LOOK: Final = 1.0
 """Seconds between two looks whether another process has changed the store."""
 _ENDING: Final = 8.0
@@ -90,6 +100,9 @@ class Daemon:
         self.directory.topic, self.directory.actuator = self.names.topic, self.leases.state
         self.directory.virtual = lambda uuid: uuid in self.virtuals
         self.url: str | None = None
+        self.failure: TedsProvisionError | None = None
+        """Why the service ends by itself; None while it need not."""
+        self._ends: Callable[[], None] = lambda: None
         self.started = time.time()
         self._version = station.version()
         self._vault_problem: dict[str, str] | None = None
@@ -143,6 +156,14 @@ class Daemon:
 
     async def serve(self, begin: Callable[[], Any], stop: asyncio.Event) -> None:
         """Fan out what is live until ``stop``; ``begin`` is awaited once the loop runs."""
+        loop = asyncio.get_running_loop()
+
+        def end() -> None:
+            loop.call_soon_threadsafe(stop.set)
+
+        self._ends = end
+        if self.failure is not None:
+            stop.set()
         fan = asyncio.create_task(self.live.run())
         try:
             await begin()
@@ -176,15 +197,25 @@ class Daemon:
             self.virtuals.start()
 
     def _observe(self) -> None:
-        """Notice changes by the command line within a second."""
+        """Follow within a second what the command line does beside us; end the service if a newer version did it."""
         while not self._stop.wait(_LOOK):
-            self._look_at_vault()
-            version = self.station.version()
-            if version != self._version:
+            try:
+                self._look_at_vault()
+                version = self.station.version()
+                if version == self._version:
+                    continue
+                self.station.require_known_schema()
                 self._version = version
                 self.directory.refresh()
                 self.names.forget()
                 self.live.event("store", state="changed")
+            except NewerStoreError as newer:
+                self.failure = newer
+                self.live.event("store", state="newer", why=newer.message, hint=newer.hint)
+                self._ends()
+                return
+            except StoreError as failure:  # what is read next may be right again
+                _log.warning("The store cannot be read: %s", failure.message)
 
     def _look_at_vault(self) -> None:
         """Report when another command locks this process out of the vault, and when it is open again."""

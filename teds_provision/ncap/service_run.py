@@ -82,6 +82,8 @@ def run(station: Station, settings: Settings, tell: Tell) -> None:
         try:
             with MasterSocket(station.home, station.accept_masters):
                 asyncio.run(_serve(daemon, local, tcp, tell))
+            if daemon.failure is not None:
+                raise daemon.failure
         finally:
             for listener in (local, tcp):
                 if listener is not None:

@@ -282,6 +282,10 @@ class Measurements:
         """Chosen names by UUID and channel: channel 0 is the node's part, :data:`STATION` the station's part."""
         return self._store.topic_names()
 
+    def names_of(self, uuid: bytes) -> dict[int, str]:
+        """Return the chosen names of one node by channel, 0 for the node's part."""
+        return self._store.topic_names_of(uuid)
+
     @property
     def frames(self) -> dict[tuple[bytes, int], str]:
         """Chosen coordinate frames (``frame_id``) by UUID and channel: channel 0 is the whole node."""

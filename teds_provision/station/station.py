@@ -293,6 +293,10 @@ class Station:
         """Return a number that changes exactly when another process has changed the store: earlier plans are stale."""
         return self._store.version()
 
+    def require_known_schema(self) -> None:
+        """Raise NewerStoreError if a newer version of this tool has brought the store to its schema meanwhile."""
+        self._store.require_known_schema()
+
     def changes(self) -> tuple[int, int]:
         """Return what differs after any change of the store, by this process or another one."""
         return self._store.changes()

@@ -145,9 +145,11 @@ def topic_warnings(station: Station, has: Image | None, wanted: Image) -> tuple[
 
     ``has``: what the board has; without channels in it, what it was last known to have.
     """
-    names = {number: name for (uuid, number), name in station.measurements.names.items() if uuid == wanted.uuid}
+    names = station.measurements.names_of(wanted.uuid)
+    if not any(names):
+        return ()
     before = has if has is not None and _describes(has.blocks) else station.nodes.datasheet(wanted.uuid)
-    if before is None or not any(names):
+    if before is None:
         return ()
     old, new = ({channel.number: channel for channel in Sheet.from_image(image).channels} for image in (before, wanted))
     warnings = []

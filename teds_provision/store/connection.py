@@ -16,10 +16,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from teds_provision.errors import BadDataError, StoreError, StoreLockedError, TedsProvisionError
+from teds_provision.errors import BadDataError, NewerStoreError, StoreError, StoreLockedError, TedsProvisionError
 from teds_provision.lazy import late
 from teds_provision.portable import CLOSING, NOFOLLOW, sync_content
 from teds_provision.store.background_writer import BackgroundWriter
+from teds_provision.store.schema import SCHEMA_VERSION
 
 if TYPE_CHECKING:
     import sqlite3
@@ -75,6 +76,14 @@ def as_store_failure(error: sqlite3.Error | OSError, path: Path) -> StoreError:
         )
     cause, cure = _CAUSES.get(primary, (f"SQLite says: {error}", "Run teds-provision doctor."))
     return StoreError(f"The store {path} cannot be used: {cause}.", hint=cure)
+
+
+def newer_schema(path: Path, version: int) -> NewerStoreError:
+    """Return the error for a store of a schema that this version of the tool does not know."""
+    return NewerStoreError(
+        f"The store {path} has schema {version}; this version of the tool knows up to {SCHEMA_VERSION}.",
+        hint="Use the newer version of teds-provision that made it.",
+    )
 
 
 def damaged(path: Path) -> StoreError:
@@ -193,6 +202,13 @@ class Connection:
         """Return a number that changes when another connection has changed the file."""
         return int(self.execute("PRAGMA data_version")[0][0])
 
+    def require_known_schema(self) -> None:
+        """Raise NewerStoreError if a newer version of this tool has brought the store to its schema meanwhile."""
+        with self._lock:
+            version = self._connection.execute("PRAGMA user_version").fetchone()[0]
+        if version > SCHEMA_VERSION:
+            raise newer_schema(self.path, version)
+
     def changes(self) -> tuple[int, int]:
         """Return what differs after any change of the file, by this connection or another one."""
         return self.version(), self._connection.total_changes
@@ -286,6 +302,7 @@ class Connection:
             self.execute("PRAGMA synchronous=NORMAL")
         try:
             self.execute("BEGIN IMMEDIATE")
+            self.require_known_schema()
         except BaseException:  # also if it was interrupted between BEGIN and the block that would roll it back
             with suppress(sqlite3.Error):
                 if self._connection.in_transaction:
@@ -355,6 +372,9 @@ class Connection:
         if isinstance(error, sqlite3.Error | OSError):
             if self._frozen is not None and getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_READONLY:
                 return self._frozen
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_ERROR:  # a column that is not there
+                with suppress(sqlite3.Error):
+                    self.require_known_schema()
             return as_store_failure(error, self.path)
         return BadDataError("A name or text is not valid UTF-8.", hint="Give it in UTF-8.")  # from a command line
 

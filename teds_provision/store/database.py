@@ -26,6 +26,7 @@ from teds_provision.store.connection import (
     Connection,
     as_store_failure,
     is_no_place_to_write,
+    newer_schema,
     too_old,
 )
 from teds_provision.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, statements
@@ -274,10 +275,7 @@ class Database(Connection):
         if 0 < version < OLDEST_SCHEMA:
             raise too_old(f"The store {self.path}", version)
         if version > SCHEMA_VERSION:
-            raise StoreError(
-                f"The store {self.path} has schema {version}; this version of the tool knows up to {SCHEMA_VERSION}.",
-                hint="Use the newer version of teds-provision that made it.",
-            )
+            raise newer_schema(self.path, version)
         return int(version)
 
 

@@ -151,6 +151,10 @@ class Store(
         """Return a number that changes when another connection has changed the file."""
         return self._database.version()
 
+    def require_known_schema(self) -> None:
+        """Raise NewerStoreError if a newer version of this tool has brought the store to its schema meanwhile."""
+        self._database.require_known_schema()
+
     def changes(self) -> tuple[int, int]:
         """Return what differs after any change of the file, by this connection or another one."""
         return self._database.changes()

@@ -6,6 +6,7 @@ import json
 import shutil
 import signal
 import socket
+import sqlite3
 import subprocess
 import threading
 import time
@@ -21,6 +22,7 @@ from teds_provision import client
 from teds_provision.client import ApiError
 from teds_provision.ncap.settings import own_source
 from teds_provision.store import Store
+from teds_provision.store.schema import SCHEMA_VERSION
 from tests.bench import make_station
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Desk, Node, Station, limited
@@ -402,3 +404,26 @@ def test_the_unit_that_is_shipped_is_sound_and_hardened(tmp_path: Path) -> None:
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert judged.returncode == 0, judged.stdout.splitlines()[-1]
+
+
+def test_a_store_that_a_newer_version_brought_forward_ends_the_service_in_words(lab: Lab) -> None:
+    """Its eye on the store died with "no such column", while it went on to call nodes authentic."""
+    lab.service.start()
+    lab.measure()
+    home, process = lab.service.station.home, lab.service.process
+    assert process is not None
+    with closing(sqlite3.connect(home / "store.sqlite3", isolation_level=None)) as newer:
+        newer.execute("ALTER TABLE nodes RENAME COLUMN name TO called")
+        newer.execute(f"PRAGMA user_version={SCHEMA_VERSION + 1}")
+    outcome = process.end()
+    assert outcome.code == 7, outcome
+    *events, last = [json.loads(line) for line in outcome.out.splitlines()]
+    assert (last["error"]["code"], "newer version" in last["error"]["hint"]) == ("newer-store", True)
+    [told] = [event for event in events if event.get("event") == "store" and event["state"] == "newer"]
+    assert f"has schema {SCHEMA_VERSION + 1}" in told["why"]
+    assert "Traceback" not in outcome.err, outcome.err
+    assert "no such column" not in outcome.out + outcome.err
+    with closing(sqlite3.connect(home / "store.sqlite3", isolation_level=None)) as newer:
+        assert newer.execute("SELECT count(*) FROM measurements").fetchone() == (1,), "it goes on with the newer one"
+        newer.execute("ALTER TABLE nodes RENAME COLUMN called TO name")  # for the next test
+        newer.execute(f"PRAGMA user_version={SCHEMA_VERSION}")

@@ -99,6 +99,22 @@ def test_with_retype_it_becomes_one_and_the_hardware_has_the_last_word(
         given(station, on_reader(angle), order(tmp_path, GRIPPER, retype=True))
 
 
+def test_a_chosen_topic_name_of_another_quantity_is_warned_about(
+    station: Station, angle: VirtualNode, tmp_path: Path
+) -> None:
+    """What was called crane/slew stayed crane/slew, in newtons."""
+    uuid = angle.tim.flash.uuid
+    given(station, on_reader(angle), order(tmp_path, ANGLE))
+    assert given(station, on_reader(angle), order(tmp_path, ANGLE)).warnings == ()
+    station.measurements.rename(uuid, 1, "crane/slew")
+    same = build(station, uuid, order(tmp_path, ANGLE), keep_draft=False)
+    assert not any("topic" in warning for warning in same.warnings)
+    built = build(station, uuid, BuildOrder(FORCE, retype=True, drop_calibration=True), keep_draft=False)
+    [told] = [warning for warning in built.warnings if "topic" in warning]
+    assert told.startswith("The chosen topic name 'crane/slew' stays with channel 1, which was in rad and is in N now.")
+    assert told.endswith(f"names set {uuid.hex()[:8]} 1 NAME")
+
+
 def test_at_a_terminal_a_yes_to_the_differences_is_enough(station: Station, angle: VirtualNode, tmp_path: Path) -> None:
     asked: list[tuple[str, ...]] = []
     with pytest.raises(WrongBoardError, match="does not match"):

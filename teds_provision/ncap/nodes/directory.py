@@ -6,6 +6,7 @@ The rows of the store and the datasheets are read after a change, not for each r
 from __future__ import annotations
 
 import json
+import logging
 import math
 import threading
 import time
@@ -15,6 +16,7 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 from teds_provision.api.operations import MOST_NODES
+from teds_provision.errors import StoreError
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.station.shown_units import shown_units
@@ -25,6 +27,7 @@ from teds_provision.store import Search
 from teds_provision.store.records import iso
 from teds_provision.teds.sheet import Channel, Sheet
 
+_log = logging.getLogger(__name__)
 _READ_NOW: Final = "read now"
 MOST_GONE: Final = 200
 """Number of nodes that left and are not in the store, kept to be shown: in transparent mode they can be invented."""
@@ -73,6 +76,12 @@ class NodeDirectory:
 
     def refresh(self, uuids: Iterable[str] | None = None) -> None:
         """Read the rows of these nodes again, or of all in the store; datasheets when they are requested."""
+        try:
+            self._refresh(uuids)
+        except StoreError as failure:  # what was read before is shown on; the eye on the store says what is wrong
+            _log.warning("The nodes cannot be read from the store: %s", failure.message)
+
+    def _refresh(self, uuids: Iterable[str] | None) -> None:
         with self._reading:  # what was read earlier never takes the place of what was read later
             every = self._station.nodes.find(Search()) if uuids is None else map(bytes.fromhex, dict.fromkeys(uuids))
             wanted = list(every)

@@ -114,6 +114,11 @@ class MeasurementTables:
         rows = self._database.execute("SELECT uuid, channel, name FROM topics ORDER BY uuid, channel")
         return {(bytes(uuid), int(channel)): str(name) for uuid, channel, name in rows}
 
+    def topic_names_of(self, uuid: bytes) -> dict[int, str]:
+        """Return the names that somebody chose for the channels of a node; channel 0 is its part of its topics."""
+        rows = self._database.execute("SELECT channel, name FROM topics WHERE uuid = ? ORDER BY channel", (uuid,))
+        return {int(channel): str(name) for channel, name in rows}
+
     def put_topic_name(self, uuid: bytes, channel: int, name: str) -> None:
         """Keep a chosen name, in place of the one before."""
         statement = "INSERT INTO topics VALUES(?, ?, ?) ON CONFLICT(uuid, channel) DO UPDATE SET name = excluded.name"
