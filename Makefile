@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # Compiled modules are kept: each of five pytests would else rewrite every assert again, 13 s of CPU each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo demo-page page-picture test test-system lint types unit compiled quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale test-rclpy fuzz faults pairs model house words man coverage mutants soak api test-other vectors-c sbom firmware firmware-faults firmware-arm firmware-coverage firmware-soak test-c room clean
+.PHONY: demo demo-page page-picture test test-system lint types unit compiled quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale test-rclpy fuzz faults pairs model house words man coverage mutants soak api test-other vectors-c sbom firmware firmware-faults firmware-zephyr firmware-arm firmware-coverage firmware-soak test-c room clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -257,6 +257,11 @@ firmware-coverage: vectors-c $(VENV)/.dev
 	-TEDS_C_BUILD=build/counted TEDS_C_WORDS="$(COUNTED)" $(BIN)/python -m pytest -q -m '$(USUAL)' \
 	  --ignore tests/firmware/test_faults.py --ignore tests/firmware/test_c_tests.py tests/firmware
 	$(BIN)/python -m tests.firmware.coverage firmware/build/counted
+
+# The Zephyr module against a Zephyr tree, the folder zephyr of a west workspace: the load cell on native_sim, then both
+# boards. Skipped with a line without ZEPHYR (firmware/docs/porting.md).
+firmware-zephyr:
+	@sh firmware/zephyr/build.sh "$(ZEPHYR)"
 
 # The library on Cortex-M0+, M4 and M33: sizes, stack, instructions held; the M4 image under qemu is checked as a node.
 # The C tests as 32 bits and big-endian, too, and what cppcheck and clang-tidy say.

@@ -253,12 +253,15 @@ enum { TEDS_NFC_QUIET, TEDS_NFC_WRITTEN };
 /* What of a message the profile looks at; NULL: no such record. */
 typedef struct teds_ndef {
     bool any, charges; /* the first record says how the reader charges */
+    bool chunked;      /* a record came in chunks, which are put together: behind them the message is no message any more */
     const uint8_t *selection, *payload;
     size_t selection_length, payload_length;
 } teds_ndef;
 bool teds_ndef_read(uint8_t *message, size_t length, teds_ndef *out);
 /* A record up to its payload; gives its octets. */
 size_t teds_ndef_head(uint8_t *at, uint8_t marks, uint8_t tnf, const char *type, size_t type_length, size_t payload);
+/* True if the application's services have names and room in the initial message. */
+bool teds_nfc_services_good(const teds_config *config);
 void teds_nfc_start(teds_node *node);
 void teds_nfc_came(teds_node *node, size_t length);
 void teds_nfc_poll(teds_node *node);

@@ -96,6 +96,7 @@ bool teds_ndef_read(uint8_t *message, size_t length, teds_ndef *out)
         first = false;
         at = each.end;
         if (open) {
+            out->chunked = true;
             memmove(whole.payload + whole.payload_length, each.payload, each.payload_length);
             whole.payload_length += each.payload_length;
         } else {

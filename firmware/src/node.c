@@ -503,6 +503,11 @@ int teds_node_init_as_built(teds_node *node, uint32_t built, const teds_config *
         (TEDS_NFC && config->nfc.present && config->nfc.max_ndef != 0 && config->nfc.max_ndef < 160)) {
         return TEDS_E_USAGE;
     }
+#if TEDS_NFC
+    if (config->nfc.present && !teds_nfc_services_good(config)) {
+        return TEDS_E_USAGE;
+    }
+#endif
 #if TEDS_OPERATION
     if (!teds_channels_good(port)) {
         return TEDS_E_USAGE;

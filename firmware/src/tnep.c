@@ -79,22 +79,31 @@ static size_t out_of_band(const teds_node *node, uint8_t *out)
     return at + 12;
 }
 
-static void show_initial(teds_node *node)
+/* Service parameters: a Tp record of TNEP 1.0. All services of the tag wait alike. */
+static size_t offer(const teds_node *node, uint8_t *out, uint8_t marks, const char *name)
 {
-    const bool airs = TEDS_BLE && node->config->ble_address != NULL;
-    const size_t uri = sizeof SERVICE - 1;
-    uint8_t *out = node->nfc.file + 2;
-    size_t at = charge(node, out);
-    at += teds_ndef_head(out + at, at == 0 ? TEDS_NDEF_BEGINS : 0, TEDS_NDEF_WELL_KNOWN, "Tp", 2, 7 + uri);
+    const size_t uri = strlen(name);
+    size_t at = teds_ndef_head(out, marks, TEDS_NDEF_WELL_KNOWN, "Tp", 2, 7 + uri);
     out[at] = 0x10;
     out[at + 1] = (uint8_t)uri;
-    memcpy(out + at + 2, SERVICE, uri);
+    memcpy(out + at + 2, name, uri);
     at += 2 + uri;
     out[at] = 0; /* single response */
     out[at + 1] = node->config->nfc.wt_int;
     out[at + 2] = node->config->nfc.n_wait;
     teds_put16(out + at + 3, (uint16_t)most(node));
-    at += 5;
+    return at + 5;
+}
+
+static void show_initial(teds_node *node)
+{
+    const bool airs = TEDS_BLE && node->config->ble_address != NULL;
+    uint8_t *out = node->nfc.file + 2;
+    size_t at = charge(node, out);
+    at += offer(node, out + at, at == 0 ? TEDS_NDEF_BEGINS : 0, SERVICE);
+    for (size_t i = 0; i < node->config->nfc.service_count; i++) {
+        at += offer(node, out + at, 0, node->config->nfc.services[i].name);
+    }
     at += teds_ndef_head(out + at, airs ? 0 : TEDS_NDEF_ENDS, TEDS_NDEF_EXTERNAL, ID_TYPE, sizeof ID_TYPE - 1, 23);
     teds_node_identify(node, out + at);
     memcpy(node->nfc.shown, out + at, 23);
@@ -218,6 +227,55 @@ static void collect(teds_node *node, const piece *came)
     say_part(node, 0);
 }
 
+/* -- services of the application ---------------------------------------------------------------------------------------- */
+
+bool teds_nfc_services_good(const teds_config *config)
+{
+    /* beside WLC 26, our Tp 41, id 45 and out-of-band 47: the initial message is one that fits the tag */
+    const uint16_t told = config->nfc.max_ndef;
+    size_t octets = 160;
+    for (size_t i = 0; i < config->nfc.service_count; i++) {
+        const teds_nfc_service *each = &config->nfc.services[i];
+        const size_t length = each->name == NULL || each->answer == NULL ? 0 : strlen(each->name);
+        if (length == 0 || length > 128 || strcmp(each->name, SERVICE) == 0) {
+            return false;
+        }
+        octets += 12 + length;
+    }
+    return octets <= (told != 0 && told < TEDS_MAX_NDEF ? told : TEDS_MAX_NDEF);
+}
+
+/* The place of a service of this name, from 1 on; 0: none. */
+static uint8_t other_named(const teds_node *node, const teds_ndef *came)
+{
+    for (size_t i = 0; i < node->config->nfc.service_count; i++) {
+        const char *name = node->config->nfc.services[i].name;
+        if (came->selection_length == strlen(name) && memcmp(came->selection, name, came->selection_length) == 0) {
+            return (uint8_t)(i + 1);
+        }
+    }
+    return 0;
+}
+
+/* A message of the reader of another service. The answer is made where requests of ours are collected: one reader has one
+ * service at a time. */
+static void answer_other(teds_node *node, size_t length)
+{
+    const teds_nfc_service *service = &node->config->nfc.services[node->nfc.other - 1];
+    const size_t left = most(node) - STATUS_OCTETS;
+    const size_t space = left < sizeof node->nfc.request ? left : sizeof node->nfc.request;
+    const int octets = service->answer(service->user, node->nfc.file + 2, length, node->nfc.request, space);
+    uint8_t *out = node->nfc.file + 2;
+    if (octets < 0 || (size_t)octets > space) {
+        say_status(node, GARBLED);
+    } else {
+        const size_t at = put_status(out, octets == 0 ? TEDS_NDEF_BEGINS | TEDS_NDEF_ENDS : TEDS_NDEF_BEGINS, SUCCESS);
+        memcpy(out + at, node->nfc.request, (size_t)octets);
+        put(node, at + (size_t)octets);
+    }
+    teds_wipe(node->nfc.request, sizeof node->nfc.request);
+}
+
 /* -- the conversation --------------------------------------------------------------------------------------------------- */
 
 static void answer(teds_node *node, size_t length)
@@ -232,10 +290,22 @@ static void answer(teds_node *node, size_t length)
     if (came.selection != NULL) {
         nfc->selected =
             came.selection_length == sizeof SERVICE - 1 && memcmp(came.selection, SERVICE, sizeof SERVICE - 1) == 0;
+        nfc->other = other_named(node, &came);
         if (nfc->selected) {
             say_status(node, SUCCESS);
-        } else {
+            return;
+        }
+        nfc->collects = nfc->collects && nfc->other == 0;
+        if (nfc->other == 0) {
             show_initial(node);
+            return;
+        }
+    }
+    if (nfc->other != 0) {
+        if (came.chunked) {
+            say_status(node, GARBLED);
+        } else {
+            answer_other(node, length);
         }
         return;
     }
@@ -263,6 +333,7 @@ static void forget(teds_node *node)
     node->nfc.collects = false;
     node->nfc.answered = false;
     node->nfc.selected = false;
+    node->nfc.other = 0;
     node->nfc.stage = TEDS_NFC_QUIET;
     node->nfc.busy_until = 0;
     teds_wipe(node->nfc.request, sizeof node->nfc.request);
@@ -272,6 +343,7 @@ void teds_nfc_field(teds_node *node, bool present)
 {
     if (present) {
         node->nfc.selected = false;
+        node->nfc.other = 0;
         node->nfc.stage = TEDS_NFC_QUIET;
         node->nfc.opened = 0;
 #if TEDS_BLE

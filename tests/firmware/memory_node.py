@@ -16,6 +16,9 @@ from tests.firmware import builds
 NANOSECONDS: Final = 10**9
 _KINDS: Final = {"can": 1, "nfc": 2, "ble": 3}
 _RANDOM: Final = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_char, ctypes.POINTER(ctypes.c_uint8), ctypes.c_size_t)
+_ANSWER: Final = ctypes.CFUNCTYPE(
+    ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_size_t
+)
 _HOOK: Final = ctypes.CFUNCTYPE(
     ctypes.c_int, ctypes.c_char, ctypes.c_uint8, ctypes.c_uint64, ctypes.c_void_p, ctypes.c_size_t
 )
@@ -268,6 +271,23 @@ class MemoryNode:
     def has_nfc(self, *, wt_int: int = 4, n_wait: int = 15, max_ndef: int = 4160) -> None:
         """It has an antenna; before the start."""
         self._library.memory_nfc(self._board, ctypes.c_uint8(wt_int), ctypes.c_uint8(n_wait), ctypes.c_uint16(max_ndef))
+
+    def has_nfc_service(self, name: bytes, answer: Callable[[bytes, int], bytes | None]) -> None:
+        """Its application has a service on the tag; before the start.
+
+        ``answer`` gets the reader's message and the room; it returns the records behind the status, None: garbled.
+        """
+
+        def called(user: int, message: int, length: int, out: int, space: int) -> int:
+            records = answer(ctypes.string_at(message, length), space)
+            if records is None:
+                return -1
+            ctypes.memmove(out, records, min(len(records), space))
+            return len(records)
+
+        kept = (_ANSWER(called), ctypes.create_string_buffer(name))
+        self._fixed.append(kept)
+        self._library.memory_nfc_service(self._board, kept[1], kept[0])
 
     def has_battery(self, flags: int, level: int) -> None:
         """It has a battery; before the start."""

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -207,3 +208,23 @@ def test_kconfig_takes_in_what_psa_is_asked_for() -> None:
     asked = set(re.findall(r"PSA_ALG_(DETERMINISTIC_ECDSA|ECDSA|ECDH|CCM|HMAC|SHA_256)\b", psa))
     assert asked == {"DETERMINISTIC_ECDSA", "ECDSA", "ECDH", "CCM", "HMAC", "SHA_256"}
     assert all(f"\tselect PSA_WANT_ALG_{item}\n" in kconfig for item in asked)
+
+
+def test_zephyr_is_skipped_with_a_line_where_there_is_no_tree() -> None:
+    """`make firmware-zephyr` builds against a tree that is given; without one nothing fails."""
+    build = str(builds.FIRMWARE / "zephyr" / "build.sh")
+    for words, said in (([], "no Zephyr tree. Give one"), ([str(builds.FIRMWARE)], "is no Zephyr tree")):
+        done = subprocess.run(["sh", build, *words], capture_output=True, text=True, check=True)
+        assert done.stdout.startswith("Skipped: ")
+        assert said in done.stdout
+
+
+def test_native_sim_has_the_nodes_partitions_and_its_can() -> None:
+    """Both forms of it, 32 and 64 bits of the host: the same overlay."""
+    folder = builds.FIRMWARE / "boards" / LOAD / "boards"
+    overlay = (folder / "native_sim.overlay").read_text()
+    assert overlay == (folder / "native_sim_native_64.overlay").read_text()
+    assert "zephyr,canbus = &can0;" in overlay
+    places = [(int(at, 16), int(octets, 16)) for at, octets in re.findall(r"reg = <(0x\w+) (0x\w+)>", overlay)]
+    assert [octets >= 4096 + 256 for _, octets in places[1:]] == [True, True]
+    assert all(at + octets <= more for (at, octets), (more, _) in pairwise(places))

@@ -195,6 +195,7 @@ typedef struct teds_can {
 typedef struct teds_nfc {
     bool selected, shows_initial, collects, answered;
     uint8_t stage, opened, file_open;
+    uint8_t other; /* the application's service that is selected, from 1 on; 0: none */
     teds_stored_reply *reply; /* it is read in pieces */
     uint16_t transaction, total, held, answered_transaction, length, came;
     uint64_t tick, busy_until; /* busy_until: its reader has something to read, or will ask on */

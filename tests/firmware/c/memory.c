@@ -627,6 +627,14 @@ void memory_nfc(memory_board *board, uint8_t wt_int, uint8_t n_wait, uint16_t ma
     board->config.nfc.max_ndef = max_ndef;
 }
 
+void memory_nfc_service(memory_board *board, const char *name,
+                        int (*answer)(void *, const uint8_t *, size_t, uint8_t *, size_t))
+{
+    board->services[board->config.nfc.service_count] = (teds_nfc_service){name, board, answer};
+    board->config.nfc.services = board->services;
+    board->config.nfc.service_count++;
+}
+
 static void battery(void *user, teds_power *out)
 {
     const memory_board *board = user;

@@ -39,6 +39,7 @@ typedef struct memory_board {
     bool fd; /* how commands come */
 #if TEDS_NFC
     teds_isodep card;
+    teds_nfc_service services[2]; /* of the application */
     uint8_t power[2], air[6]; /* flags and level of its battery; its BLE address */
 #endif
 } memory_board;
@@ -104,6 +105,9 @@ void memory_set_point(const memory_board *board, uint8_t channel, uint8_t *out);
 size_t memory_node_octets(void);
 #if TEDS_NFC
 /* Before the start: an antenna, and what the tag says of itself. */
+/* A service of the application on the tag; `name` outlives the board. Before the start. */
+void memory_nfc_service(memory_board *board, const char *name,
+                        int (*answer)(void *, const uint8_t *, size_t, uint8_t *, size_t));
 void memory_nfc(memory_board *board, uint8_t wt_int, uint8_t n_wait, uint16_t max_ndef);
 /* It has a battery with these flags and this level; an address in the air. Before the start. */
 void memory_battery(memory_board *board, uint8_t flags, uint8_t level);
