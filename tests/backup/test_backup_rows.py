@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -55,6 +56,26 @@ def test_a_chunk_of_another_backup_of_the_same_station_does_not_fit(station: Sta
     (head, _), (_, chunks) = ((tmp_path / name).read_bytes().split(b"\n", 1) for name in "ab")
     with pytest.raises(NotAuthenticError):
         opened_octets(tmp_path, head + b"\n" + chunks)
+
+
+def test_the_chunks_are_those_of_stream_and_the_last_one_alone_is_marked() -> None:
+    """By AES-GCM alone, as the construction is published: a file cut off at any chunk must not end well."""
+    key, context, out = bytes(range(32)), b"context", io.BytesIO()
+    writer = ChunkWriter(out, key, context)
+    clear = b"".join(number.to_bytes(1, "big") * CHUNK_OCTETS for number in range(3)) + b"the rest"
+    writer.write(clear)
+    writer.end()
+    octets, full = out.getvalue(), CHUNK_OCTETS + 16
+    chunks = [octets[start : start + full] for start in range(0, 4 * full, full)]
+    assert chunks[-1].endswith(b"teds-backup end\n")
+    chunks[-1] = chunks[-1].removesuffix(b"teds-backup end\n")
+    nonces = [number.to_bytes(11, "big") + (b"\1" if number == 3 else b"\0") for number in range(4)]
+    opened = [AESGCM(key).decrypt(nonce, chunk, context) for nonce, chunk in zip(nonces, chunks, strict=True)]
+    assert b"".join(opened) == clear
+    for left in range(1, 4):
+        reader = ChunkReader(io.BytesIO(b"".join(chunks[:left]) + b"teds-backup end\n"), key, context)
+        with pytest.raises(NotAuthenticError):
+            reader.read(left * CHUNK_OCTETS)
 
 
 @pytest.mark.parametrize("length", [0, 1, CHUNK_OCTETS - 1, CHUNK_OCTETS, CHUNK_OCTETS + 1, 2 * CHUNK_OCTETS])

@@ -46,7 +46,7 @@ PATTERNS = (
     Pattern(
         "a due rotation is made at contact",
         "session_if_keyed",
-        "station.keys.rotation_due(node.uuid) is not None",
+        "station.keys.rotates_now(node.uuid)",
         "False",
     ),
     Pattern("only a tap pins", "_pin_for", "node.tapped", "True", "tests/steps/test_agree.py"),
@@ -276,5 +276,37 @@ PATTERNS = (
         "Tokens.login",
         "self._logins.pop(digest_of(token), (0.0, False))",
         "self._logins.get(digest_of(token), (0.0, False))",
+    ),
+    # one change each that no test noticed on 2026-11-24
+    Pattern(
+        "a broker keeps the will",
+        "MqttSink._prepare",
+        "client.will_set(self._status, 'offline', qos=1, retain=True)",
+        "client.will_set(self._status, 'offline', qos=1)",
+        "tests/measure/sinks/test_mqtt.py",
+    ),
+    Pattern(
+        "the last chunk is marked",
+        "_nonce",
+        "b'\\x01' if last else b'\\x00'",
+        "b'\\x00'",
+        "tests/backup/test_backup_rows.py",
+    ),
+    Pattern(
+        "a node's lock is of the open file",
+        "_LockedOctet._try_to_lock",
+        "fcntl.F_OFD_SETLK",
+        "fcntl.F_SETLK",
+        "tests/store/test_lock.py",
+    ),
+    Pattern(
+        "a job's end that was seen counts",
+        "require_open",
+        "max(now, job.ends) if seen else now",
+        "now",
+        "tests/plant/test_jobs.py",
+    ),
+    Pattern(
+        "a job's count is checked again", "_require_room", "given >= job.total", "False", "tests/plant/test_office.py"
     ),
 )

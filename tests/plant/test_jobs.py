@@ -7,7 +7,7 @@ import json
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from datetime import timedelta
+from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,9 @@ from teds_provision.errors import (
     PolicyError,
     RosterExpiredError,
 )
+from teds_provision.plant import jobs, parcels
 from teds_provision.plant import line as line_module
 from teds_provision.plant import owner as owning
-from teds_provision.plant import parcels
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.jobs import digest_of_file, find_job, take_job, take_received
 from teds_provision.plant.line import LineRun, Scans
@@ -43,7 +43,7 @@ from teds_provision.store.tables.parcels import ParcelRow
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.certificate import certificate_reference_of
 from teds_provision.teds.profile.load import files_digest, find_profile, shipped_profiles
-from tests.bench import Board, MemoryLink, make_station, talk
+from tests.bench import PASSPHRASE, Board, MemoryLink, make_station, talk
 from tests.teds.certificates import ANGLE as CERTIFICATE
 
 from .owner import ALL, ANGLE, NOW, alone, job_of, join, member, roster_of
@@ -161,6 +161,28 @@ def test_a_closed_job_is_refused(owner: Station) -> None:
     owner.plant.line.set_job_state(line.job.id, "closed")
     with pytest.raises(PolicyError, match="closed"):
         LineRun(owner, line.job)
+
+
+def test_a_clock_that_is_put_back_reopens_no_job_whose_end_was_seen(
+    owner: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line, next_job = line_of(owner), line_of(owner, title="the next one")
+
+    class Later(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> datetime:  # type: ignore[override]
+            return datetime.now(tz) + timedelta(hours=2)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(jobs, "datetime", Later)
+        with pytest.raises(PolicyError, match="it ended"):
+            build(line, board(1))
+    again = Station.open(owner.home, ask=lambda prompt, confirm: PASSPHRASE)  # as the next command does
+    assert line.job is not None
+    with pytest.raises(PolicyError, match="it ended"):
+        LineRun(again, line.job)
+    again.close()
+    assert build(next_job, board(1)).verified.verdict == "authentic", "a job whose end nobody saw is open"
 
 
 def test_a_board_that_is_not_listed_or_has_another_key_costs_no_unit(owner: Station) -> None:

@@ -14,6 +14,8 @@ import pytest
 
 from teds_provision.errors import StoreError, StoreLockedError
 from teds_provision.store import StoreLock
+from teds_provision.store.lock import NodeLock
+from tests.pace import PATIENCE
 
 HOLDER = """
 import sys, time
@@ -96,3 +98,40 @@ def test_a_link_in_place_of_the_lock_is_not_followed(place: Path, tmp_path: Path
     with pytest.raises(StoreError), StoreLock(place, command="write"):
         pytest.fail("followed a link")
     assert target.read_text() == "text"
+
+
+NODE = bytes(range(10))
+ASKED = """
+import sys
+from pathlib import Path
+from teds_provision.store.lock import NodeLock
+print(NodeLock(Path(sys.argv[1]), bytes(range(10))).is_taken)
+"""
+
+
+def test_of_two_threads_and_two_processes_one_works_on_a_node_at_a_time(place: Path) -> None:
+    """A lock of the process would let its own threads in, and be gone once any of them closes the file."""
+    told, worked = threading.Event(), threading.Event()
+
+    def work() -> None:
+        with NodeLock(place, NODE, notice=lambda _: told.set()):
+            worked.set()
+
+    def taken_elsewhere() -> str:
+        done = subprocess.run(
+            [sys.executable, "-c", ASKED, str(place)], capture_output=True, text=True, check=True, timeout=60
+        )
+        return done.stdout.strip()
+
+    with NodeLock(place, NODE):
+        other = threading.Thread(target=work)
+        other.start()
+        assert told.wait(PATIENCE), "it waits for the first, and says so"
+        assert NodeLock(place, NODE).is_taken  # opens and closes the file
+        assert taken_elsewhere() == "True"
+        with NodeLock(place, bytes(10)):
+            pass  # another node is free
+        assert not worked.is_set()
+    other.join(PATIENCE)
+    assert worked.is_set()
+    assert taken_elsewhere() == "False"

@@ -94,6 +94,14 @@ class LineTables:
         """Open or close a job."""
         self._database.execute("UPDATE jobs SET state = ? WHERE id = ?", (state, id))
 
+    def end_seen(self, id: str) -> bool:
+        """Return True if this station's clock was once past the end of the job."""
+        return self._database.one("SELECT 1 FROM meta WHERE name = ?", (f"job-over-{id}",)) is not None
+
+    def put_end_seen(self, id: str) -> None:
+        """Record that this station's clock was past the end of the job."""
+        self._database.execute("INSERT OR IGNORE INTO meta VALUES(?, ?)", (f"job-over-{id}", utc_now()))
+
     def unit(self, job: str, uuid: bytes) -> UnitRow | None:
         """Return the unit that a board has of a job."""
         return self._database.read_one(UnitRow, f"SELECT {_UNIT} FROM units WHERE job = ? AND uuid = ?", (job, uuid))

@@ -7,6 +7,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,6 +20,7 @@ from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.measure.blocks import ChannelFacts, NodeReport
 from teds_provision.measure.sinks import mqtt, open_sink
 from teds_provision.teds.units import parse_units
+from tests.e2e.desk import ROOT
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
 from tests.pace import until
 from tests.places import free_tcp_port
@@ -26,6 +28,19 @@ from tests.places import free_tcp_port
 MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin")
 BARE = "8d4d9da65281f7000003"
 OIL = replace(FORCE, number=3, name="oil", unit="K", units=parse_units("K"))
+
+
+PUBLISHER = """
+import sys, time
+from teds_provision.measure.sinks import open_sink
+from tests.measure.sinks.parts import ANGLE, STATION
+sink = open_sink(sys.argv[1])
+sink.open([ANGLE], STATION)
+while sink.stats.state != "running":
+    time.sleep(0.01)
+print("open", flush=True)
+time.sleep(60)
+"""
 
 
 class Broker:
@@ -203,6 +218,27 @@ class TestWithMosquitto:
             client.disconnect()
             client.loop_stop()
         assert sink.stats.error == ""
+
+    def test_who_subscribes_after_a_station_was_killed_sees_it_offline(self, broker: Broker) -> None:
+        broker.start()
+        publisher = subprocess.Popen(
+            [sys.executable, "-c", PUBLISHER, f"mqtt://127.0.0.1:{broker.port}"], stdout=subprocess.PIPE, cwd=ROOT
+        )
+        try:
+            assert publisher.stdout is not None
+            assert publisher.stdout.readline() == b"open\n"
+            before, online = broker.heard_of("bench/status")
+            until(lambda: online == ["online"])
+        finally:
+            publisher.kill()
+            publisher.communicate()
+        until(lambda: online == ["online", "offline"])
+        after, found = broker.heard_of("bench/status")
+        until(lambda: found, "the will was for those alone who listened then")
+        assert found == ["offline"]
+        for client in (before, after):
+            client.disconnect()
+            client.loop_stop()
 
     def test_more_channels_than_the_library_holds_are_all_announced(self, broker: Broker) -> None:
         broker.start()
