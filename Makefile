@@ -23,8 +23,6 @@ page-picture: $(VENV)/.dev
 # With its packages there, no test marked system may be skipped; without root it goes on, and says at the end what it left out.
 test: $(VENV)/.dev
 	@sh scripts/install-test-packages || { test -z "$$CI" && echo "Going on without them: the tests marked system are skipped."; }
-	@$(BIN)/python -c 'import smartcard' 2>/dev/null || $(BIN)/python -m pip install --quiet 'pyscard>=2.0.5' || \
-	  { test -z "$$CI" && echo "Going on without pyscard: the tests of PC/SC readers are skipped."; }
 	@$(MAKE) --no-print-directory lint
 	@$(MAKE) --no-print-directory -j2 types compiled
 	@sh scripts/install-test-packages >/dev/null 2>&1 && export TEST_PACKAGES=installed; $(MAKE) --no-print-directory unit

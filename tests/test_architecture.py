@@ -53,7 +53,7 @@ ARROWS = {
 }
 # Too slow to load before they are needed: --help, --version and a pure decode must not wait for them.
 HEAVY = {"nfc", "ndef", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11"}
-HEAVY |= {"smartcard", "mcap", "cyclonedds", "paho", "starlette", "uvicorn", "websockets"}
+HEAVY |= {"mcap", "cyclonedds", "paho", "starlette", "uvicorn", "websockets"}
 HEAVY |= {"bleak", "bumble", "dbus_fast", "psycopg", "pyarrow", "pandas", "cantools", "canopen", "lxml", "signxml"}
 PURE = ("protocol", "teds")
 IO = {"socket", "sqlite3", "subprocess", "threading", "time", "click", "serial"}

@@ -2,17 +2,18 @@
 
 Tags are nfcpy's classes with the exchange put in: Type 4 gets APDUs as they are, Type 2 by the pseudo-APDUs of PC/SC
 part 3 (FF B0 reads 16 octets, FF D6 writes a page). The reader is held alone (SCARD_SHARE_EXCLUSIVE). Errors of the
-service are named; the library (pyscard, extra ``pcsc``) is loaded when the first such reader is opened.
+service are named; the library (pcsclite.py) is loaded when the first such reader is opened.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from teds_provision.errors import NoReaderError, UsageError
-from teds_provision.lazy import how_to_install
 from teds_provision.links.nfc.nfcpy import QuietExchange, Type2TagCommandError, Type4ATag, nfc
+from teds_provision.links.nfc.pcsclite import GONE, SHARING_VIOLATION, PcscError, PcscLibrary, load
 from teds_provision.links.nfc.tag import FieldLostError, ReaderLostError, ReaderTag, Type2, Type4Ndef
 from teds_provision.links.ports import Trace
 
@@ -24,36 +25,27 @@ _OK: Final = b"\x90\x00"
 _PRESENCE: Final = bytes.fromhex("00B0000002")
 
 
-def _scard() -> Any:
+def _context(library: PcscLibrary) -> int:
     try:
-        import smartcard.scard
-    except ImportError as error:
+        return library.establish()
+    except PcscError as error:
         raise NoReaderError(
-            "PC/SC readers need the package pyscard, which is not installed.",
-            hint=f"{how_to_install('pcsc')} (it is built: sudo apt install swig libpcsclite-dev first).",
-        ) from error
-    return smartcard.scard
-
-
-def _context(scard: Any) -> Any:
-    result, context = scard.SCardEstablishContext(scard.SCARD_SCOPE_USER)
-    if result != scard.SCARD_S_SUCCESS:
-        raise NoReaderError(
-            f"The PC/SC service does not answer: {_error_text(scard, result)}.",
+            f"The PC/SC service does not answer: {error}.",
             hint="sudo apt install pcscd; sudo systemctl start pcscd.socket. Over ssh polkit may refuse; run as root.",
-        )
-    return context
+        ) from error
 
 
 def names() -> list[str]:
     """Return the names of all PC/SC readers; raises NoReaderError if the service or the library is missing."""
-    scard = _scard()
-    context = _context(scard)
+    library = load()
+    context = _context(library)
     try:
-        result, found = scard.SCardListReaders(context, [])
+        return library.readers(context)
+    except PcscError:
+        return []
     finally:
-        scard.SCardReleaseContext(context)
-    return list(found) if result == scard.SCARD_S_SUCCESS else []
+        with suppress(PcscError):
+            library.release(context)
 
 
 def names_if_any() -> list[str]:
@@ -74,29 +66,25 @@ class PcscReader:
 
     def __init__(self, path: str, trace: Trace | None = None) -> None:
         self._trace = trace
-        self._scard = _scard()
+        self._library = load()
         self.name = _chosen(path.partition(":")[2])
         self.again = f"{PREFIX}:{self.name}"
-        self._context = _context(self._scard)
+        self._context: int | None = _context(self._library)
         self._card: _Card | None = None
 
     def sense(self) -> ReaderTag | None:
         """Connect to the tag on the reader, field off and on before; None if there is none. Raises ReaderLostError."""
         self._disconnect()
-        scard = self._scard
-        result, handle, protocol = scard.SCardConnect(
-            self._context,
-            self.name,
-            scard.SCARD_SHARE_EXCLUSIVE,
-            scard.SCARD_PROTOCOL_T0 | scard.SCARD_PROTOCOL_T1,
-        )
-        if result in _gone(scard):
-            raise ReaderLostError(_error_text(scard, result))
-        if result == scard.SCARD_E_SHARING_VIOLATION:
-            raise ReaderLostError("another program holds it")
-        if result != scard.SCARD_S_SUCCESS:
+        assert self._context is not None, "sense() before close()"
+        try:
+            handle, protocol = self._library.connect(self._context, self.name)
+        except PcscError as error:
+            if error.code == SHARING_VIOLATION:
+                raise ReaderLostError("another program holds it") from error
+            if error.code in GONE:
+                raise ReaderLostError(str(error)) from error
             return None
-        self._card = card = _Card(scard, handle, protocol, self._trace)
+        self._card = card = _Card(self._library, handle, protocol, self._trace)
         try:
             return _tag(card)
         except FieldLostError:
@@ -106,12 +94,14 @@ class PcscReader:
         """Let the card and the service go; never raises."""
         self._disconnect()
         if self._context is not None:
-            self._scard.SCardReleaseContext(self._context)
+            with suppress(PcscError):
+                self._library.release(self._context)
             self._context = None
 
     def _disconnect(self) -> None:
         if self._card is not None:
-            self._scard.SCardDisconnect(self._card.handle, self._scard.SCARD_UNPOWER_CARD)
+            with suppress(PcscError):
+                self._library.disconnect(self._card.handle)
             self._card.target = None
             self._card = None
 
@@ -132,21 +122,6 @@ def _chosen(wanted: str) -> str:
     )
 
 
-def _gone(scard: Any) -> set[int]:
-    return {
-        scard.SCARD_E_READER_UNAVAILABLE,
-        scard.SCARD_E_UNKNOWN_READER,
-        scard.SCARD_E_NO_SERVICE,
-        scard.SCARD_E_SERVICE_STOPPED,
-        scard.SCARD_E_INVALID_HANDLE,
-        scard.SCARD_F_COMM_ERROR,
-    }
-
-
-def _error_text(scard: Any, result: int) -> str:
-    return str(scard.SCardGetErrorMessage(result)).strip().rstrip(".")
-
-
 @dataclass
 class _Target:
     """The activation facts that nfcpy's tags need."""
@@ -162,31 +137,32 @@ class _Target:
 class _Card:
     """A connected card; replaces the front end of nfcpy's tags."""
 
-    def __init__(self, scard: Any, handle: Any, protocol: int, trace: Trace | None) -> None:
-        self._scard, self._trace = scard, trace
+    def __init__(self, library: PcscLibrary, handle: int, protocol: int, trace: Trace | None) -> None:
+        self._library, self._trace = library, trace
         self.handle, self._protocol = handle, protocol
         self.target: _Target | None = None
 
     @property
     def atr(self) -> bytes:
         """Answer to reset, which the reader makes up for a card without contacts."""
-        result, _, _, _, atr = self._scard.SCardStatus(self.handle)
-        if result != self._scard.SCARD_S_SUCCESS:
-            raise FieldLostError
-        return bytes(atr)
+        try:
+            return self._library.atr(self.handle)
+        except PcscError as error:
+            raise FieldLostError from error
 
     def transmit(self, apdu: bytes) -> bytes:
         """Exchange one APDU, status word last; raises FieldLostError, ReaderLostError."""
         if self._trace is not None:
             self._trace.frame("pcsc", "out", apdu)
-        result, answer = self._scard.SCardTransmit(self.handle, self._protocol, list(apdu))
-        if result in _gone(self._scard):
-            raise ReaderLostError(_error_text(self._scard, result))
-        if result != self._scard.SCARD_S_SUCCESS or len(answer) < 2:
+        try:
+            answer = self._library.transmit(self.handle, self._protocol, apdu)
+        except PcscError as error:
+            raise (ReaderLostError(str(error)) if error.code in GONE else FieldLostError) from error
+        if len(answer) < 2:
             raise FieldLostError
         if self._trace is not None:
-            self._trace.frame("pcsc", "in", bytes(answer))
-        return bytes(answer)
+            self._trace.frame("pcsc", "in", answer)
+        return answer
 
 
 def _tag(card: _Card) -> ReaderTag:

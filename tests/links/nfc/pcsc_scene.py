@@ -5,7 +5,7 @@ has a fixed place: both namespaces are this scene's own). Commands, as JSON list
 JSON line with ``code``, ``out``, ``err`` goes out. The passphrase stands in FOLDER/pass. ``["lift"]`` and ``["put"]``
 take the card off and put it back.
 
-What is real: pcscd, its client library, pyscard, vpcd's driver. What is not: the reader, its firmware, the radio.
+What is real: pcscd, its client library, vpcd's driver. What is not: the reader, its firmware, the radio.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""PC/SC readers: real pcscd and pyscard on a virtual reader, and what is said where there is no service."""
+"""PC/SC readers: real pcscd and its library on a virtual reader, and what is said where there is no service."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import shutil
@@ -15,7 +14,8 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import NoReaderError, UsageError
-from teds_provision.links.nfc import pcsc
+from teds_provision.links.nfc import pcsc, pcsclite
+from teds_provision.links.nfc.pcsclite import PcscError
 from teds_provision.links.nfc.reader import open_reader
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import clean_environment
@@ -28,8 +28,6 @@ READER = "pcsc:Virtual PCD 00 00"
 
 def why_not() -> str:
     """Why the scene cannot be run here, "" where it can."""
-    if importlib.util.find_spec("smartcard") is None:
-        return "pyscard is not installed (pip install 'teds-provision[pcsc]')"
     if not Path(DRIVER).exists() or not Path("/usr/sbin/pcscd").exists():
         return "pcscd or vsmartcard-vpcd is not installed (scripts/install-test-packages)"
     if os.geteuid() != 0 or shutil.which("unshare") is None:
@@ -119,25 +117,22 @@ def test_a_node_is_provisioned_over_a_pc_sc_reader(scene: Scene) -> None:
     assert (done.get("uuid"), done.get("verdict")) == (scene.uuid, "authentic"), done
 
 
-class Scard:
-    """A stand-in for pyscard's functions where no service can be had in the state that a test wants."""
-
-    SCARD_SCOPE_USER = SCARD_S_SUCCESS = 0
+class Library:
+    """A stand-in for the client library where no service can be had in the state that a test wants."""
 
     def __init__(self, readers: list[str] | None) -> None:
         self._readers = readers
 
-    def SCardEstablishContext(self, scope: int) -> tuple[int, int]:
-        return (0, 1) if self._readers is not None else (0x8010001D, 0)
+    def establish(self) -> int:
+        if self._readers is None:
+            raise PcscError(0x8010001D, "Service not available")
+        return 1
 
-    def SCardListReaders(self, context: int, groups: list[str]) -> tuple[int, list[str]]:
-        return 0, self._readers or []
+    def readers(self, context: int) -> list[str]:
+        return self._readers or []
 
-    def SCardReleaseContext(self, context: int) -> int:
-        return 0
-
-    def SCardGetErrorMessage(self, code: int) -> str:
-        return "Service not available."
+    def release(self, context: int) -> None:
+        pass
 
 
 @pytest.mark.parametrize(
@@ -152,18 +147,19 @@ class Scard:
 def test_what_is_wrong_with_pc_sc_is_named(
     monkeypatch: pytest.MonkeyPatch, readers: list[str] | None, path: str, error: type[Exception], says: str
 ) -> None:
-    monkeypatch.setattr(pcsc, "_scard", lambda: Scard(readers))
+    monkeypatch.setattr(pcsc, "load", lambda: Library(readers))
     with pytest.raises(error, match=says):
         open_reader(path)
 
 
 def test_the_slot_of_a_security_module_is_no_reader_for_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pcsc, "_scard", lambda: Scard(["ACS ACR1252 SAM Reader 01", "ACS ACR1252 PICC Reader 00"]))
+    monkeypatch.setattr(pcsc, "load", lambda: Library(["ACS ACR1252 SAM Reader 01", "ACS ACR1252 PICC Reader 00"]))
     assert open_reader("pcsc").name == "ACS ACR1252 PICC Reader 00"
 
 
-def test_without_pyscard_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "smartcard", None)
+def test_without_the_client_library_its_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pcsclite, "LIBRARY", "libpcsclite.so.none")
+    pcsclite.load.cache_clear()
     with pytest.raises(NoReaderError) as caught:
         open_reader("pcsc")
-    assert "teds-provision[pcsc]" in caught.value.hint
+    assert caught.value.hint == "sudo apt install pcscd"
