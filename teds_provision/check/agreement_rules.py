@@ -9,7 +9,7 @@ from typing import Final
 
 from teds_provision.check import slips
 from teds_provision.check.plain_rules import low_s, security_state
-from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenError, demand, holds
+from teds_provision.check.probe import OVER_CAN, OVER_NFC, NotApplicableError, Probe, RuleBrokenError, demand, holds
 from teds_provision.check.rule import Stage, rule
 from teds_provision.errors import BadDataError, GarbledError, NotAuthenticError, PolicyError
 from teds_provision.links.ports import MultiStationLink
@@ -26,7 +26,15 @@ from teds_provision.protocol.keys import (
     station_key_message,
     verify,
 )
-from teds_provision.protocol.messages.frames import IDENTIFY, Command, Function, Reason, security_command
+from teds_provision.protocol.messages.frames import (
+    IDENTIFY,
+    Command,
+    Function,
+    Reason,
+    Reply,
+    decode_reply,
+    security_command,
+)
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.messages.tables import describe_command, describe_reply
 from teds_provision.protocol.session import OPEN_OCTETS, StationSession
@@ -37,7 +45,7 @@ from teds_provision.protocol.wire_agreement import (
     RequestPayload,
     StationAgreement,
 )
-from teds_provision.teds.image import SECURITY
+from teds_provision.teds.image import SECURITY, BlockId
 
 _OFF_CURVE: Final = b"\x04" + bytes(64)
 _CONFIRMATIONS: Final = 6
@@ -84,7 +92,7 @@ def tapped_or_bus(probe: Probe) -> None:
     if probe.tapped:
         return
     if probe.plain(request(b"")).reason == Reason.NOT_PERMITTED:
-        raise NotApplicableError("Request is not permitted on this link: the node is to be tapped.")
+        raise NotApplicableError(f"Request is not permitted on this link, as the board has NFC. {OVER_NFC}")
 
 
 @dataclass(frozen=True)
@@ -150,18 +158,25 @@ def _slip_of_request(probe: Probe) -> slips.Slip | None:
     if probe.identity().state != NodeState.FACTORY:
         return None
     strange = StrangerStation.make()
-    for slip, message in slips.station_keys(strange.station.point):
-        if probe.plain(request(strange.request(message=message))).ok:
-            return slip
-    return None
+
+    def takes(message: bytes) -> bool:
+        return probe.plain(request(strange.request(message=message))).ok
+
+    if takes(b"") or takes(b"no station key"):
+        return None  # it refuses the right one no more, or takes any: no slip explains that
+    return next((slip for slip, message in slips.station_keys(strange.station.point) if takes(message)), None)
 
 
 def stranger_asks(probe: Probe) -> bytes:
     """The payload of a reply to a good Request of a stranger, which nobody confirms; raises NotApplicableError."""
+    return _stranger_asks(probe, request(StrangerStation.make().request())).payload
+
+
+def _stranger_asks(probe: Probe, command: Command) -> Reply:
     tapped_or_bus(probe)
     if probe.no_agreement:
         raise NotApplicableError(f"Needs a good reply to Request, and none came: {probe.no_agreement}")
-    return probe.good(request(StrangerStation.make().request()))
+    return Reply(True, probe.good(command))
 
 
 def agree(
@@ -337,6 +352,17 @@ def confirm_checks(probe: Probe) -> str:
     return "4, 12, then 2; nothing changed"
 
 
+@rule("repetition-request", "Repetition", Stage.FACTORY)
+def repetition_request(probe: Probe) -> str:
+    """A repeated Request gets the stored reply and is not run again: nonceN, En and what pends stay."""
+    line, command = probe.resending, request(StrangerStation.make().request())
+    first = _stranger_asks(probe, command)
+    again = decode_reply(line.again(command.encode()))
+    text = "the stored reply is due, another one came. It was run again." if again.ok else describe_reply(again)
+    holds(again == first, f"Request (128.1) repeated: {text}")
+    return f"the stored {len(first.payload)} octets"
+
+
 @rule("reset-ends-request", "Reset", Stage.FACTORY)
 def reset_ends_request(probe: Probe) -> str:
     """A Reset ends the agreement that is pending: the Confirm after it gets 2, not 12."""
@@ -369,6 +395,23 @@ def confirm_newest(probe: Probe) -> str:
     return demand(probe.plain(first.confirm), Reason.BAD_TAG, "Confirm (128.2) of the Request before the last")
 
 
+@rule("confirm-whole-tag", "Key agreement", Stage.AGREEMENT)
+def confirm_whole_tag(probe: Probe) -> str:
+    """All 16 octets of tagS are looked at: one that is wrong in its first or last octet alone gets 12."""
+    tapped_or_bus(probe)
+    for at in (0, 15):
+        agreed, tried = agree(probe)
+        if probe.keep is not None:  # a node that takes it shall not be lost
+            probe.keep(agreed)
+        right = agreed.confirm.payload
+        wrong = right[:at] + bytes([right[at] ^ 1]) + right[at + 1 :]
+        reply = probe.plain(security_command(Function.CONFIRM, wrong))
+        if reply.ok:
+            probe.key, probe.okm = agreed.key, tried.okm
+        seen = demand(reply, Reason.BAD_TAG, f"Confirm (128.2), octet {at} of tagS alone wrong")
+    return seen
+
+
 @rule("agreement", "Key agreement", Stage.AGREEMENT)
 def agreement(probe: Probe) -> str:
     """A good Confirm is taken: Identify says keyed, and the epoch that was offered."""
@@ -397,13 +440,20 @@ def confirm(probe: Probe, *, sealed: bool) -> None:
 
 
 def _slip_of_confirm(probe: Probe) -> slips.Slip | None:
-    """What a node that refuses a good tagS may be waiting for: each is tried, with a Request of its own."""
-    for number in range(_CONFIRMATIONS):
+    """What a node that refuses a good tagS may be waiting for: each is tried, with a Request of its own.
+
+    The right one and one of zeros before them: a node that takes either is not explained by a slip.
+    """
+    for number in range(-2, _CONFIRMATIONS):
         agreed, tried = agree(probe)
         assert probe.keep is not None
         probe.keep(agreed)
-        slip, tag = slips.confirmations(tried.okm[16:], tried.script)[number]
-        if probe.plain(security_command(Function.CONFIRM, tag)).ok:
+        slip: slips.Slip | None = None
+        command = agreed.confirm if number == -2 else _WRONG_CONFIRM
+        if number >= 0:
+            slip, tag = slips.confirmations(tried.okm[16:], tried.script)[number]
+            command = security_command(Function.CONFIRM, tag)
+        if probe.plain(command).ok:
             probe.key, probe.okm = agreed.key, tried.okm
             return slip
     return None
@@ -425,7 +475,7 @@ def open_a_session(probe: Probe) -> str:
 def keyed_untapped(probe: Probe) -> str:
     """Untapped Request, Confirm and Set CAN address get 3 once the node has a key."""
     if probe.tapped:
-        raise NotApplicableError("This link counts as tapped; try it over CAN.")
+        raise NotApplicableError(f"Every command counts as tapped on this link. {OVER_CAN}")
     # what is refused here would change nothing even where it is let through: its SIG104, length and state are wrong
     probe.refused(request(StrangerStation.make().request(certified=False)), Reason.NOT_PERMITTED)
     probe.refused(security_command(Function.CONFIRM, bytes(16)), Reason.NOT_PERMITTED)
@@ -442,7 +492,7 @@ def keyed_security(probe: Probe) -> str:
 def confirm_elsewhere(probe: Probe) -> str:
     """A Confirm that is not by the same session as its Request gets 2, looked at before its tag."""
     if not probe.tapped:
-        raise NotApplicableError("Needs a tap: try it over NFC.")
+        raise NotApplicableError(f"Needs a tap. {OVER_NFC}")
     probe.sealed_good(StationAgreement(probe.station, probe.uuid).request())
     seen = probe.refused(_WRONG_CONFIRM, Reason.WRONG_STATE, "plain, of a Request in a session")
     probe.close()
@@ -509,9 +559,9 @@ def confirm_ends_sessions(probe: Probe) -> str:
         others[0].open()
         others[0].sealed_good(IDENTIFY)
         others[1].open()  # half-open: nothing is sealed in it
-    before = probe.identity()
+    before, stored = probe.identity(), _teds_of(probe)
     confirm(probe, sealed=True)
-    probe.session = None
+    probe.session, probe.before_rotation = None, (before, stored)
     holds(probe.identity().epoch == before.epoch + 1, f"After Confirm the epoch is not {before.epoch + 1}.")
     seen = demand(probe.plain(own.seal(IDENTIFY)), Reason.WRONG_STATE, "Sealed (128.4) in the session of the Confirm")
     for other, what in zip(others, ("another station's session", "another station's half-open Open"), strict=False):
@@ -524,6 +574,30 @@ def confirm_ends_sessions(probe: Probe) -> str:
     probe.sealed_good(IDENTIFY)
     probe.close()
     return seen
+
+
+@rule("rotation-keeps", "Key agreement", Stage.ROTATION)
+def rotation_keeps(probe: Probe) -> str:
+    """Another key changes the epoch alone: state, sequence and every TEDS stay.
+
+    Looks at what the Confirm of confirm-ends-sessions left.
+    """
+    if probe.before_rotation is None:
+        raise NotApplicableError("Needs a good Confirm of a node with a key (rule confirm-ends-sessions).")
+    before, stored = probe.before_rotation
+    after = probe.identity()
+    states = f"{before.state.name.lower()} became {after.state.name.lower()}"
+    holds(after.state == before.state, f"After a Confirm of a node with a key, {states}; rotation keeps the state.")
+    holds(after.sequence == before.sequence, f"Confirm took the sequence from {before.sequence} to {after.sequence}.")
+    kept = _teds_of(probe)
+    holds(kept == stored, "After a Confirm of a node with a key its TEDS are not what they were.")
+    return f"{after.state.name.lower()}, sequence {after.sequence}, {len(kept)} TEDS kept"
+
+
+def _teds_of(probe: Probe) -> dict[BlockId, bytes]:
+    """Every TEDS, the Security TEDS too if it is signed: an initial one has the epoch, which changes."""
+    signed = probe.security().signed
+    return {block: probe.teds(block) for block in probe.listed() if signed or block != SECURITY}
 
 
 # -- a test agreement in the open --------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from teds_provision.check.probe import HeardFrame, NotApplicableError, Probe, holds
+from teds_provision.check.probe import OVER_CAN, OVER_NFC, HeardFrame, NotApplicableError, Probe, holds
 from teds_provision.check.rule import Stage, rule
 from teds_provision.links.can.isotp import OVERFLOW, addresses, gap_seconds, read_single
 from teds_provision.links.ports import AnnouncingLink, MultiStationLink
@@ -27,7 +27,7 @@ _LONG: Final = write_teds(0, 12, 0, bytes(96))
 def _of_the_node(probe: Probe) -> tuple[HeardFrame, list[HeardFrame]]:
     """The first CAN frame that asks, and those by which the node takes a long question and gives a long answer."""
     if probe.heard is None or probe.contact.address is None:
-        raise NotApplicableError("A rule of CAN; try it there.")
+        raise NotApplicableError(f"A rule of CAN. {OVER_CAN}")
     began = len(probe.heard.frames)
     probe.plain(_LONG)
     probe.teds(SECURITY)
@@ -120,7 +120,7 @@ def nfc_wait_time(probe: Probe) -> str:
     """The service record announces a WT_INT that is a multiple of 4."""
     link = probe.contact.link
     if not isinstance(link, AnnouncingLink):
-        raise NotApplicableError("A rule of NFC; try it there.")
+        raise NotApplicableError(f"A rule of NFC. {OVER_NFC}")
     wt_int = link.announced["WT_INT"]
     holds(wt_int % 4 == 0, f"WT_INT is {wt_int}: implementations round what is no multiple of 4 differently.")
     return ", ".join(f"{name} {value}" for name, value in link.announced.items())
@@ -133,8 +133,10 @@ def nfc_wtx(probe: Probe) -> str:
         [frame.octets for frame in probe.heard.frames if frame.direction == "in"] if probe.heard is not None else []
     )
     asked = {block[1] & 0x3F for block in blocks if len(block) == 2 and block[0] == _WTX}
-    if probe.contact.address is not None or not asked:
-        raise NotApplicableError("No S(WTX) was heard.")
+    if probe.contact.address is not None:
+        raise NotApplicableError(f"A rule of NFC. {OVER_NFC}")
+    if not asked:
+        raise NotApplicableError("The board never asked for more time, so there is no S(WTX) to look at.")
     wrong = sorted(asked - set(range(1, _MOST_WTX + 1)))
     holds(not wrong, f"S(WTX) with multiplier {', '.join(map(str, wrong))}: 1 to {_MOST_WTX} are allowed.")
     return f"multiplier {', '.join(map(str, sorted(asked)))}"

@@ -11,7 +11,7 @@ from teds_provision.check import slips
 from teds_provision.check.slips import Slip
 from teds_provision.errors import BadDataError, GarbledError, MessageTooLongError, NodeSilentError, NotAuthenticError
 from teds_provision.links import Contact
-from teds_provision.links.ports import Direction, Link, MultiStationLink, Trace
+from teds_provision.links.ports import Direction, FramedLink, Link, MultiStationLink, ResendLink, Trace
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import (
@@ -27,15 +27,21 @@ from teds_provision.protocol.messages.frames import (
 )
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.messages.tables import describe_answer, describe_command, describe_reply
-from teds_provision.protocol.session import StationSession
-from teds_provision.protocol.wire_agreement import AgreedKey, Credentials
+from teds_provision.protocol.session import TAG_OCTETS, StationSession, open_mac
+from teds_provision.protocol.wire_agreement import AgreedKey, Credentials, key_id
 from teds_provision.talk.conversation import BUSY_PAUSE, BUSY_SECONDS
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.image import SECURITY as SECURITY_TEDS
 from teds_provision.teds.image import BlockId
+from teds_provision.teds.sheet import ChannelKind
 
+OVER_CAN: Final = "Connect the board's CAN, and add: --via can --can INTERFACE:CHANNEL"
+OVER_NFC: Final = "Put the board on an NFC reader, and add: --via nfc"
+"""What a person connects so that a skipped rule runs."""
 _LARGEST_TEDS: Final = 1 << 20
+_FAR_COUNTER: Final = 1000
+"""Of a session in which slips are tried: later than every counter before."""
 _STATIONS: Final = range(0xF7, 0xF0, -1)
 """Addresses of base stations, those first that a real one has least often."""
 
@@ -132,6 +138,14 @@ class Probe:
         """The CAN address that the node had before a rule moved it, 0 where none did; when it was moved."""
         self.asked = ""
         """The last command that was sent, in words."""
+        self.before_rotation: tuple[Identity, dict[BlockId, bytes]] | None = None
+        """What Identify said and which TEDS there were before the node got another key; None until it did."""
+        self.channels: dict[int, tuple[ChannelKind, int]] = {}
+        """Kind and ModLenth of the channels that can be claimed, by number; empty until that was asked."""
+        self.no_channels = ""
+        """Why no channel can be claimed; empty if that was not asked, or one can."""
+        self.own_blocks: dict[BlockId, bytes] | None = None
+        """The board's own TEDS while others are there for trying; None while its own are."""
 
     # -- frames ----------------------------------------------------------------------------------------------------
 
@@ -186,12 +200,36 @@ class Probe:
         """The node's line where it is one of a bus; raises NotApplicableError elsewhere."""
         link = self.contact.link
         if not isinstance(link, MultiStationLink):
-            raise NotApplicableError("Needs a bus, where a second station can ask: try it over CAN.")
+            raise NotApplicableError(f"Needs a second base station. {OVER_CAN}")
+        return link
+
+    @property
+    def resending(self) -> ResendLink:
+        """The line where a request can be sent again; raises NotApplicableError elsewhere."""
+        if not isinstance(self.line, ResendLink):
+            raise NotApplicableError(f"This link sends no request twice. {OVER_CAN}")
+        return self.line
+
+    @property
+    def framed(self) -> FramedLink:
+        """The node's line where its frames can be sent one by one; raises NotApplicableError elsewhere."""
+        link = self.contact.link
+        if not isinstance(link, FramedLink):
+            raise NotApplicableError(f"Needs single CAN frames. {OVER_CAN}")
         return link
 
     def beside(self, number: int) -> Probe:
         """The same node as another base station has it, ``number`` 1 or 2: its own line, and so its own session."""
-        bus = self.bus
+        other = Probe(self.contact, self.heard)
+        other.line, other.key, other.okm = self.bus.beside(self.free_source(number)), self.key, self.okm
+        other.credentials = self.credentials
+        return other
+
+    def free_source(self, number: int) -> int:
+        """An address of base stations under which nothing was heard, the first (1), second or third such.
+
+        Raises NotApplicableError if there are not so many.
+        """
         frames = self.heard.frames if self.heard is not None else []
         out = [frame.identifier & 0xFF for frame in frames if frame.identifier is not None and frame.direction == "out"]
         taken = {
@@ -199,11 +237,10 @@ class Probe:
         }
         free = [source for source in _STATIONS if source not in taken | set(out[:1])]
         if number > len(free):
-            raise NotApplicableError("All addresses of base stations are in use on this bus.")
-        other = Probe(self.contact, self.heard)
-        other.line, other.key, other.okm = bus.beside(free[number - 1]), self.key, self.okm
-        other.credentials = self.credentials
-        return other
+            raise NotApplicableError(
+                "The other base stations use all addresses, F1 to F7: disconnect one of them from this bus."
+            )
+        return free[number - 1]
 
     def now(self) -> float:
         """Monotonic seconds."""
@@ -291,12 +328,18 @@ class Probe:
         """What the node made otherwise of keyId (it said 16) or mac (12): each slip is tried until it takes one."""
         if reply.reason not in (Reason.UNKNOWN_KEY, Reason.BAD_TAG):
             return None
-        about_key = reply.reason == Reason.UNKNOWN_KEY
-        tries = slips.opens(self.link_key, self.okm, self.uuid, one_time.point, about_key=about_key)
-        for slip, payload in tries:
-            if self.plain(security_command(Function.OPEN, payload(self.opening_counter()))).ok:
-                return slip
-        return None
+        about_key, key, point = reply.reason == Reason.UNKNOWN_KEY, self.link_key, one_time.point
+
+        def takes(payload: Callable[[bytes], bytes]) -> bool:
+            return self.plain(security_command(Function.OPEN, payload(self.opening_counter()))).ok
+
+        # what it refuses no more, or takes whatever it is, no slip explains
+        if takes(lambda counter: key_id(key) + point + open_mac(key, self.uuid, counter, point)):
+            return None
+        if takes(lambda _: (bytes(8) if about_key else key_id(key)) + point + bytes(TAG_OCTETS)):
+            return None
+        tries = slips.opens(key, self.okm, self.uuid, point, about_key=about_key)
+        return next((slip for slip, payload in tries if takes(payload)), None)
 
     def sealed(self, command: Command) -> Reply:
         """Send a command in the session, which is opened where none is; the inner reply."""
@@ -331,11 +374,16 @@ class Probe:
 
     def _slip_of_sealed(self, session: StationSession) -> Slip | None:
         """How the node would take a Sealed frame: each slip is tried, under counters of their own."""
-        for counter, (slip, seal) in enumerate(slips.SEALED, 1000):
-            payload = seal(session.keys, counter, IDENTIFY.encode())
-            if self.plain(security_command(Function.SEALED, payload)).ok:
-                return slip
-        return None
+
+        def takes(payload: bytes) -> bool:
+            return self.plain(security_command(Function.SEALED, payload)).ok
+
+        right = session.seal(IDENTIFY, counter=_FAR_COUNTER).payload
+        if takes(right) or takes(right[:4] + bytes(len(right) - 4)):
+            return None  # it refuses it no more, or takes whatever comes: no slip explains that
+        tries = enumerate(slips.SEALED, _FAR_COUNTER + 1)
+        frame = IDENTIFY.encode()
+        return next((slip for counter, (slip, seal) in tries if takes(seal(session.keys, counter, frame))), None)
 
     def sealed_good(self, command: Command) -> bytes:
         """A sealed command that must succeed; the inner payload."""

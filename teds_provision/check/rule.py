@@ -10,6 +10,8 @@ from typing import Final, Literal
 from teds_provision.check.probe import Probe
 
 Result = Literal["passed", "failed", "skipped"]
+PROFILE: Final = "profile.md"
+OPERATION_PAGE: Final = "operation.md"
 
 
 class Stage(Enum):
@@ -21,13 +23,14 @@ class Stage(Enum):
     KEYED = "a node with a key of this station"
     SESSION = "in sessions; what is staged is dropped"
     COMMIT = "a datasheet is committed"
+    MEASURING = "channels are claimed; a board of ours keeps its TEDS"
     ROTATION = "the node is given another key"
     RESET = "the node goes back to factory state"
 
 
 @dataclass(frozen=True)
 class Rule:
-    """One rule: its name, the section of docs/profile.md that makes it, and how it is tried.
+    """One rule: its name, the section of a page of docs/ that makes it, and how it is tried.
 
     ``run`` returns what was seen, in few words; raises RuleBrokenError, NotApplicableError or a LinkError.
     """
@@ -36,11 +39,12 @@ class Rule:
     section: str
     stage: Stage
     run: Callable[[Probe], str]
+    page: str = PROFILE
 
     @property
     def clause(self) -> str:
         """Page and section."""
-        return f"profile.md, {self.section}"
+        return f"{self.page}, {self.section}"
 
 
 @dataclass(frozen=True)
@@ -61,11 +65,13 @@ RULES: Final[list[Rule]] = []
 """Every rule, in the order in which they are run within their stage."""
 
 
-def rule(name: str, section: str, stage: Stage) -> Callable[[Callable[[Probe], str]], Callable[[Probe], str]]:
+def rule(
+    name: str, section: str, stage: Stage, *, page: str = PROFILE
+) -> Callable[[Callable[[Probe], str]], Callable[[Probe], str]]:
     """Register a function as a rule of this name."""
 
     def register(run: Callable[[Probe], str]) -> Callable[[Probe], str]:
-        RULES.append(Rule(name, section, stage, run))
+        RULES.append(Rule(name, section, stage, run, page))
         return run
 
     return register

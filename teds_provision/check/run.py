@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from teds_provision.check import agreement_rules, link_rules, plain_rules, session_rules, write_rules
+from teds_provision.check import (
+    agreement_rules,
+    frame_rules,
+    link_rules,
+    measuring_rules,
+    plain_rules,
+    session_rules,
+    write_rules,
+)
 from teds_provision.check.agreement_rules import ExplainedRequest, explain
 from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenError, TraceRecorder
 from teds_provision.check.rule import RULES, Rule, RuleResult, Stage
@@ -21,7 +30,7 @@ from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter
 
-_REGISTERS = (plain_rules, link_rules, agreement_rules, session_rules, write_rules)
+_REGISTERS = (plain_rules, link_rules, frame_rules, agreement_rules, session_rules, write_rules, measuring_rules)
 """The modules whose rules are registered by being imported."""
 _ONLY_FACTORY = "The node has a key. Ask with --factory to have it reset and keyed anew."
 _NEEDS_FACTORY = "Changes the node's key. Ask with --factory."
@@ -109,13 +118,15 @@ class _Run:
             if ours:
                 self._stage(Stage.KEYED)
                 self._stage(Stage.SESSION)
+                if not self._factory:  # else when it is a factory node again, whose TEDS may be written
+                    self._stage(Stage.MEASURING)
             self._in_factory_state(ours)
         except LinkError as lost:
             self._lost = lost
             for stage in Stage:
                 self._skip(stage, _GONE)
         for stage in Stage:
-            held = stage in (Stage.KEYED, Stage.SESSION) and not self._factory
+            held = stage in (Stage.KEYED, Stage.SESSION, Stage.MEASURING) and not self._factory
             self._skip(stage, _NEEDS_KEY if held else _NEEDS_FACTORY)
         stages = list(Stage)
         ordered = sorted(RULES, key=lambda rule: stages.index(rule.stage))
@@ -231,14 +242,18 @@ class _Run:
         if probe.key is None:
             ended = self._checks["agreement"]
             why = f"No key was agreed (rule agreement, {ended.result}): {ended.detail}"
-            for stage in (Stage.KEYED, Stage.SESSION, Stage.COMMIT, Stage.ROTATION, Stage.RESET):
+            for stage in (Stage.KEYED, Stage.SESSION, Stage.COMMIT, Stage.MEASURING, Stage.ROTATION, Stage.RESET):
                 self._skip(stage, why)
             return
         if sessions_too:
             self._stage(Stage.KEYED)
             self._stage(Stage.SESSION)
-        for stage in (Stage.COMMIT, Stage.ROTATION, Stage.RESET):
-            self._stage(stage)
+        self._stage(Stage.COMMIT)
+        self._stage(Stage.MEASURING)
+        with suppress(RuleBrokenError, NotApplicableError):  # what is broken, a rule has said
+            measuring_rules.restore(probe)
+        self._stage(Stage.ROTATION)
+        self._stage(Stage.RESET)
         if self._checks["reset"].result == "passed":
             with self._station.durable("node check"):
                 self._station.keys.remove(self._node.uuid)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Callable
 from typing import Final
@@ -12,7 +11,7 @@ from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenErro
 from teds_provision.check.rule import Stage, rule
 from teds_provision.check.slips import Slip
 from teds_provision.errors import LinkError
-from teds_provision.links.ports import MultiStationLink, ResendLink
+from teds_provision.links.ports import MultiStationLink
 from teds_provision.protocol.announce import LAST_ADDRESS
 from teds_provision.protocol.keys import CHALLENGE_OCTETS, POINT_OCTETS, SoftwareKey
 from teds_provision.protocol.messages.frames import (
@@ -28,12 +27,17 @@ from teds_provision.protocol.messages.frames import (
     write_teds,
 )
 from teds_provision.protocol.messages.tables import describe_command, describe_reply
-from teds_provision.protocol.session import BLOCK_OCTETS, LAST_COUNTER, OPEN_OCTETS, StationSession, open_mac
+from teds_provision.protocol.session import (
+    BLOCK_OCTETS,
+    LAST_COUNTER,
+    OPEN_OCTETS,
+    TAG_OCTETS,
+    StationSession,
+    open_mac,
+)
 from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.teds.image import SECURITY as SECURITY_TEDS
 
-_OPERATE: Final = (4, 1)
-_IDLE: Final = (4, 2)
 REPLY_HEADER: Final = 3
 
 
@@ -67,14 +71,20 @@ def open_replaced(probe: Probe) -> str:
 
 @rule("open-checks", "Sessions", Stage.SESSION)
 def open_checks(probe: Probe) -> str:
-    """Length, keyId, mac: 4, 16, 12, in this order, and none of them uses c up."""
+    """Length, keyId, mac: 4, 16, 12, in this order, each over all of its octets, and none of them uses c up."""
     _opens(probe)
     key, before = probe.link_key, probe.opening_counter()
     point = SoftwareKey.generate().point
     probe.refused(_open(bytes(OPEN_OCTETS - 1)), Reason.BAD_FORM)
     probe.refused(_open(bytes(OPEN_OCTETS)), Reason.UNKNOWN_KEY, "a keyId of zeros")
-    wrong = key_id(key) + point + os.urandom(16)
-    probe.refused(_open(wrong), Reason.BAD_TAG, "a wrong mac")
+    probe.refused(
+        _open(key_id(key)[:4] + bytes(4) + point + bytes(16)), Reason.UNKNOWN_KEY, "a keyId of which 4 octets are right"
+    )
+    probe.refused(_open(key_id(key) + point + os.urandom(16)), Reason.BAD_TAG, "a wrong mac")
+    mac = open_mac(key, probe.uuid, before, point)
+    for at in (0, 7, 8, TAG_OCTETS - 1):
+        almost = mac[:at] + bytes([mac[at] ^ 1]) + mac[at + 1 :]
+        probe.refused(_open(key_id(key) + point + almost), Reason.BAD_TAG, f"a mac whose octet {at} alone is wrong")
     seen = probe.refused(_open(key_id(key) + bytes(65) + bytes(16)), Reason.BAD_TAG, "a wrong mac over a wrong point")
     holds(probe.opening_counter() == before, "A refused Open changed c.")
     return seen
@@ -170,8 +180,12 @@ def sealed_tag(probe: Probe) -> str:
     probe.sealed_good(IDENTIFY)
     probe.refused(security_command(Function.SEALED, bytes(35)), Reason.BAD_FORM)
     good = session.seal(IDENTIFY)
-    bad = good.payload[:-1] + bytes([good.payload[-1] ^ 1])
-    seen = probe.refused(security_command(Function.SEALED, bad), Reason.BAD_TAG, "one bit of the tag wrong")
+    for at in (-TAG_OCTETS, -1):
+        bad = bytearray(good.payload)
+        bad[at] ^= 1
+        seen = probe.refused(
+            security_command(Function.SEALED, bytes(bad)), Reason.BAD_TAG, f"octet {at + TAG_OCTETS} of the tag wrong"
+        )
     session.unseal(probe.good(good))
     return seen
 
@@ -260,6 +274,21 @@ def stranger_ends_nothing(probe: Probe) -> str:
     return "Identify, List and Prove of a third station; both sessions go on"
 
 
+@rule("session-bound", "Sessions", Stage.SESSION)
+def session_bound(probe: Probe) -> str:
+    """A session, and a half-open Open, belong to one pair of addresses: from another one Sealed gets 2."""
+    other = probe.beside(1)
+    for what in ("of a half-open Open", "of a session"):
+        if what == "of a half-open Open":
+            probe.open()
+        assert probe.session is not None
+        sealed = probe.session.seal(IDENTIFY)
+        seen = demand(other.plain(sealed), Reason.WRONG_STATE, f"Sealed (128.4) {what}, from another station's address")
+        probe.session.unseal(probe.good(sealed).ljust(36, b"\0"))
+    probe.close()
+    return seen
+
+
 # -- repetition --------------------------------------------------------------------------------------------------------
 
 
@@ -267,9 +296,7 @@ class _RepeatedIdentify:
     """A sealed Identify whose reply the node is to keep."""
 
     def __init__(self, probe: Probe) -> None:
-        if not isinstance(probe.line, ResendLink):
-            raise NotApplicableError("This link cannot send a request again.")
-        self._probe, self._line = probe, probe.line
+        self._probe, self._line = probe, probe.resending
         self._frame = probe.open().seal(IDENTIFY).encode()
         self._words = f"{describe_command(IDENTIFY)}, for repeating"
         self.first = self._noted(probe.line.exchange, "")
@@ -296,6 +323,23 @@ def repetition(probe: Probe) -> str:
     sent.again()
     sent.again()
     return f"the stored {len(sent.first)} octets, twice"
+
+
+@rule("repetition-open", "Repetition", Stage.SESSION)
+def repetition_open(probe: Probe) -> str:
+    """A repeated Open gets the stored reply: it is run once, so c grows by 1 and the session opens all the same."""
+    _opens(probe)
+    line, counter = probe.resending, probe.opening_counter()
+    session = StationSession(probe.link_key, probe.uuid)
+    frame = session.open(counter).encode()
+    first = probe.octets(frame, "Open (128.3), for repeating")
+    again = decode_reply(line.again(frame))
+    holds(again == first, f"Open (128.3) repeated: the stored reply is due, {describe_reply(again)} came.")
+    session.accept(first.payload)
+    probe.session = session
+    probe.sealed_good(IDENTIFY)
+    probe.close()
+    return "the stored reply, and a session under it"
 
 
 @rule("repetition-everyone", "Repetition", Stage.SESSION)
@@ -336,7 +380,7 @@ def address_moves(probe: Probe) -> str:
     """
     home = probe.identity().can_address
     if not home:
-        raise NotApplicableError("The node has no CAN address.")
+        raise NotApplicableError("The board has no CAN, and so no address to move.")
     probe.sealed_good(_set_address(home))
     target = _free_address(probe, home)
     probe.home_address = home
@@ -366,7 +410,7 @@ def _free_address(probe: Probe, home: int) -> int:
         address = (home - 1 + 53 * step) % LAST_ADDRESS + 1
         if not isinstance(link, MultiStationLink) or link.there(address) is None:
             return address
-    raise NotApplicableError("No CAN address is free here.")
+    raise NotApplicableError("Every CAN address is in use here: disconnect other boards.")
 
 
 def _moved(probe: Probe, home: int, target: int) -> StationSession:
@@ -418,31 +462,12 @@ def close(probe: Probe) -> str:
     return demand(probe.plain(session.seal(IDENTIFY)), Reason.WRONG_STATE, "Sealed (128.4) after Close")
 
 
-@rule("operate-lease", "Which command when", Stage.SESSION)
-def operate_lease(probe: Probe) -> str:
-    """Operate takes a lease of 1 to 60 s: 0 and 61 get 19, with the digest of the datasheet that is there now."""
-    digest = hashlib.sha256(probe.teds(SECURITY_TEDS)).digest()[:16]
-    answers = {lease: probe.sealed(Command(0, *_OPERATE, digest + bytes([lease]))) for lease in (0, 61)}
-    probe.sealed(Command(0, *_IDLE))
-    probe.close()
-    reasons = {reply.reason for reply in answers.values()}
-    if reasons == {Reason.UNKNOWN_COMMAND}:
-        raise NotApplicableError("The node does not measure: Operate gets 1.")
-    if reasons == {Reason.DIGEST_MISMATCH}:
-        raise NotApplicableError(
-            "No channel has a Channel TEDS that fits it: Operate gets 6 before the lease is looked at."
-        )
-    for lease, reply in answers.items():
-        demand(reply, Reason.OUT_OF_RANGE, f"Operate (4.1) of all sensors, sealed, lease {lease}")
-    return "19 for a lease of 0 and of 61 s"
-
-
 @rule("address-back", "Command frames", Stage.SESSION)
 def address_back(probe: Probe) -> str:
     """10 s after a write of the address another one is taken."""
     home = probe.home_address
     if not home or probe.identity().can_address == home:
-        raise NotApplicableError("The address was not moved.")
+        raise NotApplicableError("The rule address-moves moved no address.")
     probe.pause(max(0.0, probe.moved_at + _ADDRESS_SECONDS + 0.5 - probe.now()))
     _moved(probe, probe.identity().can_address, home)
     now = probe.identity().can_address

@@ -637,6 +637,45 @@ def of_sealed_reply(keys: SessionKeys, payload: bytes, counter: int) -> Slip | N
     return None
 
 
+def of_data_message(key: bytes, run: int, counter: int, message: bytes) -> Slip | None:
+    """Return what would explain the wrong tag of a data message of this run and counter; ``key`` is k_m."""
+    label, head, rest = b"TEDS1 stream\0", message[:4], message[4:]
+
+    def run_key(octets: bytes, run_octets: bytes = run.to_bytes(2, "big")) -> bytes:
+        return HKDFExpand(hashes.SHA256(), 16, octets + run_octets).derive(key)
+
+    keys = _ways(
+        run_key(label),
+        run_label_without_00=(run_key(label[:-1]), 'the label "TEDS1 stream" of the run\'s key stands without its 00'),
+        run_drive_label=(run_key(b"TEDS1 drive\0"), "the key of the stream is made with the label of Drive"),
+        run_little_endian=(run_key(label, run.to_bytes(2, "little")), "run is little-endian in the run's key"),
+        run_before=(run_key(label, (run - 1).to_bytes(2, "big")), "the run's key is that of the run before"),
+        run_left_out=(run_key(label, b""), "the run's key leaves out run"),
+        run_key_is_km=(key[:16], "messages are sealed under k_m; each run has a key of its own"),
+    )
+    nonces = _ways(
+        bytes(9) + head,
+        nonce_counter_first=(head + bytes(9), SEALED[1][0].words),
+        nonce_counter_little_endian=(bytes(9) + head[::-1], SEALED[2][0].words),
+        nonce_of_zeros=(bytes(13), "the nonce of a data message is zeros alone: one key and nonce for many messages"),
+        nonce_next_counter=(bytes(9) + (counter + 1).to_bytes(4, "big"), "the counter in the nonce is one too high"),
+    )
+    for (named, under), (slip, nonce) in product(keys, nonces):
+        for aad in (None, head):
+            right = named is None and slip is None and aad is None
+            if not right and _opens(under, nonce, rest, aad):
+                return _together((named, slip, SEALED[3][0] if aad else None))
+    return None
+
+
+def _opens(key: bytes, nonce: bytes, sealed: bytes, aad: bytes | None) -> bool:
+    try:
+        AESCCM(key, tag_length=8).decrypt(nonce, sealed, aad)
+    except (InvalidTag, ValueError):
+        return False
+    return True
+
+
 def _of_padding(inner: bytes) -> Slip | None:
     """What was done in place of PKCS #7; ``inner`` is what the good tag covers."""
     length = 3 + int.from_bytes(inner[1:3], "big")

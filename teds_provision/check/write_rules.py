@@ -30,6 +30,7 @@ from teds_provision.protocol.messages.frames import (
     TedsFunction,
     TedsStatus,
     query_teds,
+    read_teds,
     security_command,
     update_teds,
     write_teds,
@@ -44,6 +45,8 @@ from teds_provision.teds.image import SECURITY, BlockId
 _MOST_WRITTEN = 32768
 """MaxTEDSSize up to which a TEDS of that size is staged for trying."""
 _ALPHABET = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"
+_CODES = (*range(1, 18), 131)
+"""Access codes of TEDS that any board may be given."""
 _HEAD = 53
 """Octets of a Write that are not TEDS: of maxMessage so many less may be written at once."""
 
@@ -91,6 +94,49 @@ def update_checks(probe: Probe) -> str:
     holds(block not in probe.listed(), f"List (128.11) names {block}, which is staged and not committed.")
     probe.close()
     return seen
+
+
+@rule("update-codes", "Writing to flash", Stage.SESSION)
+def update_codes(probe: Probe) -> str:
+    """The checksum of a staged TEDS is looked at whatever its access code is, Calibration as well as text: else 4."""
+    listed = set(probe.listed())
+    for code in _CODES:
+        channel = next(channel for channel in range(255, 0, -1) if (channel, code) not in listed)
+        good = _example((channel, code))
+        probe.sealed_good(write_teds(channel, code, 0, good[:-1] + bytes([good[-1] ^ 1])))
+        seen = probe.sealed_refused(update_teds(channel, code), Reason.BAD_FORM, f"access code {code}, checksum wrong")
+        probe.close()
+    return seen
+
+
+@rule("staged-unseen", "Writing to flash", Stage.SESSION)
+def staged_unseen(probe: Probe) -> str:
+    """What is staged is not there yet: neither Read nor Query gives it, and Update of it alone commits nothing."""
+    block = absent(probe)
+    before = probe.sealed_good(query_teds(*block))
+    probe.sealed_good(write_teds(*block, 0, _example(block)))
+    probe.sealed_refused(read_teds(*block, 0), Reason.NO_SUCH_TEDS, f"{block} staged, not committed")
+    holds(
+        probe.sealed_good(query_teds(*block)) == before, f"Query (1.1) gives {block}, which is staged, not committed."
+    )
+    probe.sealed_good(update_teds(*block))
+    probe.close()
+    probe.sealed_refused(read_teds(*block, 0), Reason.NO_SUCH_TEDS, f"after Update of {block} alone, without 128")
+    text = f"Update (1.4) of {block} alone stored it: no datasheet covers it."
+    holds(probe.sealed_good(query_teds(*block)) == before, text)
+    probe.close()
+    return f"{block} is not there before a datasheet is committed"
+
+
+@rule("write-read-only", "Writing to flash", Stage.SESSION)
+def write_read_only(probe: Probe) -> str:
+    """A TEDS that Query calls read-only is not written: 3."""
+    for block in probe.listed():
+        if TedsStatus.decode(probe.good(query_teds(*block))).attributes & Attribute.READ_ONLY:
+            seen = probe.sealed_refused(write_teds(*block, 0, b"\0"), Reason.NOT_PERMITTED, f"{block} is read-only")
+            probe.close()
+            return seen
+    raise NotApplicableError("No TEDS of this board is read-only: build its firmware with one, as Origin (130).")
 
 
 @rule("write-drops", "Writing to flash", Stage.SESSION)
@@ -153,7 +199,8 @@ def staging_shared(probe: Probe) -> str:
 # -- the commit --------------------------------------------------------------------------------------------------------
 
 
-def _stored(probe: Probe) -> dict[BlockId, bytes]:
+def stored_blocks(probe: Probe) -> dict[BlockId, bytes]:
+    """Every TEDS that the node lists but the Security TEDS, read now."""
     return {block: probe.teds(block) for block in probe.listed() if block != SECURITY}
 
 
@@ -182,12 +229,22 @@ def _signed(probe: Probe, sheet: SecurityTeds) -> bytes:
     return sign_datasheet(sheet, probe.uuid, probe.station)
 
 
+def commit_blocks(probe: Probe, blocks: dict[BlockId, bytes], *, write: dict[BlockId, bytes]) -> None:
+    """Commit a datasheet over these TEDS, of which ``write`` are new; raises RuleBrokenError where it is refused."""
+    octets = _signed(probe, _sheet(probe, blocks))
+    for block, teds in write.items():
+        _write(probe, block, teds)
+    _write(probe, SECURITY, octets)
+    probe.sealed_good(update_teds(*SECURITY))
+    holds(probe.teds(SECURITY) == octets, "After the commit Read gives another Security TEDS.")
+
+
 Change = Callable[[SecurityTeds], SecurityTeds]
 
 
 def _refused_commit(probe: Probe, reason: Reason, why: str, change: Change) -> str:
     """Commit a datasheet that is wrong in one thing, over what is stored; what came."""
-    return _refused_over(probe, reason, why, _signed(probe, change(_sheet(probe, _stored(probe)))))
+    return _refused_over(probe, reason, why, _signed(probe, change(_sheet(probe, stored_blocks(probe)))))
 
 
 def _refused_over(probe: Probe, reason: Reason, why: str, octets: bytes) -> str:
@@ -198,7 +255,7 @@ def _refused_over(probe: Probe, reason: Reason, why: str, octets: bytes) -> str:
         seen = probe.sealed_refused(update_teds(*SECURITY), reason, why)
     except RuleBrokenError:
         if probe.teds(SECURITY) == octets:  # it took what is wrong: a good one in its place, so that the rest can go on
-            _write(probe, SECURITY, _signed(probe, _sheet(probe, _stored(probe))))
+            _write(probe, SECURITY, _signed(probe, _sheet(probe, stored_blocks(probe))))
             probe.sealed(update_teds(*SECURITY))
             probe.close()
         raise
@@ -216,7 +273,7 @@ def commit_signatures(probe: Probe) -> str:
     forged = other.sign(b"no station key")
     _refused_commit(probe, Reason.BAD_SIGNATURE, "104 wrong", lambda s: replace(s, station_key_signature=forged))
     _refused_commit(probe, Reason.BAD_SIGNATURE, "102 wrong", lambda s: replace(s, node_key_signature=forged))
-    octets = _sheet(probe, _stored(probe)).with_signature(other.sign(b"another datasheet")).encode()
+    octets = _sheet(probe, stored_blocks(probe)).with_signature(other.sign(b"another datasheet")).encode()
     _write(probe, SECURITY, octets)
     seen = probe.sealed_refused(update_teds(*SECURITY), Reason.BAD_SIGNATURE, "100 wrong")
     probe.close()
@@ -226,7 +283,7 @@ def commit_signatures(probe: Probe) -> str:
 @rule("commit-high-s", "Notation", Stage.COMMIT)
 def commit_high_s(probe: Probe) -> str:
     """A field 100 whose s is in the upper half gets 5."""
-    sheet = _sheet(probe, _stored(probe))
+    sheet = _sheet(probe, stored_blocks(probe))
     good = security.decode(_signed(probe, sheet)).signature
     assert good is not None
     twisted = good[:32] + (GROUP_ORDER - int.from_bytes(good[32:], "big")).to_bytes(32, "big")
@@ -237,7 +294,7 @@ def commit_high_s(probe: Probe) -> str:
 @rule("commit-form", "Writing to flash", Stage.COMMIT)
 def commit_form(probe: Probe) -> str:
     """A Security TEDS that is not canonical, or not signed, gets 4."""
-    octets = _signed(probe, _sheet(probe, _stored(probe)))
+    octets = _signed(probe, _sheet(probe, stored_blocks(probe)))
     twice = frame(octets[4:-2] + b"\x6e\x01\x01")  # field 110 a second time
     for wrong, why in ((twice, "110 twice"), (security_of_the_node(probe), "not signed")):
         _write(probe, SECURITY, wrong)
@@ -281,7 +338,7 @@ def commit_base64(probe: Probe) -> str:
 def commit_extra(probe: Probe) -> str:
     """Fields 111 to 255 are skipped, and covered by the signature: one changed after signing gets 5."""
     extra = {111: b"\x01", 200: b"of a later profile", 255: b""}
-    good = _signed(probe, replace(_sheet(probe, _stored(probe)), extra=extra))
+    good = _signed(probe, replace(_sheet(probe, stored_blocks(probe)), extra=extra))
     at = good.index(b"of a later profile")
     changed = frame(good[4:at] + b"OF" + good[at + 2 : -2])
     _refused_over(probe, Reason.BAD_SIGNATURE, "field 200 changed after signing", changed)
@@ -294,7 +351,7 @@ def commit_extra(probe: Probe) -> str:
 
 def _unsigned_block(probe: Probe) -> bytes:
     """The data block of the next good Security TEDS, without field 100."""
-    return _sheet(probe, _stored(probe)).block()
+    return _sheet(probe, stored_blocks(probe)).block()
 
 
 def _signed_block(probe: Probe, block: bytes, message: bytes = b"") -> bytes:
@@ -324,7 +381,7 @@ def security_of_the_node(probe: Probe) -> bytes:
 def commit_digests(probe: Probe) -> str:
     """A listed TEDS that is not there, and a staged one that is not listed, get 6."""
     block = absent(probe)
-    stored = _stored(probe)
+    stored = stored_blocks(probe)
     _write(probe, SECURITY, _signed(probe, _sheet(probe, stored | {block: _example(block)})))
     probe.sealed_refused(update_teds(*SECURITY), Reason.DIGEST_MISMATCH, "one listed, not there")
     _write(probe, block, _example(block))
@@ -338,7 +395,7 @@ def commit_digests(probe: Probe) -> str:
 def commit_digest(probe: Probe) -> str:
     """A staged TEDS with another digest than the one that is listed gets 6."""
     block = absent(probe)
-    listed = _stored(probe) | {block: frame(bytes([3, 4, 0, block[1], 1, 1, 0x80, 2, 0xBE, 0xEF]))}
+    listed = stored_blocks(probe) | {block: frame(bytes([3, 4, 0, block[1], 1, 1, 0x80, 2, 0xBE, 0xEF]))}
     _write(probe, block, _example(block))
     octets = _signed(probe, _sheet(probe, listed))
     return _refused_over(probe, Reason.DIGEST_MISMATCH, "another digest", octets)
@@ -350,7 +407,7 @@ def commit_own_check(probe: Probe) -> str:
     block = absent(probe)
     wrong = _example(block)[:-1] + bytes([_example(block)[-1] ^ 1])
     _write(probe, block, wrong)
-    octets = _signed(probe, _sheet(probe, _stored(probe) | {block: wrong}))
+    octets = _signed(probe, _sheet(probe, stored_blocks(probe) | {block: wrong}))
     return _refused_over(probe, Reason.BAD_FORM, "checksum of a staged TEDS", octets)
 
 
@@ -375,7 +432,7 @@ def commit_uuid(probe: Probe) -> str:
     other = bytes(octet ^ 0x55 for octet in probe.uuid)
     octets = frame(bytes([3, 4, 0, 1, 1, 1, 4, 10]) + other)
     _write(probe, meta, octets)
-    listed = _stored(probe) | {meta: octets}
+    listed = stored_blocks(probe) | {meta: octets}
     return _refused_over(probe, Reason.WRONG_UUID, "another UUID", _signed(probe, _sheet(probe, listed)))
 
 
@@ -390,14 +447,17 @@ def commit_sequence(probe: Probe) -> str:
 
 @rule("commit-epoch", "Writing to flash", Stage.COMMIT)
 def commit_epoch(probe: Probe) -> str:
-    """A KeyEpoch other than the node's gets 8, after the sequence."""
-    return _refused_commit(probe, Reason.WRONG_EPOCH, "an epoch ahead", lambda s: replace(s, key_epoch=s.key_epoch + 1))
+    """A KeyEpoch other than the node's, a later or an earlier one, gets 8, after the sequence."""
+    _refused_commit(probe, Reason.WRONG_EPOCH, "an epoch ahead", lambda s: replace(s, key_epoch=s.key_epoch + 1))
+    return _refused_commit(
+        probe, Reason.WRONG_EPOCH, "an epoch behind", lambda s: replace(s, key_epoch=max(0, s.key_epoch - 1))
+    )
 
 
 @rule("commit", "Writing to flash", Stage.COMMIT)
 def commit(probe: Probe) -> str:
     """A good one is taken whole and read back; the next, without the TEDS of the test, removes it again."""
-    block, stored, before = absent(probe), _stored(probe), probe.identity()
+    block, stored, before = absent(probe), stored_blocks(probe), probe.identity()
     for blocks in (stored | {block: _example(block)}, stored):
         octets = _signed(probe, _sheet(probe, blocks))
         for block_id in set(blocks) - set(stored):
@@ -411,8 +471,10 @@ def commit(probe: Probe) -> str:
                 slip,
             )
         holds(probe.teds(SECURITY) == octets, "After the commit Read gives another Security TEDS.")
-        holds(_stored(probe) == blocks, "After the commit the node holds other TEDS than were signed.")
-    after = probe.require(NodeState.PROVISIONED)
+        holds(stored_blocks(probe) == blocks, "After the commit the node holds other TEDS than were signed.")
+    after = probe.identity()
+    text = f"After a commit Identify says {after.state.name.lower()}; provisioned is due."
+    holds(after.state == NodeState.PROVISIONED, text)
     holds(
         after.sequence == before.sequence + 2,
         f"Sequence went from {before.sequence} to {after.sequence} with two commits.",
@@ -422,32 +484,44 @@ def commit(probe: Probe) -> str:
 
 
 def _slip_of_commit(probe: Probe, reason: int | None, blocks: dict[BlockId, bytes]) -> Slip | None:
-    """What a node that refuses a good datasheet with 5 or 6 may be looking for: each is tried until it takes one."""
+    """What a node that refuses a good datasheet with 5 or 6 may be looking for: each is tried until it takes one.
+
+    None if it takes the right one now, or one that no slip explains: then none of these is what is wrong with it.
+    """
     probe.close()
+    stored = stored_blocks(probe)
+    new = {block: teds for block, teds in blocks.items() if block not in stored}
+
+    def takes(octets: bytes) -> bool:
+        for block, teds in new.items():
+            _write(probe, block, teds)
+        _write(probe, SECURITY, octets)
+        taken = probe.sealed(update_teds(*SECURITY)).ok
+        probe.close()
+        return taken
+
+    def listing(listed: dict[BlockId, bytes]) -> bytes:
+        return _signed(probe, replace(_sheet(probe, blocks), signed_blocks=dict(sorted(listed.items()))))
+
     tries: list[tuple[Slip, bytes]] = []
+    nonsense = b""
     if reason == Reason.BAD_SIGNATURE:
         block = _sheet(probe, blocks).block()
         tries = [(slip, _signed_block(probe, block, message)) for slip, message in slips.datasheets(probe.uuid, block)]
-    if reason == Reason.DIGEST_MISMATCH:
+        nonsense = _signed_block(probe, block, b"no datasheet")
+    if reason == Reason.DIGEST_MISMATCH and blocks:  # without a block every slip below gives the right datasheet
         cuts = {
             "digest-of-data-block": (slice(4, -2), "the digests of field 108 are over data blocks only"),
             "digest-without-length": (slice(4, None), "the digests of field 108 leave out Length"),
             "digest-without-checksum": (slice(0, -2), "the digests of field 108 leave out Checksum"),
         }
-        for name, (cut, words) in cuts.items():
-            listed = {block: hashlib.sha256(teds[cut]).digest() for block, teds in blocks.items()}
-            sheet = replace(_sheet(probe, blocks), signed_blocks=dict(sorted(listed.items())))
-            tries.append((Slip(name, words + "; they are from Length to Checksum"), _signed(probe, sheet)))
-    stored = _stored(probe)
-    for slip, octets in tries:
-        for block_id in set(blocks) - set(stored):
-            _write(probe, block_id, blocks[block_id])
-        _write(probe, SECURITY, octets)
-        taken = probe.sealed(update_teds(*SECURITY)).ok
-        probe.close()
-        if taken:
-            return slip
-    return None
+        for name, (part, words) in cuts.items():
+            listed = {block: hashlib.sha256(teds[part]).digest() for block, teds in blocks.items()}
+            tries.append((Slip(name, words + "; they are from Length to Checksum"), listing(listed)))
+        nonsense = listing({block: bytes(32) for block in blocks})
+    if not tries or takes(_signed(probe, _sheet(probe, blocks))) or takes(nonsense):
+        return None
+    return next((slip for slip, octets in tries if takes(octets)), None)
 
 
 # -- the way back ------------------------------------------------------------------------------------------------------
@@ -456,7 +530,7 @@ def _slip_of_commit(probe: Probe, reason: int | None, blocks: dict[BlockId, byte
 @rule("reset", "Reset", Stage.RESET)
 def reset(probe: Probe) -> str:
     """In a session Reset erases key and trust and proves it; epoch and sequence stay, sessions end."""
-    before, stored, challenge = probe.identity(), _stored(probe), os.urandom(CHALLENGE_OCTETS)
+    before, stored, challenge = probe.identity(), stored_blocks(probe), os.urandom(CHALLENGE_OCTETS)
     probe.sealed_refused(security_command(Function.RESET, challenge[1:]), Reason.BAD_FORM, "a challenge of 31 octets")
     proof = probe.sealed_good(security_command(Function.RESET, challenge))
     probe.session = None
@@ -468,7 +542,7 @@ def reset(probe: Probe) -> str:
         kept, f"Reset took epoch {before.epoch} and sequence {before.sequence} to {after.epoch} and {after.sequence}."
     )
     holds(not probe.security().signed, "After Reset the node still shows a signed Security TEDS.")
-    holds(_stored(probe) == stored, "After Reset the other TEDS of the node are not what they were.")
+    holds(stored_blocks(probe) == stored, "After Reset the other TEDS of the node are not what they were.")
     security_state(probe)
     return f"factory, epoch {after.epoch} and sequence {after.sequence} kept"
 

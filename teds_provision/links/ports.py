@@ -5,8 +5,9 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import Final, Literal, Protocol, runtime_checkable
+from typing import Final, Literal, NamedTuple, Protocol, runtime_checkable
 
 from teds_provision.links.hints import BleAddress, Charging
 from teds_provision.protocol.messages.identity import Identity
@@ -150,6 +151,38 @@ class MultiStationLink(Protocol):
 
         Returns the data of the frame that the node answers with (ISO-TP, its first octet is the type), empty for none.
         """
+
+
+class BusFrame(NamedTuple):
+    """One frame of a bus as it was: identifier, data, and when it came in (seconds of ``time.monotonic()``)."""
+
+    identifier: int
+    octets: bytes
+    at: float
+
+
+class BusFrames(Protocol):
+    """The frames of a bus, one by one, below every link. Used by one thread.
+
+    ``own`` is the address of this base station on it; ``fd``: commands go by CAN FD here.
+    """
+
+    own: int
+    fd: bool
+
+    def send(self, identifier: int, octets: bytes, *, fd: bool = False) -> None:
+        """Put one frame on the bus; raises LinkError."""
+
+    def next(self, seconds: float) -> BusFrame | None:
+        """The next frame of a node, Announces and data too; None after ``seconds``. Raises LinkError."""
+
+
+@runtime_checkable
+class FramedLink(Protocol):
+    """A node's line on a bus whose frames can be sent and heard one by one, to see what a node makes of them (CAN)."""
+
+    def single_frames(self) -> AbstractContextManager[BusFrames]:
+        """Hear every frame of nodes from now on, until the block ends."""
 
 
 @runtime_checkable

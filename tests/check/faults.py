@@ -12,7 +12,7 @@ from teds_provision.protocol import datasheet
 from teds_provision.protocol.messages.frames import Function
 from teds_provision.protocol.tim import node
 
-from . import bends, faulty
+from . import bends, faulty, more_bends
 from .bends import Bend, agreeing_so, datasheet_signed_as, hkdf, mac, opened_by, opening_so, sealing_so, sha, signs_for
 from .faulty import Fault
 
@@ -36,9 +36,14 @@ class Faulty:
     link: dict[str, Any] = field(default_factory=dict)
 
 
-def _slip(what: str, slip: str, bend: Bend, *also: str, rule: str = "agreement-tags", words: str = "") -> Faulty:
-    """A slip of the key agreement or of a session."""
-    return Faulty(what, rule, words or "A known slip fits", bend, slip=slip, also=also)
+_MEASURING: Final = "measuring can"
+
+
+def _slip(
+    what: str, slip: str, bend: Bend, *also: str, rule: str = "agreement-tags", words: str = "", over: str = "nfc"
+) -> Faulty:
+    """A slip of the key agreement, of a session or of a stream."""
+    return Faulty(what, rule, words or "A known slip fits", bend, slip=slip, also=also, over=over)
 
 
 FAULTS: Final[dict[str, Faulty]] = {
@@ -313,14 +318,16 @@ FAULTS: Final[dict[str, Faulty]] = {
         "Close ends nothing", "close", "after Close", fault=faulty.close_is_ignored, also=("*",)),
     "FAULT_ONE_SESSION": Faulty(
         "room for one session", "two-sessions", "a sealed reply is due, refusal 2 came", bends.room_for_one,
-        also=("stranger-ends-nothing", "repetition-two", "confirm-beside", "staging-shared", "confirm-ends-sessions",
+        also=("stranger-ends-nothing", "session-bound", "repetition-two", "confirm-beside", "staging-shared",
+              "confirm-ends-sessions",
               "address-moves", "reset"),
         over="can"),
     "FAULT_STRANGER_ENDS_SESSION": Faulty(
         "a third station's Identify that ends a session", "stranger-ends-nothing", "from a third station",
         bends.a_third_link_takes_the_place_of_a_session, also=("confirm-ends-sessions",), over="can"),
     "FAULT_RUNS_AGAIN": Faulty(
-        "a repetition that is run again", "repetition", "the stored reply is due", link={"runs_again": True}),
+        "a repetition that is run again", "repetition", "the stored reply is due",
+        link={"runs_again": lambda frame: frame[3] == Function.SEALED}),
     "FAULT_EVERYONE_DROPS_REPLY": Faulty(
         "a functional Identify drops the stored reply", "repetition-everyone", "after a functional Identify",
         over="can", link={"everyone_counts": True}),
@@ -389,6 +396,8 @@ FAULTS: Final[dict[str, Faulty]] = {
         "two addresses within 10 s", "address-moves", "a second write within 10 s", bends.no_seconds_between_addresses),
     "FAULT_LEASE_0": Faulty(
         "a lease of 0", "operate-lease", "lease 0", bends.any_lease, over="measuring"),
+    "FAULT_LEASE_255": Faulty(
+        "a lease of 255", "operate-lease", "lease 255", more_bends.lease_of_255, over="measuring"),
     "FAULT_RESET_FORGETS_EPOCH": Faulty(
         "an epoch that goes back with Reset", "reset", "epoch", fault=faulty.reset_forgets_epoch),
     "FAULT_RESET_TAKES_TEDS": Faulty(
@@ -400,4 +409,101 @@ FAULTS: Final[dict[str, Faulty]] = {
     "FAULT_RESET_ANY_CHALLENGE": Faulty(
         "Prove and Reset with any challenge", "prove-length", "refusal 4 is due", bends.any_challenge_of_reset,
         also=("reset",)),
+    # -- what a station sees of comparisons, repetition and the commit
+    "FAULT_OPEN_MAC_OF_8_OCTETS": Faulty(
+        "mac of Open compared over 8 octets", "open-checks", "a mac whose octet 8 alone is wrong",
+        more_bends.open_mac_of_8_octets),
+    "FAULT_KEY_ID_OF_4_OCTETS": Faulty(
+        "keyId compared over 4 octets", "open-checks", "a keyId of which 4 octets are right",
+        more_bends.key_id_of_4_octets),
+    "FAULT_STATION_TAG_OF_8_OCTETS": Faulty(
+        "tagS compared over 8 octets", "confirm-whole-tag", "octet 15 of tagS alone wrong",
+        more_bends.station_tag_of_8_octets, over="can", also=("agreement", "confirm-newest")),
+    "FAULT_REQUEST_RUNS_AGAIN": Faulty(
+        "a repeated Request that is run again", "repetition-request", "It was run again",
+        link={"runs_again": lambda frame: frame[3] == Function.REQUEST}),
+    "FAULT_OPEN_RUNS_AGAIN": Faulty(
+        "a repeated Open that is run again", "repetition-open", "refusal 12 came",
+        link={"runs_again": lambda frame: frame[3] == Function.OPEN}),
+    "FAULT_SESSION_OF_ANY_ADDRESS": Faulty(
+        "a session that belongs to no address", "session-bound", "from another station's address",
+        more_bends.session_of_any_address, over="can", also=("*",)),
+    "FAULT_OLDER_EPOCH": Faulty(
+        "a commit of an older epoch", "commit-epoch", "an epoch behind", more_bends.takes_an_older_epoch),
+    "FAULT_CALIBRATION_CHECKSUM": Faulty(
+        "the checksum of a Calibration TEDS ignored", "update-codes", "access code 5, checksum wrong",
+        more_bends.calibration_unchecked),
+    "FAULT_NEVER_PROVISIONED": Faulty(
+        "a node that never says provisioned", "commit", "Identify says keyed; provisioned is due",
+        more_bends.never_provisioned),
+    "FAULT_STAGING_SURVIVES_COMMIT": Faulty(
+        "staged TEDS that survive the commit", "commit", "success is due, refusal 6 came",
+        more_bends.staging_survives_the_commit),
+    "FAULT_ROTATION_UNPROVISIONS": Faulty(
+        "a rotation that takes the datasheet away", "rotation-keeps", "provisioned became keyed",
+        more_bends.rotation_unprovisions),
+    "FAULT_READ_STAGED": Faulty(
+        "Read gives what is staged", "staged-unseen", "staged, not committed", more_bends.read_gives_what_is_staged),
+    "FAULT_UPDATE_STORES": Faulty(
+        "Update of one TEDS stores it", "staged-unseen", "alone", more_bends.update_stores_at_once, also=("*",)),
+    "FAULT_WRITE_READ_ONLY": Faulty(
+        "a read-only TEDS that is written", "write-read-only", "is read-only", more_bends.writes_read_only,
+        over="nfc read-only"),
+    # -- frames of CAN
+    "FAULT_ANY_TARGET": Faulty(
+        "frames for other addresses answered", "can-other-address", "the node at", more_bends.answers_for_any_address,
+        over="can"),
+    "FAULT_ANYTHING_FUNCTIONAL": Faulty(
+        "any command answered that everyone is asked", "can-functional", "only Identify is answered",
+        more_bends.runs_what_everyone_is_asked, over="can"),
+    "FAULT_ANY_SEQUENCE_NUMBER": Faulty(
+        "sequence numbers of ISO-TP ignored", "can-sequence", "a reply came", more_bends.any_sequence_number,
+        over="can"),
+    "FAULT_BLOCK_SIZE_IGNORED": Faulty(
+        "block size ignored", "can-flow-obeyed", "more frames came without a flow control",
+        more_bends.block_size_ignored, over="can"),
+    "FAULT_STMIN_IGNORED": Faulty(
+        "STmin ignored", "can-flow-obeyed", "STmin 50 ms was asked for", more_bends.stmin_ignored, over="can"),
+    "FAULT_WAIT_IGNORED": Faulty(
+        "a flow control that says wait taken for go on", "can-flow-obeyed", "that says wait", more_bends.wait_is_go_on,
+        over="can"),
+    "FAULT_SHORT_FIRST_FRAME": Faulty(
+        "a first frame of 7 octets", "can-lengths", "a first frame of 7 octets", more_bends.short_first_frame,
+        over="can"),
+    "FAULT_ESCAPED_CLASSIC_FRAME": Faulty(
+        "the length of CAN FD in a classic single frame", "can-lengths", "a classic single frame",
+        more_bends.escape_in_a_classic_frame, over="can"),
+    "FAULT_ANNOUNCE_CRC": Faulty(
+        "a wrong CRC in Announce", "can-announce", "is due", more_bends.announces_another_crc, over="can"),
+    "FAULT_CLAIM_REVERSED": Faulty(
+        "the greater CRC keeps the address", "can-announce", "the node moved to",
+        more_bends.claim_the_wrong_way_round, over="can", also=("*",)),
+    # -- measurement
+    "FAULT_OPERATE_ANY_DIGEST": Faulty(
+        "Operate with any digest", "operate-digest", "octet 0 of the digest changed", more_bends.any_digest,
+        over="measuring"),
+    "FAULT_WRITE_UNDER_CLAIM": Faulty(
+        "Write under a claim", "operate-configuration", "refusal 2 is due", more_bends.writes_under_a_claim,
+        over="measuring"),
+    "FAULT_VALUES_UNCLAIMED": Faulty(
+        "values of a channel that is not claimed", "operate-values", "not claimed", more_bends.values_unclaimed,
+        over="measuring"),
+    "FAULT_LEASE_FOR_EVER": Faulty(
+        "a lease that never ends", "operate-expires", "is still claimed", more_bends.lease_for_ever, over="measuring"),
+    "FAULT_STREAM_NONCE": _slip(
+        "the counter first in the nonce of data messages", "nonce-counter-first",
+        more_bends.stream_nonce_counter_first, rule="stream-messages", words="Data message 1 of run 1",
+        over=_MEASURING),
+    "FAULT_STREAM_NONCE_STANDS_STILL": _slip(
+        "one nonce for every data message", "nonce-of-zeros", more_bends.stream_nonce_stands_still,
+        rule="stream-messages", words="one key and nonce for many messages", over=_MEASURING),
+    "FAULT_RUN_STANDS_STILL": Faulty(
+        "every stream is run 1", "stream-messages", "run 1; 2 is due", more_bends.run_stands_still, over=_MEASURING),
+    "FAULT_DRIVE_REPLAY": Faulty(
+        "a Drive message of an older counter", "drive-replay", "a message with counter 4 was taken after counter 7",
+        more_bends.drive_replayed, over=_MEASURING),
+    "FAULT_DRIVE_TWICE": Faulty(
+        "a Drive message taken twice", "drive-replay", "started it again", more_bends.drive_twice, over=_MEASURING),
+    "FAULT_ANY_TOKEN": Faulty(
+        "a trigger with any T", "trigger-token", "with another T", more_bends.any_token, over=_MEASURING),
 }  # fmt: skip

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from teds_provision.errors import NodeSilentError
+from teds_provision.links.ports import BusFrames
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey
 from teds_provision.protocol.messages.frames import (
     COMMON,
@@ -27,6 +29,7 @@ from teds_provision.protocol.session import OPEN_OCTETS, open_mac
 from teds_provision.teds.codec.frame import frame
 
 from ..bench import Board, MemoryLink
+from .memory_bus import MemoryServer
 
 Next = Callable[[bytes], bytes]
 """What the reference node answers to a command frame."""
@@ -39,8 +42,8 @@ class FaultyLink(MemoryLink):
 
     fault: Fault | None = None
     tapped_when_keyed: bool = False
-    runs_again: bool = False
-    """Whether the node runs a repeated request instead of giving the stored reply."""
+    runs_again: Callable[[bytes], bool] = lambda _: False
+    """Which repeated requests the node runs instead of giving the stored reply."""
     repetition: Repetition = field(default_factory=Repetition)
 
     @property
@@ -50,7 +53,7 @@ class FaultyLink(MemoryLink):
 
     def reference(self, octets: bytes) -> bytes:
         """What the reference node answers here."""
-        factory = self.board.state.state == NodeState.FACTORY
+        factory = self.board.tim.identity().state == NodeState.FACTORY
         tapped = self.via == "nfc" or factory or self.tapped_when_keyed
         return self.board.tim.handle(octets, link=self.name, tapped=tapped)
 
@@ -60,14 +63,16 @@ class FaultyLink(MemoryLink):
         return self.answer(frame)
 
     def again(self, frame: bytes) -> bytes:
-        self.count += self.runs_again
+        self.count += self.runs_again(frame)
         return self.answer(frame)
 
     def answer(self, frame: bytes) -> bytes:
         def run(octets: bytes) -> bytes:
             return self.reference(octets) if self.fault is None else self.fault(self.board, octets, self.reference)
 
-        return self.repetition.answer(self.count, frame, run, now=self.board.seconds)
+        reply = self.repetition.answer(self.count, frame, run, now=self.board.seconds)
+        self.board.tim.reply_left(self.name)
+        return reply
 
 
 @dataclass
@@ -85,6 +90,8 @@ class FaultyBus(FaultyLink):
     one_buffer: bytes = b"\x30\x10\0"
     """What answers a second station's first frame beside the one of the first."""
     half_sent: int = 0
+    end: BusFrames | None = None
+    """The node's end of the bus, frame by frame."""
     lines: dict[int, FaultyBus] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -119,6 +126,13 @@ class FaultyBus(FaultyLink):
             self.count += 1
             return self.answer(IDENTIFY.encode())
         return self.reference(IDENTIFY.encode())
+
+    @contextmanager
+    def single_frames(self) -> Iterator[BusFrames]:
+        own = self.lines[0xF1]
+        if own.end is None:
+            own.end = getattr(self.board, "frames_of", MemoryServer)(own)
+        yield own.end
 
     def there(self, address: int) -> Identity | None:
         here = address == self.board.tim.can_address or (self.stays_at_the_old and address == self._first)

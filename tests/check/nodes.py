@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import pytest
 
@@ -12,29 +13,45 @@ from teds_provision.check.rule import RuleResult
 from teds_provision.check.run import CheckReport, check_node
 from teds_provision.protocol.tim import Tim
 from teds_provision.station.station import Station
-from tests.protocol.operation.bench import FakeHardware, channel_teds
+from teds_provision.teds.codec.frame import frame
+from tests.protocol.operation.bench import SECOND, FakeHardware, channel_teds
 
 from ..bench import Board, talk
 from ..protocol.desk import META, NAME
 from .faulty import FaultyBus, FaultyLink
+
+ORIGIN: Final = (0, 130)
+ORIGIN_TEDS: Final = frame(bytes([3, 4, 0, 130, 1, 1, 4, 9]) + b"kind=dbc\n")
+
+
+@dataclass
+class TimedHardware(FakeHardware):
+    """Hardware whose clock is that of its board."""
+
+    clock: Callable[[], float] = float
+
+    def now(self) -> int:
+        return self.tick + round(self.clock() * SECOND)
 
 
 class Measuring(Board):
     """A node with channels, which a session may claim; their TEDS fit."""
 
     def power_on(self) -> None:
-        self.hardware = FakeHardware()
+        self.hardware = TimedHardware(clock=lambda: self.seconds)
         super().power_on()
         self.tim = Tim(self.key, self.flash, lambda: self.seconds, max_message=self.max_message, hardware=self.hardware)
 
 
 def made(over: str = "nfc", *, epoch: int = 4) -> Board:
     """A node in factory state that was keyed before, with a Meta-TEDS and a name of its own."""
-    board = Measuring() if over == "measuring" else Board()
+    board = Measuring() if over.startswith("measuring") else Board()
     blocks = {(0, 1): META, (1, 12): NAME}
-    if isinstance(board, Measuring):
+    if isinstance(board, Measuring) and not over.endswith("blank"):
         blocks |= {(number, 3): channel_teds(facts) for number, facts in board.hardware.channels.items()}
-    board.flash.state = replace(board.state, blocks=blocks, epoch=epoch)
+    read_only = frozenset({ORIGIN} if over.endswith("read-only") else ())
+    blocks |= dict.fromkeys(read_only, ORIGIN_TEDS)
+    board.flash.state = replace(board.state, blocks=blocks, read_only=read_only, epoch=epoch)
     board.power_on()
     return board
 
@@ -51,7 +68,7 @@ def checked(
 
     patch.setattr(Probe, "pause", pause)
     patch.setattr(Probe, "now", lambda self: board.seconds)
-    line = line or (FaultyBus(board, **link) if over == "can" else FaultyLink(board, **link))
+    line = line or (FaultyBus(board, **link) if "can" in over else FaultyLink(board, **link))
     return check_node(station, talk(board, line), factory=factory, explained=explained)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.check import frame_rules
 from teds_provision.check.agreement_rules import ExplainedRequest
 from teds_provision.check.rule import RULES, Stage
 from teds_provision.check.run import CheckReport, check_node
@@ -17,6 +18,7 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import reset_node
 from teds_provision.steps.identify import identify
+from tests.protocol.operation.bench import SAFE_VALUE
 
 from ..bench import Board, make_station, talk
 from . import faulty, nodes
@@ -24,7 +26,7 @@ from .bends import agreeing_so, opening_so
 from .faulty import FaultyLink
 from .nodes import names
 
-PAGE = Path(__file__).parents[2] / "docs" / "profile.md"
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 @pytest.fixture
@@ -41,9 +43,14 @@ OF_FRAMES = {"can-flow-control", "can-form", "nfc-wait-time", "nfc-wtx"}
 """Rules that hear frames: a link in memory has none. ``test_link_rules`` tries them."""
 OF_STATIONS = {
     "can-busy", "confirm-other-link", "confirm-beside", "two-sessions", "stranger-ends-nothing", "repetition-everyone",
-    "repetition-two", "staging-shared",
+    "repetition-two", "staging-shared", "session-bound",
 }  # fmt: skip
 """Rules that need a second station."""
+OF_CAN = OF_STATIONS | {rule.name for rule in RULES if rule.run.__module__ == frame_rules.__name__}
+OF_CHANNELS = {rule.name for rule in RULES if rule.stage == Stage.MEASURING}
+BY_DATA = {"stream-messages", "drive-replay", "trigger-token"}
+"""Rules of channels that need CAN."""
+NOTHING_READ_ONLY = {"write-read-only"}
 
 
 # -- a good node -------------------------------------------------------------------------------------------------------
@@ -52,9 +59,11 @@ OF_STATIONS = {
 @pytest.mark.parametrize(
     ("over", "skipped"),
     [
-        ("nfc", {"keyed-untapped", "operate-lease", *OF_STATIONS}),
-        ("can", {"confirm-elsewhere", "operate-lease"}),
-        ("measuring", {"keyed-untapped", *OF_STATIONS}),
+        ("nfc", {"keyed-untapped", *OF_CHANNELS, *OF_CAN, *NOTHING_READ_ONLY}),
+        ("can", {"confirm-elsewhere", *OF_CHANNELS, *NOTHING_READ_ONLY}),
+        ("measuring", {"keyed-untapped", *BY_DATA, *OF_CAN, *NOTHING_READ_ONLY}),
+        ("measuring can", {"confirm-elsewhere", *NOTHING_READ_ONLY}),
+        ("nfc read-only", {"keyed-untapped", *OF_CHANNELS, *OF_CAN}),
     ],
 )
 def test_the_reference_node_keeps_every_rule(
@@ -67,9 +76,46 @@ def test_the_reference_node_keeps_every_rule(
     assert names(report, "skipped") == skipped | OF_FRAMES
     assert board.state.state == NodeState.FACTORY
     assert board.state.blocks == own, "the TEDS of the test is gone, its own are there"
-    assert (board.state.epoch, board.state.sequence) == (6, 3)
+    assert board.state.epoch == 6
+    assert board.state.sequence == 3
     assert board.tim.can_address == home
     assert not station.keys.held(board.uuid)
+
+
+def test_a_board_without_channel_teds_is_lent_some(station: Station, patch: pytest.MonkeyPatch) -> None:
+    """With --factory too "operate-lease" was skipped, as a board in factory state has no datasheet."""
+    board = nodes.made("measuring can blank")
+    own = dict(board.state.blocks)
+    report = nodes.checked(station, patch, board, over="measuring can")
+    assert not nodes.failed(report)
+    assert names(report, "passed") >= OF_CHANNELS
+    assert board.state.blocks == own, "what was lent is gone"
+    assert board.hardware.points == dict.fromkeys((4, 6), SAFE_VALUE), "no actuator was given another value"
+
+
+@pytest.mark.parametrize("over", ["measuring can", "measuring can blank"])
+def test_without_factory_no_channel_teds_is_written_and_no_actuator_claimed(
+    station: Station, patch: pytest.MonkeyPatch, over: str
+) -> None:
+    board = nodes.made(over)
+    agreed(station, board)
+    before = board.state
+    report = nodes.checked(station, patch, board, over=over, factory=False)
+    assert not nodes.failed(report)
+    assert board.state == before
+    (replay,) = [check for check in report.checks if check.rule == "drive-replay"]
+    assert replay.result == "skipped"
+    assert "--factory" in replay.detail
+    assert ("trigger-token" in names(report, "passed")) == (over == "measuring can")
+
+
+@pytest.mark.parametrize("over", ["nfc", "can", "measuring can blank"])
+def test_a_skipped_rule_says_what_lets_it_run(station: Station, patch: pytest.MonkeyPatch, over: str) -> None:
+    report = nodes.checked(station, patch, nodes.made(over), over=over, factory=False)
+    words = re.compile(
+        r"Connect the board's CAN|NFC reader|build its firmware with|--factory|never asked for more time"
+    )
+    assert [check for check in report.checks if check.result == "skipped" and not words.search(check.detail)] == []
 
 
 def test_without_factory_a_factory_node_is_left_as_it_was(station: Station) -> None:
@@ -79,7 +125,7 @@ def test_without_factory_a_factory_node_is_left_as_it_was(station: Station) -> N
     assert board.state == before
     assert not names(report, "failed")
     tried = {rule.name for rule in RULES if rule.stage in (Stage.PLAIN, Stage.FACTORY)}
-    assert names(report, "passed") == tried - OF_FRAMES - OF_STATIONS
+    assert names(report, "passed") == tried - OF_FRAMES - OF_CAN
 
 
 def agreed(station: Station, board: Board) -> None:
@@ -104,7 +150,7 @@ def test_a_run_that_was_cut_leaves_a_node_of_ours(station: Station) -> None:
     assert board.state.key == held
     assert not names(report, "failed")
     in_sessions = {rule.name for rule in RULES if rule.stage in (Stage.KEYED, Stage.SESSION)}
-    assert in_sessions - OF_STATIONS - {"keyed-untapped", "operate-lease"} <= names(report, "passed")
+    assert in_sessions - OF_STATIONS - NOTHING_READ_ONLY - {"keyed-untapped"} <= names(report, "passed")
     again = checked(station, board)
     assert not names(again, "failed")
     assert board.state.state == NodeState.FACTORY
@@ -295,6 +341,7 @@ def test_a_node_that_falls_silent_loses_no_report(station: Station, via: str) ->
 
 
 def test_every_clause_is_a_section_of_the_page() -> None:
-    sections = set(re.findall(r"^## (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE))
-    assert {rule.section for rule in RULES} <= sections
+    for page in {rule.page for rule in RULES}:
+        sections = set(re.findall(r"^## (.+)$", (DOCS / page).read_text(encoding="utf-8"), re.MULTILINE))
+        assert {rule.section for rule in RULES if rule.page == page} <= sections
     assert len({rule.name for rule in RULES}) == len(RULES)

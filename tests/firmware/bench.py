@@ -101,7 +101,7 @@ class Acting(MemoryNode):
                 ctypes.c_uint8(facts.octets), ctypes.c_uint32(facts.shortest),
             )  # fmt: skip
             if facts.halt is not None:
-                self._library.memory_halt(self._board, ctypes.c_uint8(number), ctypes.c_uint8(facts.halt))
+                self.halts(number, facts.halt)
 
     def slow(self, slow: bool) -> None:
         """Whether its point arithmetic takes its time; before a start."""

@@ -559,7 +559,144 @@ static bool opened(const uint8_t key[16], const uint8_t nonce[13], const uint8_t
     ),
 }
 
+SEEN_BY_A_STATION: Final[dict[str, Change]] = {
+    # -- comparisons, the commit, what is stored
+    "FAULT_OPEN_MAC_OF_8_OCTETS": Change(
+        "session.c", "teds_equal(payload + 73, mac, 16)", "teds_equal(payload + 73, mac, 8)"
+    ),
+    "FAULT_KEY_ID_OF_4_OCTETS": Change("session.c", "teds_equal(payload, key_id, 8)", "teds_equal(payload, key_id, 4)"),
+    "FAULT_STATION_TAG_OF_8_OCTETS": Change(
+        "agree.c", "teds_equal(command->payload, pending->tag, 16)", "teds_equal(command->payload, pending->tag, 8)"
+    ),
+    "FAULT_SESSION_OF_ANY_ADDRESS": Change(
+        "session.c",
+        "    return teds_session_on(node, link) != NULL || half_open_on(node, link) != NULL;",
+        "    return teds_session_on(node, link) != NULL || half_open_on(node, link) != NULL || any_session(node) != NULL ||\n"
+        "           node->half_open[0].used;",
+        "static teds_session *any_session(teds_node *node)\n{\n    for (size_t i = 0; i < TEDS_SESSIONS; i++) {\n"
+        "        if (node->sessions[i].used) {\n            return &node->sessions[i];\n        }\n    }\n    return NULL;\n}\n",
+        more=(
+            (
+                "    const teds_keys *keys = NULL;\n    uint32_t last = 0;\n",
+                "    const teds_keys *keys = NULL;\n    uint32_t last = 0;\n"
+                "    session = session != NULL ? session : any_session(node);\n"
+                "    half = half != NULL || !node->half_open[0].used ? half : &node->half_open[0];\n",
+            ),
+        ),
+    ),
+    "FAULT_OLDER_EPOCH": Change(
+        "commit.c", "teds->numbers[1] == node->state.epoch", "teds->numbers[1] <= node->state.epoch"
+    ),
+    "FAULT_CALIBRATION_CHECKSUM": Change(
+        "security_teds.c",
+        "    if (length < 12 || teds_get32(teds)",
+        "    if (code == 5) {\n        return true;\n    }\n    if (length < 12 || teds_get32(teds)",
+    ),
+    "FAULT_NEVER_PROVISIONED": Change("node.c", "(node->state.flags & TEDS_PROVISIONED) != 0 ? 2 : 1;", "1;"),
+    "FAULT_STAGING_SURVIVES_COMMIT": Change(
+        "commit.c", "    if (!failed) {\n        teds_staging_drop(node);\n    }\n", ""
+    ),
+    "FAULT_ROTATION_UNPROVISIONS": Change("agree.c", "state.flags |= TEDS_KEYED;", "state.flags = TEDS_KEYED;"),
+    "FAULT_READ_STAGED": Change(
+        "teds_store.c",
+        "    if (!teds_find(node, (uint16_t)id, &source)) {\n        return -TEDS_NO_SUCH_TEDS;\n    }\n    offset",
+        "    if (!teds_find_new(node, (uint16_t)id, &source)) {\n        return -TEDS_NO_SUCH_TEDS;\n    }\n    offset",
+    ),
+    "FAULT_UPDATE_STORES": Change(
+        "teds_store.c",
+        "        failed = teds_own_check((uint8_t)id, image, octets) ? 0 : -TEDS_BAD_FORM;\n",
+        "        failed = teds_own_check((uint8_t)id, image, octets) ? 0 : -TEDS_BAD_FORM;\n"
+        "        if (!failed && octets <= sizeof stored) {\n            stored_id = id;\n            stored_octets = octets;\n"
+        "            memcpy(stored, image, octets);\n        }\n",
+        "static uint8_t stored[64];\nstatic size_t stored_octets;\nstatic int stored_id = -1;\n",
+        more=(
+            (
+                "    if (!teds_find(node, (uint16_t)id, &source)) {\n        return -TEDS_NO_SUCH_TEDS;\n    }\n    offset",
+                "    if (id == stored_id && node->staging_end == 0) {\n        teds_put32(out, 0);\n        memcpy(out + 4, stored, stored_octets);\n"
+                "        return (int)(4 + stored_octets);\n    }\n"
+                "    if (!teds_find(node, (uint16_t)id, &source)) {\n        return -TEDS_NO_SUCH_TEDS;\n    }\n    offset",
+            ),
+        ),
+    ),
+    "FAULT_WRITE_READ_ONLY": Change(
+        "teds_store.c",
+        "    if (find_fixed(node, (uint16_t)id, &source)) {\n        return -TEDS_NOT_PERMITTED;\n    }\n    offset",
+        "    (void)source;\n    offset",
+    ),
+    # -- frames of CAN
+    "FAULT_ANY_TARGET": Change(
+        "can.c",
+        "    if (own != node->can.address || frame->length < 2) {\n",
+        "    (void)own;\n    if (frame->length < 2) {\n",
+    ),
+    "FAULT_ANYTHING_FUNCTIONAL": Change(
+        "can.c",
+        "octets != 7 ||\n        memcmp(body + 1, identify, 6) != 0) {",
+        "octets != 7) {\n        (void)identify;",
+    ),
+    "FAULT_ANY_SEQUENCE_NUMBER": Change(
+        "can.c", "if (number != can->rx_number || now >= can->rx_until", "if (now >= can->rx_until"
+    ),
+    "FAULT_BLOCK_SIZE_IGNORED": Change("isotp.c", "line->out_block = data[1];", "line->out_block = 0;"),
+    "FAULT_STMIN_IGNORED": Change("isotp.c", "line->out_gap = teds_isotp_gap(data[2]);", "line->out_gap = 0;"),
+    "FAULT_WAIT_IGNORED": Change("isotp.c", "    switch (data[0] & 15) {\n", "    switch (data[0] & 14) {\n"),
+    "FAULT_SHORT_FIRST_FRAME": Change(
+        "can.c", "} else if (length < (frame->length > 8 ? frame->length - 1u : 8u)) {", "} else if (false) {"
+    ),
+    "FAULT_ESCAPED_CLASSIC_FRAME": Change(
+        "isotp.c",
+        "const size_t start = length > 8 ? 2 : 1;",
+        "const size_t start = length > 8 || (length == 8 && data[0] == 0) ? 2 : 1;",
+        more=(("*octets >= (start == 2 ? 8u : 1u)", "*octets >= 1u"),),
+    ),
+    "FAULT_ANNOUNCE_CRC": Change(
+        "can.c", "teds_put32(frame->data + 2, crc_of(node));", "teds_put32(frame->data + 2, crc_of(node) ^ 1u);"
+    ),
+    "FAULT_CLAIM_REVERSED": Change("can.c", "if (crc > own || stays(node)) {", "if (crc < own || stays(node)) {"),
+    # -- measurement
+    "FAULT_LEASE_255": Change("operation.c", "lease > 60 ||", "(lease > 60 && lease != 255) ||"),
+    "FAULT_OPERATE_ANY_DIGEST": Change(
+        "operation.c", "if (memcmp(digest, command->payload, 16) != 0) {", "if (false) {"
+    ),
+    "FAULT_WRITE_UNDER_CLAIM": Change(
+        "operation.c",
+        "    if (origin->session != NULL && origin->session->claims != 0) {\n        return -TEDS_WRONG_STATE;",
+        "    if (origin->session != NULL && origin->session->claims != 0) {\n        return 0;",
+    ),
+    "FAULT_VALUES_UNCLAIMED": Change(
+        "operation.c",
+        "return place >= 0 && (origin->session->claims >> place & 1) != 0;",
+        "(void)origin;\n    return place >= 0;",
+    ),
+    "FAULT_LEASE_FOR_EVER": Change(
+        "operation.c",
+        "            at = each->good_at + each->lease;\n            if (now >= at) {",
+        "            at = each->good_at + each->lease;\n            if (false) {",
+    ),
+    "FAULT_STREAM_NONCE": Change(
+        "stream.c", "teds_put32(nonce + 9, stream->full_counter);", "teds_put32(nonce, stream->full_counter);"
+    ),
+    "FAULT_STREAM_NONCE_STANDS_STILL": Change("stream.c", "    teds_put32(nonce + 9, stream->full_counter);\n", ""),
+    "FAULT_RUN_STANDS_STILL": Change("stream.c", "    session->run++;\n", "    session->run = 1;\n"),
+    "FAULT_DRIVE_REPLAY": Change(
+        "drive.c", "if (session->drive.seen && counter <= session->drive.last) {", "if (false) {"
+    ),
+    "FAULT_DRIVE_TWICE": Change(
+        "drive.c",
+        "session->drive.seen && counter <= session->drive.last",
+        "session->drive.seen && counter < session->drive.last",
+    ),
+    "FAULT_ANY_TOKEN": Change("stream.c", "teds_equal(seen, session->arms[i].commitment, 16)", "seen[0] <= 255"),
+}
+"""Faults that a station sees only if it looks for them: frame by frame, over all octets, on a board with channels."""
+
 ON_THE_BUS: Final[dict[str, Change]] = {
+    "FAULT_REQUEST_RUNS_AGAIN": Change(
+        "node.c", "(frame[3] == TEDS_IDENTIFY ||", "(frame[3] == TEDS_REQUEST || frame[3] == TEDS_IDENTIFY ||"
+    ),
+    "FAULT_OPEN_RUNS_AGAIN": Change(
+        "node.c", "(frame[3] == TEDS_IDENTIFY ||", "(frame[3] == TEDS_OPEN || frame[3] == TEDS_IDENTIFY ||"
+    ),
     "FAULT_RUNS_AGAIN": Change("node.c", "    if (!place->stored || memcmp(digest", "    if (true || memcmp(digest"),
     "FAULT_EVERYONE_DROPS_REPLY": Change(
         "can.c",

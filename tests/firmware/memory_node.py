@@ -420,6 +420,10 @@ class MemoryNode:
             ctypes.c_uint32(shortest),
         )  # fmt: skip
 
+    def halts(self, number: int, halt: int) -> None:
+        """How an actuator reaches its safe state (ActHalt), before the start."""
+        self._library.memory_halt(self._board, ctypes.c_uint8(number), ctypes.c_uint8(halt))
+
     def blocks(self) -> dict[tuple[int, int], bytes]:
         """Every TEDS that it lists, the initial Security TEDS too; read as a station does."""
         listed = self.handle(bytes.fromhex("0000800b0000"), link="can:f7", tapped=False)[3:]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from queue import Empty
 from typing import Final
 
@@ -16,7 +16,7 @@ from teds_provision.errors import (
     MessageTooLongError,
     NodeSilentError,
 )
-from teds_provision.links.can.bus_multiplexer import AddressPair, BusMultiplexer
+from teds_provision.links.can.bus_multiplexer import AddressPair, BusMultiplexer, Listener
 from teds_provision.links.can.isotp import (
     FUNCTIONAL,
     OVERFLOW,
@@ -28,7 +28,8 @@ from teds_provision.links.can.isotp import (
     physical_id,
     single,
 )
-from teds_provision.links.ports import CAN, Capabilities
+from teds_provision.links.can.spec import LAST_NODE
+from teds_provision.links.ports import CAN, BusFrame, Capabilities
 from teds_provision.protocol.messages.frames import IDENTIFY, Reason, decode_reply, refusal
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import REPEAT_SECONDS, REPLY_SECONDS, TRIES
@@ -76,6 +77,29 @@ class _NoFlowControlError(Exception):
     def __init__(self, *, begun: bool) -> None:
         super().__init__()
         self.begun = begun
+
+
+def _is_of_a_node(frame: Frame) -> bool:
+    return 1 <= frame.identifier & 0xFF <= LAST_NODE
+
+
+class SingleFrames:
+    """The frames of an open bus, one by one; see ``links.ports.BusFrames``."""
+
+    def __init__(self, bus: BusMultiplexer, heard: Listener, own: int) -> None:
+        self._bus, self._heard, self.own, self.fd = bus, heard, own, bus.spec.fd
+
+    def send(self, identifier: int, octets: bytes, *, fd: bool = False) -> None:
+        """Put one frame on the bus."""
+        self._bus.send(Frame(identifier, octets, fd))
+
+    def next(self, seconds: float) -> BusFrame | None:
+        """The next frame of a node; None after ``seconds``."""
+        until = time.monotonic() + seconds
+        while (frame := self._heard.get(max(0.0, until - time.monotonic()))) is None:
+            if time.monotonic() >= until:
+                return None
+        return BusFrame(frame.identifier, frame.data, frame.at)
 
 
 class CanLink:
@@ -163,6 +187,13 @@ class CanLink:
                     event = bus.next_of(line.events, 0.01)
                     return single(event.body, fd=bus.spec.fd) if event.kind == "whole" else b"\x10"
         return b""
+
+    @contextmanager
+    def single_frames(self) -> Iterator[SingleFrames]:
+        """The frames of the bus, one by one; see ``links.ports.FramedLink``."""
+        bus = self._bus()
+        with bus.listen(_is_of_a_node) as heard:
+            yield SingleFrames(bus, heard, self._source or bus.own)
 
     def exchange_limited(self, frame: bytes, *, tries: int, seconds: float) -> bytes:
         """As ``exchange``, at most ``tries`` times, each with ``seconds`` of silence allowed."""
