@@ -14,7 +14,7 @@ from teds_provision.plant.transport import Transport
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant.chain import counting
 from teds_provision.protocol.plant.document import MemberRequest, hash_of, open_request
-from teds_provision.protocol.plant.roster import Roster, open_roster
+from teds_provision.protocol.plant.roster import MOST_AHEAD, Roster, open_roster
 from teds_provision.station.station import Station
 from teds_provision.steps.verify import Verification, snapshot_trust, verify_image
 from teds_provision.store import utc_now
@@ -70,6 +70,11 @@ def found_roster(station: Station, post: Transport, octets: bytes | None) -> Ros
             f"{post.where} contains rosters of {len(registries)} registries.", hint="Choose one: --roster FILE"
         )
     best = max(mine, key=lambda roster: (roster.version, roster.hash))
+    if best is not held and best.created > now() + MOST_AHEAD:
+        raise PolicyError(
+            f"The roster of {best.name} is dated {best.created:%Y-%m-%d}, in the future.",
+            hint="Set the clock of this machine, or have the owner set his and sign the next version: registry renew",
+        )
     if best.expires <= now():
         raise RosterExpiredError(
             f"The roster of {best.name} expired on {best.expires:%Y-%m-%d}.",

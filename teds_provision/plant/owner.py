@@ -20,6 +20,7 @@ from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
 from teds_provision.protocol.plant.document import MemberRequest, payload
 from teds_provision.protocol.plant.roster import (
+    MOST_AHEAD,
     NOWHERE,
     USUAL,
     Member,
@@ -114,6 +115,11 @@ def add(station: Station, request: MemberRequest, roles: frozenset[Role]) -> Ros
         raise PolicyError(
             f"Station {request.name} is not certified by this owner's CA and cannot join.",
             hint="A station without nodes can be set up again: init --request, trust ca sign, init --certificate",
+        )
+    if request.created > max(now(), own.created) + MOST_AHEAD:
+        raise PolicyError(
+            f"The request of {request.name} is dated {request.created:%Y-%m-%d}, in the future.",
+            hint="Set the clock of that station, or of this one.",
         )
     there = own.by_key.get(request.fingerprint)
     if isinstance(there, RemovedMember):

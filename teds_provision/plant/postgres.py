@@ -50,6 +50,8 @@ _GRACE: Final = 5.0
 _CHANNEL: Final = "teds"
 _FROM_URL: Final = frozenset({"host", "hostaddr", "port", "dbname", "sslrootcert", "sslcrl", "sslcrldir"})
 _NO_SCHEMA: Final = frozenset({"42P01", "3F000", "42883", "42703"})  # no such table, schema, function, column
+# The server's words, as libpq has no SQLSTATE before a login; in another language they are passed on as they are.
+_LOGIN_REFUSED: Final = ("is not permitted to log in", "password authentication failed")
 _RETURNING: Final = 2  # the first schema that has `found`
 
 
@@ -613,6 +615,12 @@ def _failure(error: psycopg.Error, *, late: bool) -> TedsProvisionError:
             )
     if late:
         return RegistryError("The registry did not answer in time.", hint="All other work can continue without it.")
+    if any(refusal in words for refusal in _LOGIN_REFUSED):
+        return RegistryError(
+            f"The database refuses this station's login: {words}",
+            hint="If this station was removed, its key cannot return. Otherwise at a keeper, with FILE from registry"
+            " request --output FILE: registry sql --member FILE | psql",
+        )
     return RegistryError(f"Cannot use the registry: {words}", hint="All other work can continue without it.")
 
 

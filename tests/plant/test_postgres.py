@@ -14,6 +14,7 @@ import pytest
 from teds_provision.demo.cluster import Cluster
 from teds_provision.errors import ForkError, NotMemberError, PolicyError, RegistryError, StoreError, UsageError
 from teds_provision.plant.postgres import Registry, parameters
+from teds_provision.plant.schema import close_sql
 from tests.pace import PATIENCE
 from tests.plant.postgres import Database, Login, own_cluster
 from tests.plant.relay import Relay, relay
@@ -181,6 +182,15 @@ def test_another_servers_certificate_is_refused(login: Login, tmp_path: Any) -> 
     stranger.write_bytes(_tls()[1])
     with pytest.raises(RegistryError, match="certificate verify failed"):
         registry(login, sslrootcert=str(stranger)).look()
+
+
+def test_a_refused_login_names_its_cure(login: Login) -> None:
+    for more in ({"password": "0" * 64}, {}):
+        with pytest.raises(RegistryError, match="refuses this station's login") as refused:
+            registry(login, **more).look()
+        assert refused.value.exit_code == 5
+        assert "registry sql --member FILE" in refused.value.hint
+        login.database.sql(close_sql(login.fingerprint))  # the second time its own password is of no use either
 
 
 def test_a_server_of_another_name_is_refused(login: Login) -> None:
