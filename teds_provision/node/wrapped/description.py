@@ -338,7 +338,9 @@ def _channel_lines(number: int, channel: WrappedChannel) -> list[str]:
     ]
     if form.coefficients is not None and channel.raw_limits is not None:
         ends = ", ".join(_number(end) for end in channel.raw_limits)
-        lines += ["", f"[channel.{number}.calibration]", "required = true", f"raw-range = [{ends}]"]
+        intercept, slope = form.coefficients
+        indication = f"indication = [{_number(slope)}, {_number(intercept)}]"  # for certificates in this unit
+        lines += ["", f"[channel.{number}.calibration]", "required = true", f"raw-range = [{ends}]", indication]
     text = _text_of(channel)
     if text:
         lines += ["", "[[text]]", 'kind = "channel-identification"', f"channel = {number}", f"xml = {_toml(text)}"]
