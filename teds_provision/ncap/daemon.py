@@ -81,7 +81,12 @@ class Daemon:
         )
         self.sheets = Sheets(station, self.directory, self.node_jobs, self.measurements.sheet)
         self.provisioning = Provisioning(
-            station, self.directory, self.live, self.node_jobs, self.measurements.unmeasured
+            station,
+            self.directory,
+            self.live,
+            self.node_jobs,
+            self.measurements.unmeasured,
+            trusted=settings.trust_dcc,
         )
         self.leases = ActuatorLeases(
             station,

@@ -30,6 +30,7 @@ class Settings:
     """``places`` are links as ``can:…`` and ``nfc:…``; ``detection`` None: as it was last set, else ``whitelist``.
 
     ``adopt``: factory nodes of a wired bus get a key; ``yes``: such a node's own datasheet is signed at once.
+    ``trust_dcc``: files with certificates (PEM), one of which must have signed a calibration certificate.
     ``unverified``: they are measured by their own datasheet, marked so. ``http`` is (host, port) or None: then only the
     Unix socket of the home is served. ``sinks`` take what is measured, beside those of each measurement; ``brokers``
     are URLs by the names under which a measurement may name them; ``record`` is a folder for a recording of each
@@ -42,6 +43,7 @@ class Settings:
     places: tuple[str, ...] = ()
     detection: Detection | None = None
     adopt: bool = False
+    trust_dcc: tuple[Path, ...] = ()
     yes: bool = False
     unverified: bool = False
     http: tuple[str, int] | None = None

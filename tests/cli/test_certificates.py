@@ -10,7 +10,9 @@ import pytest
 from teds_provision.teds.certificate import certificate_reference_of
 from teds_provision.teds.dcc import xml_tree
 from teds_provision.teds.image import Image
+from tests.bench import PASSPHRASE
 from tests.teds.certificates import ANGLE, EXAMPLES, POINTS, TEMPERATURE, changed, signer
+from tests.terminal import on_terminal
 
 from .shell import call
 
@@ -88,6 +90,15 @@ def test_an_unclear_item_is_asked_about_and_without_a_terminal_refused(home: Pat
     other = call(home, *build[:-1], f"2={EXAMPLES / 'temperature.xml'}")
     assert other.code == 8
     assert "channels 1 to 1" not in other.out
+
+
+def test_a_person_at_a_terminal_chooses_the_item(home: Path) -> None:
+    words = ("build", UUID, "--profile", "temperature-sensor", "--calibration", EXAMPLES / "temperature.xml")
+    shown = on_terminal(home, *words, answers=["as-left"], passphrase=PASSPHRASE)
+    assert shown.code == 0, shown.screen
+    assert "as-found: Before adjustment, as found" in shown.screen.replace("\r\n", " ").replace("  ", " ")
+    assert "certificate T-2026-118" in shown.screen.replace("\r\n", " ")
+    assert shown.screen.count("Which one") == 1, "asked once, however often the file is read"
 
 
 def test_without_the_extra_its_install_command_is_named(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:

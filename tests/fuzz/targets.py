@@ -454,6 +454,34 @@ def calibration_seeds() -> Iterable[bytes]:
     yield b'\2{"channel": "1-3", "slope": 0.001, "intercept": 0, "interval": "1 year", "uncertainty": "5 mN"}'
 
 
+def check_certificate(data: bytes) -> None:
+    """Calibration certificates: read, their signature checked, a calibration made of the first item that fits."""
+    from teds_provision.teds.calibration.files import read_certified
+    from teds_provision.teds.certificate import CertificateChoice
+    from teds_provision.teds.dcc.shown import ShownCertificate
+    from teds_provision.teds.dcc.signature import read_checked
+    from teds_provision.teds.profile import load_profile
+
+    choice = CertificateChoice(choose=lambda _, items: items[0][0])
+    with suppress(TedsProvisionError):
+        shown = ShownCertificate.of(read_checked(data, "c.xml", (), NOW))
+        json.dumps(shown.to_json(), allow_nan=False)
+        list(shown.lines())
+        made = read_certified(data, "c.xml", load_profile("magnetic-angular-position-sensor"), choice)[1]
+        assert made.certificate is not None
+        assert made.certificate.signature == "not checked", "nobody is trusted here"
+        assert len(made.certificate.encode()) < 300
+
+
+def certificate_seeds() -> Iterable[bytes]:
+    folder = Path(__file__).parents[2] / "examples" / "dcc"
+    for name in ("angle.xml", "temperature.xml"):
+        text = (folder / name).read_text()
+        small = "".join(line.strip() for line in text.splitlines() if "<!--" not in line)
+        yield small.encode()
+        yield small.replace("dcc:", "").replace("xmlns:dcc", "xmlns").encode()
+
+
 def check_profile(data: bytes) -> None:
     """Profiles, and the sheets of ``--require``."""
     from teds_provision.teds.fits import parse_require
@@ -629,6 +657,7 @@ def line_seeds() -> Iterable[bytes]:
 _JSON = ("{", "}", "[", "]", '"', ":", ",", "null", "true", "1e9")
 _TOML = ("[[", "]]", "[channel.1]", " = ", '"""', "'", "extends", "unit", "points", "calibration", "inf", "nan")
 _XML = ("<", "/>", "</", "<!DOCTYPE", "<![CDATA[", "&#0;", "uuid=", "<teds", "<field", "xmlns=")
+_DCC = ("dcc:list", "dcc:quantity", "si:hybrid", "si:realListXMLList", "\\one", "\\tothe{2}", "URI=''", "ds:Signature")
 
 TARGETS = {
     target.name: target
@@ -645,6 +674,7 @@ TARGETS = {
         Target("backup", check_backup, backup_seeds, (*_JSON, "schema", "tables")),
         Target("whitelist", check_whitelist, whitelist_seeds, (*_JSON, *_XML, "whitelist", "fingerprint", ";", "\t")),
         Target("calibration", check_calibration, calibration_seeds, (*_JSON, *_TOML, "# unit:", "method", "all")),
+        Target("certificate", check_certificate, certificate_seeds, (*_XML, *_DCC), longest=8192),
         Target("profile", check_profile, profile_seeds, _TOML, longest=2048),
         Target("image", check_image, image_seeds, (*_JSON, *_XML, ":00000001FF", "# channel 1 access code 3")),
         Target("evidence", check_evidence, evidence_seeds, (*_JSON, "facts", "steps", "blocks", "subject", "teds:")),

@@ -15,6 +15,8 @@ from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Desk
 from tests.ncap.service import Service, verdict
 from tests.pace import until
+from tests.teds.certificates import ANGLE as CERTIFICATE
+from tests.teds.certificates import TEMPERATURE, signer
 
 pytestmark = pytest.mark.link
 CURVE = "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n"
@@ -128,6 +130,30 @@ def test_the_next_board_that_is_tapped_is_provisioned_whichever_it_is(desk: Desk
         node = desk.node("board").start()
         run = until(lambda: service_run(asked, node.uuid))
         assert (run["state"], run["verdict"]) == ("done", "authentic"), run
+    service.end()
+
+
+def test_a_certificate_calibrates_the_next_board_if_the_service_trusts_who_signed_it(desk: Desk) -> None:
+    lab = signer()
+    pem = desk.folder / "lab.pem"
+    pem.write_bytes(lab.certificate)
+    service = Service(desk, desk.station()).start("--nfc", desk.links.nfc, "--trust-dcc", pem)
+    with service.client() as asked:
+        order = {"profile": ANGLE, "calibration_name": "angle.xml", "calibration_channel": 1}
+        for text, code in ((CERTIFICATE, "not-authentic"), (lab.sign(TEMPERATURE), "bad-data")):
+            with pytest.raises(ApiError) as refused:
+                asked.request("POST", "/nodes/next/provision", {**order, "calibration": text.decode()})
+            assert refused.value.code == code
+        both = {**order, "profile": "temperature-sensor", "calibration": lab.sign(TEMPERATURE).decode()}
+        with pytest.raises(ApiError, match="as-found") as unclear:
+            asked.request("POST", "/nodes/next/provision", both)
+        assert unclear.value.code == "unclear-item"
+        asked.request("POST", "/nodes/next/provision", {**order, "calibration": lab.sign(CERTIFICATE).decode()})
+        node = desk.node("board").start()
+        run = until(lambda: service_run(asked, node.uuid))
+        assert (run["state"], run["verdict"]) == ("done", "authentic"), run
+        codes = [block["access_code"] for block in asked.request("GET", f"/nodes/{node.uuid}/teds")["teds"]]
+        assert 131 in codes
     service.end()
 
 

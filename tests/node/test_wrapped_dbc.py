@@ -26,10 +26,13 @@ from teds_provision.node.wrapped.latest_values import LatestValues
 from teds_provision.node.wrapped.reading import describe
 from teds_provision.node.wrapped.running import SensorPlace, WrappedRun, require_match
 from teds_provision.node.wrapped.wrapped_source import WrappedSource
+from teds_provision.teds.calibration import evaluate, load_calibrations
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
+from teds_provision.teds.certificate import CertificateChoice
 from teds_provision.teds.guard import check_calibration
 from teds_provision.teds.image import Image
 from teds_provision.teds.origin import ORIGIN, origin_of
+from teds_provision.teds.profile.load import parse_profile
 from teds_provision.teds.sheet import Sheet
 from tests.e2e.desk import ROOT
 
@@ -302,3 +305,18 @@ def test_describing_needs_the_extra_and_nothing_else_loads_it() -> None:
     assert done.returncode == 0, done.stderr
     assert "needs the package cantools" in done.stdout
     assert "teds-provision[bench]" in done.stdout
+
+
+def test_a_certificate_of_a_wrapped_sensor_corrects_what_its_frames_indicate() -> None:
+    """The certificate relates torque on the bus to torque; the profile states which raw number the bus value is."""
+    profile = parse_profile(dbc_message.read(DBC, "Torque").sensor.profile_text("torque"), "torque")
+    path = DBC.with_suffix(".xml")
+    made = load_calibrations(path, profile, CertificateChoice(channel=1))[1]
+    for raw in (-20000, 0, 5000, 20000):  # of the frame; a sample adds half the range
+        given = raw * 0.01
+        value = float(evaluate(made, raw + 32768).value)
+        assert value == pytest.approx(given * 200 / 200.7, abs=0.3), "the lever's torque, not the bus's"
+    assert made.points[0] == pytest.approx((-20060 + 32768, -200))
+    assert made.uncertainty == pytest.approx(0.2)
+    assert made.certificate is not None
+    assert made.certificate.number == "M-2026-0311"

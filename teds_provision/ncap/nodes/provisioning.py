@@ -81,9 +81,11 @@ class Provisioning:
         live: Live,
         desk: NodeJobs,
         apart: Callable[[str, str], AbstractContextManager[None]] = lambda _uuid, _why: nullcontext(),
+        *,
+        trusted: tuple[Path, ...] = (),
     ) -> None:
         self._station, self._directory, self._live, self._node_jobs = station, roster, live, desk
-        self._apart = apart
+        self._apart, self._trusted = apart, trusted
         self._runs: dict[str, ProvisioningRun] = {}
         self._guard = threading.Lock()
 
@@ -133,6 +135,7 @@ class Provisioning:
                 accept_calibration=accept,
                 channel=channel,
                 item=item,
+                trusted=self._trusted,
             )
             prepare(self._station, order, None if uuid == NEXT else bytes.fromhex(uuid))
         except BaseException as error:

@@ -25,6 +25,7 @@ GOOD: Final = "good"
 NOT_CHECKED: Final = "not checked"
 MOST_REFERENCES: Final = 8
 MOST_CERTIFICATES: Final = 8
+_FIRST_YEAR, _LAST_YEAR = 1970, 9000
 _XADES: Final = "http://uri.etsi.org/01903/v1.3.2#"
 _ALWAYS: Final = (
     "Not checked: revocation of the signer's certificate, time stamps, signature policies (XAdES-T and above).",
@@ -144,16 +145,25 @@ def _objects(signature: Node) -> Iterable[Node]:
 
 
 def _chain(signature: Node) -> list[x509.Certificate]:
-    """Return the certificates that a signature brings, the signer's first; raises _UnsupportedError without one."""
+    """Return the certificates that a signature brings; raises _UnsupportedError without one, or for a damaged one."""
     from cryptography import x509
+    from cryptography.exceptions import UnsupportedAlgorithm
 
     nodes = signature.all_of("ds:KeyInfo/ds:X509Data/ds:X509Certificate")[:MOST_CERTIFICATES]
     found = []
     for node in nodes:
         try:
-            found.append(x509.load_der_x509_certificate(base64.b64decode(node.text.replace(" ", ""), validate=True)))
-        except (ValueError, binascii.Error) as error:
+            one = x509.load_der_x509_certificate(base64.b64decode(node.text.replace(" ", ""), validate=True))
+            _ = (
+                one.subject,
+                one.issuer,
+                one.not_valid_before_utc,
+                one.not_valid_after_utc,
+                one.public_key(),
+            )  # parsed late
+        except (ValueError, binascii.Error, UnsupportedAlgorithm) as error:
             raise _UnsupportedError("a certificate in it cannot be read") from error
+        found.append(one)
     if not found:
         raise _UnsupportedError("it brings no X.509 certificate")
     return found
@@ -209,7 +219,7 @@ def _may_sign(certificate: x509.Certificate) -> bool:
         usage = certificate.extensions.get_extension_for_class(x509.KeyUsage).value
     except x509.ExtensionNotFound:
         return True
-    except ValueError:
+    except (ValueError, x509.DuplicateExtension, x509.UnsupportedGeneralNameType):
         return False
     return usage.digital_signature or usage.content_commitment
 
@@ -222,6 +232,8 @@ def _stated_time(signature: Node) -> datetime | None:
                 try:
                     moment = datetime.fromisoformat((element.text or "").strip())
                 except ValueError:
+                    return None
+                if not _FIRST_YEAR <= moment.year < _LAST_YEAR:
                     return None
                 return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
     return None
