@@ -41,14 +41,15 @@ ARROWS = {
     "plant": _BELOW_TALK | {"talk", "steps", "handover"},
     "measure": _BELOW_TALK | {"talk", "steps", "handover"},
     "client": {"api"},
-    "ncap": _BELOW_TALK | {"talk", "steps", "handover", "plant", "measure", "node", "client", "api"},
+    "describe": _BELOW_TALK | {"talk", "steps", "handover", "measure", "api"},
+    "ncap": _BELOW_TALK | {"talk", "steps", "handover", "plant", "measure", "node", "client", "api", "describe"},
     "check": _BELOW_TALK | {"talk", "steps"},
     "backup": {"station", "vault", "store", "protocol", "teds"},
     "doctor": {"station", "links", "vault", "store", "protocol", "teds"},
     "demo": _BELOW_TALK | {"talk", "steps", "handover", "plant", "measure", "client"},
     "cli": _BELOW_TALK
     | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure", "check", "ncap", "client", "api"}
-    | {"trace", "plant"},
+    | {"trace", "plant", "describe"},
     "__main__": {"cli"},
 }
 # Too slow to load before they are needed: --help, --version and a pure decode must not wait for them.

@@ -50,6 +50,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "log": Entry("log", "log", "Show the audit log and check its hash chain."),
         "trace": Entry("log", "trace", "Show what --trace recorded."),
         "show": Entry("show", "show", "Decode TEDS, images, profiles, bundles and messages."),
+        "describe": Entry("describe", "describe", "Export datasheets as Thing Description, ros2_control or AAS."),
     },
     "Measure and actuate": {
         "record": Entry("record", "record", "Inspect and convert recordings."),

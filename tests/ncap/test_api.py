@@ -11,7 +11,9 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Barrier
 from typing import Any
-from urllib.parse import quote
+from urllib.error import HTTPError
+from urllib.parse import quote, urljoin
+from urllib.request import Request, urlopen
 
 import pytest
 
@@ -100,6 +102,30 @@ def test_a_node_has_its_verdict_with_checks_and_its_channels_with_units(asked: C
     assert opening["topic"] == "/bench/hand/opening"
     assert asked.node(hand[:6])["uuid"] == hand
     assert hand in {node["uuid"] for node in asked.nodes()}
+
+
+def test_things_are_described_for_the_web_of_things_and_read_at_their_forms(
+    service: Service, asked: Client, hand: str
+) -> None:
+    """``/.well-known/wot``: asked as a client of the Web of Things does, over HTTP with a token that may only read."""
+    url, token = service.url, service.token("wot", "--read-only")
+    found = fetched(f"{url}/.well-known/wot", token)
+    [thing] = [thing for thing in found if thing["id"] == f"urn:teds:{hand}"]
+    [form] = next(iter(thing["properties"].values()))["forms"]
+    channel = fetched(urljoin(thing["base"], form["href"]), token)
+    assert channel == next(one for one in asked.node(hand)["channels"] if one["number"] == channel["number"]) | {
+        "last": channel["last"]
+    }
+    with pytest.raises(HTTPError) as refusal:
+        fetched(f"{url}/.well-known/wot", "")
+    assert refusal.value.code == 401
+    refused(asked, 404, "not-found", "GET", f"/nodes/{hand}/channels/9")
+
+
+def fetched(url: str, token: str) -> Any:
+    request = Request(url, headers={"authorization": f"Bearer {token}"} if token else {})
+    with urlopen(request, timeout=20) as answer:
+        return json.load(answer)
 
 
 def test_the_datasheet_is_read_decoded_and_given_as_a_document(asked: Client, hand: str) -> None:

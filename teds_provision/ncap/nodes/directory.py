@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 from teds_provision.api.operations import MOST_NODES
-from teds_provision.errors import StoreError
+from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.station.shown_units import shown_units
@@ -214,6 +214,14 @@ class NodeDirectory:
         """Return True if there is anything to show of a node."""
         with self._lock:
             return uuid in self._rows or uuid in self._seen
+
+    def channel(self, uuid: str, number: int) -> dict[str, Any]:
+        """Return one channel of a node as in :meth:`node`; raises NotFoundError."""
+        for channel in self.node(uuid)["channels"]:
+            if channel["number"] == number:
+                found: dict[str, Any] = channel
+                return found
+        raise NotFoundError(f"Node {uuid} has no channel {number}.")
 
     def nodes(self, most: int = MOST_NODES) -> list[dict[str, Any]]:
         """Return the first ``most`` of them; present ones come first."""

@@ -21,7 +21,7 @@ from teds_provision.api.operations import API
 from teds_provision.errors import NotFoundError, StoreError, TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.live import LiveClient
-from teds_provision.ncap.web import metrics
+from teds_provision.ncap.web import metrics, wot
 from teds_provision.ncap.web.answers import ASKED, answer_bug, answer_error, answer_refusal, changing
 from teds_provision.ncap.web.clause12 import Clause12
 from teds_provision.ncap.web.guard import CALLER, SAFE, Caller, RequestRefusedError
@@ -52,6 +52,7 @@ def build(daemon: Daemon) -> Starlette:
             ],
         ),
     ]
+    routes.append(wot.route(daemon))
     if daemon.settings.metrics:
         routes.append(metrics.route(daemon))
     if daemon.settings.clause_12:

@@ -62,7 +62,7 @@ class Resources:
             Route("/nodes/{uuid}/past", self.past),
             Route("/nodes/{uuid}/teds", self.teds, methods=["GET", "PUT"]),
             Route("/nodes/{uuid}/provision", self.provision, methods=["GET", "POST"]),
-            Route("/nodes/{uuid}/channels/{number:int}", self.channel, methods=["PUT"]),
+            Route("/nodes/{uuid}/channels/{number:int}", self.channel, methods=["GET", "PUT"]),
             Route("/groups", self.groups, methods=["GET", "POST"]),
             Route("/groups/{name:path}", self.group, methods=["PUT", "DELETE"]),
             Route("/measurements", self.measurements, methods=["GET", "POST"]),
@@ -320,7 +320,10 @@ class Resources:
         return await asyncio.to_thread(self._daemon.resolve, word)
 
     async def channel(self, request: Request) -> Response:
-        """PUT /nodes/UUID/channels/N: an actuator."""
+        """GET, PUT /nodes/UUID/channels/N: a channel with its last value; an actuator's set point."""
+        if request.method == "GET":
+            uuid, number = await self._node_of(request), request.path_params["number"]
+            return JSONResponse(await asyncio.to_thread(self._daemon.directory.channel, uuid, number))
         body = await body_of(request, bodies.SetPoint)
         uuid, number = await self._node_of(request), request.path_params["number"]
         if body.value is None or body.hold == 0:

@@ -1,0 +1,169 @@
+"""``describe``: a signed datasheet as Thing Description, ros2_control files and Asset Administration Shell."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jsonschema
+import pytest
+import yaml
+
+from teds_provision.describe import ros2_control
+from teds_provision.describe.described_node import DescribedNode, MissingFieldError, described_node
+from teds_provision.describe.thing_description import thing_description
+from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError
+from teds_provision.handover.life import revoke
+from teds_provision.measure.running.measurement_job import station_facts
+from teds_provision.measure.sinks.names import Topics
+from teds_provision.station.station import Station
+from teds_provision.steps.build import BuildOrder, no_confirmation
+from teds_provision.steps.provision import provision
+from teds_provision.talk.progress import SilentReporter
+from teds_provision.teds.profile.load import shipped_profiles
+from tests.bench import Board, talk
+from tests.cli.shell import call
+
+SCHEMA = json.loads((Path(__file__).parent / "td-json-schema-validation.json").read_text())
+NAMEPLATE = """<MetaIdentificationTEDSDataBlock xmlns="urn:example">
+<ManufacturerId>Example Robotics</ManufacturerId><ProductDescription>Gripper 50</ProductDescription>
+<OrderCode>GR-50-A</OrderCode><ArticleNo>4711</ArticleNo><SerialNo>0042</SerialNo>
+<ProductUri>https://example.org/gr50/0042</ProductUri>
+<Street>Bench 1</Street><ZipCode>12345</ZipCode><CityTown>Lab</CityTown><NationalCode>DE</NationalCode>
+</MetaIdentificationTEDSDataBlock>"""
+
+
+def gripper(station: Station, board: Board, folder: Path, nameplate: str = NAMEPLATE) -> DescribedNode:
+    text = f"\n[[text]]\nkind = \"meta-identification\"\nxml = '''{nameplate}'''\n" if nameplate else ""
+    own = folder / "own-gripper.toml"
+    own.write_text((shipped_profiles() / "gripper.toml").read_text() + text)
+    with talk(board) as node:
+        provision(
+            station,
+            node,
+            BuildOrder(str(own), name="hand"),
+            accept=lambda _who: None,
+            reporter=SilentReporter(),
+            confirm=no_confirmation,
+        )
+    return described_node(station, board.uuid)
+
+
+def test_a_thing_description_validates_and_its_forms_are_the_api(
+    station: Station, board: Board, tmp_path: Path
+) -> None:
+    node = gripper(station, board, tmp_path)
+    description = thing_description(node, "https://bench:8443")
+    jsonschema.validate(description, SCHEMA)
+    assert description["security"] in description["securityDefinitions"]  # the W3C schema does not check it
+    assert description["title"] == "hand"
+    sensors = [channel for channel in node.sheet.channels if not channel.actuator]
+    assert len(description["properties"]) == len(sensors)
+    [action] = description["actions"].values()
+    [form] = action["forms"]
+    actuator = next(channel for channel in node.sheet.channels if channel.actuator)
+    assert form["href"] == f"api/v1/nodes/{board.uuid.hex()}/channels/{actuator.number}"
+    value = action["input"]["properties"]["value"]
+    assert (value["minimum"], value["maximum"], value["unit"]) == (actuator.low, actuator.high, actuator.si_unit)
+
+
+def test_xacro_expands_the_macro_with_the_limits_of_the_datasheet(
+    station: Station, board: Board, tmp_path: Path
+) -> None:
+    node = gripper(station, board, tmp_path)
+    topics = Topics(station_facts(station))
+    [joint] = ros2_control.joints(node, topics)
+    (tmp_path / "hand.xacro").write_text(ros2_control.xacro(node, [joint], topics))
+    (tmp_path / "robot.xacro").write_text(
+        '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+        f'<xacro:include filename="{tmp_path}/hand.xacro"/><xacro:teds_hand/></robot>'
+    )
+    done = subprocess.run(
+        [str(Path(sys.executable).parent / "xacro"), str(tmp_path / "robot.xacro")],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    actuator = node.sheet.channel(joint.actuator)
+    assert actuator is not None
+    assert f'<param name="max">{actuator.high!r}</param>' in done.stdout
+    assert '<joint name="hand">' in done.stdout
+    files = yaml.safe_load(ros2_control.controllers(node, [joint], topics))
+    manager = files["controller_manager"]["ros__parameters"]
+    assert files[f"hand_{joint.command}_controller"]["ros__parameters"]["joints"] == ["hand"]
+    periods = [
+        channel.period for channel in node.sheet.channels if channel.number in {joint.actuator, *joint.state.values()}
+    ]
+    assert manager["update_rate"] <= 1 / max(period for period in periods if period == period) + 1
+
+
+def test_an_asset_shell_is_read_back_by_basyx_and_is_the_same_twice(
+    station: Station, board: Board, tmp_path: Path
+) -> None:
+    adapter = pytest.importorskip("basyx.aas.adapter.json")
+    from teds_provision.describe.asset_shell import asset_shell
+
+    node = gripper(station, board, tmp_path)
+    text = asset_shell(node)
+    assert text == asset_shell(node)
+    (tmp_path / "shell.json").write_text(text)
+    with (tmp_path / "shell.json").open() as file:
+        found = adapter.read_aas_json_file(file, failsafe=False)
+    plate = found.get(f"urn:teds:{board.uuid.hex()}:nameplate")
+    assert plate.get_referable("OrderCodeOfManufacturer").value == "GR-50-A"
+    assert plate.get_referable("AddressInformation").get_referable("CityTown").value["en"] == "Lab"
+    technical = found.get(f"urn:teds:{board.uuid.hex()}:technical-data")
+    section = technical.get_referable("TechnicalProperties").get_referable("Channel1")
+    channel = node.sheet.channel(1)
+    assert channel is not None
+    assert section.get_referable("HighLimit").value == channel.high
+
+
+def test_a_missing_field_is_named_with_its_profile_key_and_nothing_is_written(
+    station: Station, board: Board, tmp_path: Path
+) -> None:
+    pytest.importorskip("basyx")
+    from teds_provision.describe.asset_shell import asset_shell
+
+    without = NAMEPLATE.replace("<OrderCode>GR-50-A</OrderCode>", "")
+    node = gripper(station, board, tmp_path, without)
+    with pytest.raises(MissingFieldError, match="OrderCodeOfManufacturer") as caught:
+        asset_shell(node)
+    assert "<OrderCode>" in str(caught.value.hint)
+    assert "meta-identification" in str(caught.value.hint)
+    out = tmp_path / "out"
+    out.mkdir()
+    done = call(station.home, "--json", "describe", board.uuid.hex(), "--as", "aas", "--output", str(out))
+    assert (done.code, list(out.iterdir())) == (8, [])
+    assert done.json["error"]["code"] == "missing-field"
+    done = call(station.home, "--json", "describe", board.uuid.hex(), "--as", "td", "--output", str(out))
+    assert done.code == 0, done.err
+    assert [Path(name).name for name in done.json["files"]] == [f"{board.uuid.hex()}.td.json"]
+    assert (out / f"{board.uuid.hex()}.td.json").is_file()
+
+
+def test_a_hostile_nameplate_is_no_nameplate(station: Station, board: Board, tmp_path: Path) -> None:
+    node = gripper(station, board, tmp_path, '<!DOCTYPE a [<!ENTITY b "c">]><a><OrderCode>&b;</OrderCode></a>')
+    assert node.nameplate == {}
+
+
+def test_only_an_authentic_datasheet_is_described(station: Station, board: Board, tmp_path: Path) -> None:
+    with pytest.raises(NotFoundError):
+        described_node(station, board.uuid)
+    gripper(station, board, tmp_path, "")
+    revoke(station, board.uuid, "stolen")
+    with pytest.raises(NotAuthenticError, match="revoked"):
+        described_node(station, board.uuid)
+
+
+def test_a_sensor_alone_has_no_joint(station: Station, board: Board, tmp_path: Path) -> None:
+    node = gripper(station, board, tmp_path, "")
+    sensors = tuple(channel for channel in node.sheet.channels if not channel.actuator)
+    from dataclasses import replace
+
+    with pytest.raises(BadDataError, match="no joint"):
+        ros2_control.joints(replace(node, sheet=replace(node.sheet, channels=sensors)), Topics(station_facts(station)))
