@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from teds_provision import describe as formats
+from teds_provision import measure
 from teds_provision.cli.build import write_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
@@ -38,6 +41,7 @@ FORMS: Final = ("td", "ros2-control", "aas")
     type=click.Path(path_type=Path, file_okay=False),
     default=Path(),
     show_default="the working folder",
+    metavar="FOLDER",
     help="Folder for the files.",
 )
 @pass_app
@@ -47,14 +51,12 @@ def describe(app: App, uuids: tuple[str, ...], form: str, output: Path) -> None:
     Only authentic datasheets are exported. If the format requires a field that the datasheet lacks, nothing is written
     and the error names the field and the profile key that provides it.
     """
-    from teds_provision.describe.described_node import described_node
-
     station = app.station()
     if not output.is_dir():
         raise NotFoundError(f"There is no folder {output}.", hint=f"Create it: mkdir {output}")
     made: dict[Path, str] = {}
     for text in uuids:
-        node = described_node(station, station.nodes.resolve(text))
+        node = formats.described_node.described_node(station, station.nodes.resolve(text))
         made |= {output / name: content for name, content in _MAKERS[form](station, node).items()}
     for path, content in made.items():
         write_file(path, content)
@@ -62,19 +64,13 @@ def describe(app: App, uuids: tuple[str, ...], form: str, output: Path) -> None:
 
 
 def _thing_description(_station: Station, node: DescribedNode) -> dict[str, str]:
-    import json
-
-    from teds_provision.describe.thing_description import thing_description
-
-    return {f"{node.uuid.hex()}.td.json": json.dumps(thing_description(node), ensure_ascii=False, indent=2) + "\n"}
+    description = formats.thing_description.thing_description(node)
+    return {f"{node.uuid.hex()}.td.json": json.dumps(description, ensure_ascii=False, indent=2) + "\n"}
 
 
 def _ros2_control(station: Station, node: DescribedNode) -> dict[str, str]:
-    from teds_provision.describe import ros2_control
-    from teds_provision.measure.running.measurement_job import station_facts
-    from teds_provision.measure.sinks.names import Topics
-
-    topics = Topics(station_facts(station))
+    ros2_control = formats.ros2_control
+    topics = measure.sinks.names.Topics(measure.running.measurement_job.station_facts(station))
     joints = ros2_control.joints(node, topics)
     name = topics.node(node.uuid.hex())
     return {
@@ -84,9 +80,7 @@ def _ros2_control(station: Station, node: DescribedNode) -> dict[str, str]:
 
 
 def _asset_shell(_station: Station, node: DescribedNode) -> dict[str, str]:
-    from teds_provision.describe.asset_shell import asset_shell
-
-    return {f"{node.uuid.hex()}.aas.json": asset_shell(node)}
+    return {f"{node.uuid.hex()}.aas.json": formats.asset_shell.asset_shell(node)}
 
 
 _MAKERS: Final[dict[str, Callable[[Any, Any], dict[str, str]]]] = {

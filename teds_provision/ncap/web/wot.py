@@ -14,6 +14,8 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from teds_provision.api.operations import MOST_NODES
+from teds_provision.describe.described_node import described_node
+from teds_provision.describe.thing_description import thing_description
 from teds_provision.errors import TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.web.answers import reading
@@ -35,9 +37,6 @@ def route(daemon: Daemon) -> Route:
 
 
 def _descriptions(daemon: Daemon, base: str) -> list[dict[str, Any]]:
-    from teds_provision.describe.described_node import described_node
-    from teds_provision.describe.thing_description import thing_description
-
     found = []
     for uuid in daemon.directory.uuids()[:MOST_NODES]:
         try:
