@@ -90,14 +90,34 @@ def file_names() -> list[str]:
     return sorted(name for name, paths in kinds.items() if paths == {True})
 
 
+_CONFIGURATION_END = (
+    "## What can go wrong",
+    "",
+    "| what you see | cause and remedy |",
+    "|---|---|",
+    "| `config.toml`, with a line number (8) | the file cannot be read as TOML, or a value has another type; "
+    "every command but `doctor` refuses until it is corrected |",
+    "| an option has no effect | the command line goes before the variable, the variable before the file: "
+    "`config show` names where each value comes from |",
+    "",
+    "## Next",
+    "",
+    "[contract/cli.md](contract/cli.md) has exit codes and JSON; the "
+    "[command reference](https://teds-provision.github.io/teds-provision/reference/commands.html) has every command.",
+    "",
+)
+
+
 def configuration() -> str:
     """docs/configuration.md: every option, variable and key on one page."""
     lines = [
         "# Configuration",
         "",
-        "Every option can stand on the command line, in an environment variable, or in `config.toml` in the home",
-        "(`teds-provision config path` says where). The command line goes before the variable, the variable before the",
-        "file.",
+        "**For** anyone who does not want to type `--can` every time, or sets up a station by script.",
+        "",
+        "Every option can be given on the command line, in an environment variable, or in `config.toml` in the home",
+        "(`teds-provision config path` prints its path). The command line goes before the variable, the variable",
+        "before the file.",
         "No option and no variable holds a secret: passphrases come from a prompt, the keyring, or `--passphrase-fd`.",
         "",
         "```toml",
@@ -124,6 +144,14 @@ def configuration() -> str:
         "A relative path in `config.toml` starts at the folder of `config.toml`, wherever you type the command;",
         "`config set` writes the path that you gave from the root on.",
         "",
+        "**You will see** with `config show` where each value comes from:",
+        "",
+        "```",
+        "$ teds-provision config show",
+        "home  h  [--home]",
+        "can   udp_multicast:239.74.163.41?port=24141  [h/config.toml]",
+        "```",
+        "",
     ]
     for path, command in commands():
         options = options_of(command)
@@ -136,7 +164,7 @@ def configuration() -> str:
             help_text = (option.help or "").replace("|", "\\|")
             lines.append(f"| `--{name}` | {variable} | {help_text} |")
         lines.append("")
-    return "\n".join(lines)
+    return "\n".join([*lines, *_CONFIGURATION_END])
 
 
 def _roff(text: str) -> str:
