@@ -221,10 +221,12 @@ def _many(app: App, boards: BatchRun, questions: Questions, screen: Screen, *, t
             if boards.expected and not app.json:
                 _tell_one_of(app, boards, board)
             elif not screen.tells:
-                _tell_board(app, board, **_of_line(boards, board.uuid))
+                _tell_board(app, board, warn=not boards.expected, **_of_line(boards, board.uuid))
             screen.ended(board)
     finally:
         screen.close()
+        if boards.expected:
+            _tell_warnings(app, boards)
         if totals:
             _tell_totals(app, boards)
     error = boards.totals().error if totals else None
@@ -350,9 +352,14 @@ def _tell_plans(app: App, boards: BatchRun) -> None:
         raise click.exceptions.Exit(boards.worst.exit_code)
 
 
-def _print_result(app: App, done: ProvisionResult, *, error: TedsProvisionError | None = None, **more: object) -> None:
-    """Print one node's result; ``error`` ends the command, ``more`` is on the line of one of many."""
-    for warning in done.warnings:
+def _print_result(
+    app: App, done: ProvisionResult, *, error: TedsProvisionError | None = None, warn: bool = True, **more: object
+) -> None:
+    """Print one node's result; ``error`` ends the command, ``more`` is on the line of one of many.
+
+    ``warn`` False: its warnings are printed with those of the others.
+    """
+    for warning in done.warnings if warn else ():
         app.warn(warning)
     units = station.shown_units.shown_units(app.station(), done.who.uuid)
     summary = station.summary.summarise(done.image, units)
@@ -375,13 +382,14 @@ def _print_result(app: App, done: ProvisionResult, *, error: TedsProvisionError 
     app.conclude(result, lambda console: _summary(console, done, summary, more), error)
 
 
-def _tell_board(app: App, board: BoardResult, **line: Any) -> None:
+def _tell_board(app: App, board: BoardResult, *, warn: bool = True, **line: Any) -> None:
     """One line of JSON, or what a person reads: UUID, time and row of the sheet on each; ``line``: its unit."""
     if board.done is not None:
         failure = board.failure
         if failure is not None:  # an authentic board can fail: its type requires a calibration, a channel read nothing
             line["failure"] = {"code": failure.code, "message": failure.message, "hint": failure.hint}
-        _print_result(app, board.done, row=board.row, time=board.time, seconds=round(board.seconds, 3), **line)
+        seconds = round(board.seconds, 3)
+        _print_result(app, board.done, warn=warn, row=board.row, time=board.time, seconds=seconds, **line)
         if board.failure is not None and not app.json:
             app.fail_line(board.failure, uuid=board.uuid.hex(), time=board.time, row=board.row)
     elif board.error is not None:
@@ -404,6 +412,17 @@ def _tell_one_of(app: App, boards: BatchRun, board: BoardResult) -> None:
     app.lines([sanitize(f"{place}  {board.uuid.hex()}  {name or '(no name)'}  {words}  {board.seconds:.1f} s")])
     if board.failure is not None:
         app.note(f"{board.uuid.hex()}: {board.failure.message}\n  → {board.failure.hint}".removesuffix("\n  → "))
+
+
+def _tell_warnings(app: App, boards: BatchRun) -> None:
+    """Print each warning about boards of a bus once, with the names of those that have it."""
+    found = boards.board_warnings
+    station = app.station() if found else None
+    for warning, uuids in found.items():
+        known = [station.nodes.get(uuid) for uuid in uuids[:_NAMED]] if station is not None else []
+        names = [record.name or record.uuid.hex() for record in known if record is not None]
+        more = f" and {len(uuids) - _NAMED} more" if len(uuids) > _NAMED else ""
+        app.warn(f"{', '.join(names)}{more}: {warning}")
 
 
 def _tell_totals(app: App, boards: BatchRun) -> None:
@@ -453,6 +472,7 @@ def _summary(console: Console, done: ProvisionResult, summary: NodeSummary, more
 
 _BELL: Final = "\a"
 _LAST: Final = 5
+_NAMED: Final = 5
 _ROWS: Final = 5
 _WHY_LINES: Final = 3
 _ROOMY: Final = 30

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from teds_provision.errors import LinkError, NoNodeError, StoreError, TedsProvisionError
@@ -103,6 +104,9 @@ class Measurement:
         except BaseException:
             for sink in opened:
                 sink.close()
+                if sink.recorder:  # nothing was measured: the next try gets the name that was asked for
+                    for name in sink.files:
+                        Path(name).unlink(missing_ok=True)
             raise
         self.buses.expect(self.uuids)
         if self.request.require is not None:

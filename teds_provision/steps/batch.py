@@ -16,6 +16,7 @@ from typing import Final
 from teds_provision import __version__
 from teds_provision.errors import (
     KeyMismatchError,
+    NotAuthenticError,
     NotWhitelistedError,
     PolicyError,
     TedsProvisionError,
@@ -26,7 +27,7 @@ from teds_provision.links import Contact, LinkSettings, Port, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.adoption import Adopt, read_factory_datasheet, refuse_adoption
-from teds_provision.steps.agree import TakeOver
+from teds_provision.steps.agree import TakeOver, require_session
 from teds_provision.steps.batch_sheet import (
     BatchTotals,
     BoardResult,
@@ -56,6 +57,7 @@ from teds_provision.steps.identify import IdentifiedNode, examine
 from teds_provision.steps.provision import Accept, ProductionLine, ProvisionResult, provision, verify_only
 from teds_provision.steps.readings import verdict_of
 from teds_provision.steps.teds_read import take_snapshot
+from teds_provision.steps.verify_node import verify_in_session
 from teds_provision.steps.write import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.meeting import (
@@ -228,6 +230,15 @@ class BatchRun:
         return len(self._boards)
 
     @property
+    def board_warnings(self) -> dict[str, list[bytes]]:
+        """The warnings of the boards of this run, each with the UUIDs of those that have it."""
+        found: dict[str, list[bytes]] = {}
+        for board in self._boards:
+            for warning in board.done.warnings if board.done is not None else ():
+                found.setdefault(warning, []).append(board.uuid)
+        return found
+
+    @property
     def worst(self) -> TedsProvisionError | None:
         """The most important error of the boards of this run."""
         found: TedsProvisionError | None = None
@@ -355,13 +366,25 @@ class BatchRun:
         pool = ThreadPoolExecutor(workers, thread_name_prefix="node")
         self.expected = len(contacts)
         running = [pool.submit(self._board, contact, port.place, questions) for contact in contacts]
+        locked: VaultLockedError | None = None
         try:
             for done in as_completed(running):
-                if not done.cancelled():
-                    yield done.result()
-                if self.stop.is_asked:
+                if done.cancelled():
+                    continue
+                failure = done.exception()
+                if isinstance(failure, VaultLockedError):  # ends the command, after the boards that are finished
+                    locked = failure
+                else:
+                    board = done.result()
+                    if board is None:
+                        self.expected -= 1
+                    else:
+                        yield board
+                if self.stop.is_asked or locked is not None:
                     for waiting in running:
                         waiting.cancel()
+            if locked is not None:
+                raise locked
         except BaseException:  # Ctrl-C: a mute node would be waited for, a minute long
             port.close()
             raise
@@ -406,7 +429,8 @@ class BatchRun:
         image = self._station.nodes.datasheet(uuid)
         return image is not None and self._lacks_calibration(uuid, image) is not None
 
-    def _board(self, contact: Contact, place: str, questions: Questions) -> BoardResult:
+    def _board(self, contact: Contact, place: str, questions: Questions) -> BoardResult | None:
+        """Provision one node of the bus; None if it turns out to be finished already."""
         began, uuid = time.monotonic(), contact.identity.uuid
         done: ProvisionResult | None = None
         error: TedsProvisionError | None = None
@@ -414,6 +438,8 @@ class BatchRun:
         told = NodeReporter(self._reporter, known.name if known is not None and known.name else uuid.hex())
         try:
             with Conversation(contact, notice=told.notice) as node:
+                if self._was_finished_elsewhere(node):
+                    return None
                 done = self._provision(node, questions, told)
             error = self._lacks_calibration(uuid, done.image)
         except VaultLockedError:  # of the whole command, and of no board
@@ -424,6 +450,27 @@ class BatchRun:
             error = lost.cause
         row = self._rows.pop(uuid, None)
         return BoardResult(uuid, time.monotonic() - began, done, error, row.number if row is not None else None, place)
+
+    def _was_finished_elsewhere(self, node: Conversation) -> bool:
+        """Return True if a node that was never read here has an authentic datasheet, as one whose key was imported.
+
+        It is read in a session, and its datasheet is not signed again by this station.
+        """
+        uuid, unread = node.uuid, self._station.nodes.reading(node.uuid) is None
+        if not unread or node.identity.state != NodeState.PROVISIONED or not self.prepared.order.names_nothing:
+            return False
+        if self.progress is not None or self.line is not None or not self._station.keys.held(uuid):
+            return False
+        try:
+            with self._station.node_lock(uuid):
+                require_session(self._station, node)
+                looked = verify_in_session(self._station, node, by="provision")
+        except (PolicyError, NotAuthenticError):  # provisioning says what is wrong
+            return False
+        if looked.verified.verdict != "authentic":
+            return False
+        self._station.notice(f"Nothing to do: node {uuid.hex()} is authentic, as its datasheet was signed elsewhere.")
+        return self._lacks_calibration(uuid, looked.image) is None
 
     # -- both ------------------------------------------------------------------------------------------------------
 

@@ -135,3 +135,36 @@ def test_a_board_that_is_authentic_but_not_finished_has_its_error_on_its_line(
     assert last["totals"]["failed"] == len(failed) > 0
     assert outcome.code != 0
     assert all(line["error"]["message"] for line in failed)
+
+
+def test_a_node_whose_key_was_imported_is_read_and_not_signed_again(
+    desk: Desk, station: Station, bus: list[Node], tmp_path: Path
+) -> None:
+    """--all gave boards that another station of the owner had finished a second signature, or ended with 6."""
+    links, rival = desk.links.over("can"), desk.station("rival")
+    calibration = tmp_path / "old.csv"
+    calibration.write_text("# date: 2020-01-01\nraw,value [degree]\n0,0\n65535,359.9\n")
+    sheet = tmp_path / "boards.csv"
+    rows = [f"{uuid},node {at},{ANGLE},{calibration}" for at, uuid in enumerate(UUIDS)]
+    sheet.write_text("\n".join(["uuid,name,profile,calibration", *rows]) + "\n")
+    made = station.run("--json", "provision", "--all", "--batch", sheet, *links)
+    assert made.code == 0, made
+    warned = [line for line in made.err.splitlines() if "Warning" in line and "node 0" in line]
+    assert len(warned) == 1, made.err
+    assert all(f"node {at}" in warned[0] for at in range(3)), "once, with the nodes that have it"
+
+    for one, other, name in ((station, rival, "rival"), (rival, station, "bench")):
+        key = tmp_path / f"{name}.pem"
+        key.write_text(other.ask("init")["public_key"])
+        one.ask("trust", "add", name, key, "--yes")
+    bundle = tmp_path / "keys.bundle"
+    station.ask("export-keys", "--to", "rival", "--all", "--output", bundle, "--yes")
+    rival.ask("import-keys", bundle, "--yes")
+    before = [node.flash["sequence"] for node in bus]
+    outcome = rival.run("--json", "provision", "--all", *links)
+    assert outcome.code == 0, outcome
+    assert json.loads(outcome.out)["totals"] | {"seconds": 0} == {
+        "passed": 0, "failed": 0, "skipped": 0, "seconds": 0, "first_pass": None, "steps": {},
+    }  # fmt: skip
+    assert [node.flash["sequence"] for node in bus] == before
+    assert rival.ask("nodes", UUIDS[0])["nodes"][0]["verdict"] == "authentic"

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import json
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadDataError, NodeBusyError, NodeSilentError, NoNodeError
+from teds_provision.errors import (
+    BadDataError,
+    NodeBusyError,
+    NodeSilentError,
+    NoNodeError,
+    PolicyError,
+    VaultLockedError,
+)
+from teds_provision.links import Contact, LinkSettings
 from teds_provision.station.station import Station
+from teds_provision.steps.batch import BatchRun, ProvisionRequest, Questions
 from teds_provision.steps.batch_sheet import (
     BatchSheet,
     BoardResult,
@@ -20,6 +31,8 @@ from teds_provision.steps.batch_sheet import (
     write_report,
 )
 from teds_provision.steps.build import BuildOrder
+from teds_provision.talk.progress import SilentReporter
+from tests.bench import Board, contact
 
 
 def read(station: Station, folder: Path, text: str | bytes) -> BatchSheet:
@@ -273,3 +286,44 @@ def test_the_report_for_people_says_yield_and_leaves_out_what_was_not_reached(st
         assert fact in text
     write_report(tmp_path / "day.csv", progress, about)
     assert "first_pass,0.0000" in (tmp_path / "day.csv").read_text()
+
+
+def test_boards_that_are_finished_when_the_vault_is_locked_are_counted(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process changed the passphrase while nodes of a bus were worked on: finished ones are reported."""
+    boards = BatchRun(station, LinkSettings("can"), ProvisionRequest(everyone=True), SilentReporter())
+    contacts = [on_reader_number(number) for number in range(4)]
+    locked = threading.Event()
+
+    def board(contact: Contact, place: str, _questions: Questions) -> BoardResult:
+        uuid = contact.identity.uuid
+        if uuid == contacts[0].identity.uuid:
+            locked.set()
+            raise VaultLockedError("The vault is locked.")
+        locked.wait(5.0)
+        time.sleep(0.05)  # the error is there first
+        return BoardResult(uuid, 0.1, None, PolicyError("refused"), None, place)
+
+    monkeypatch.setattr(boards, "_board", board)
+    came: list[bytes] = []
+    everyone = boards._side_by_side(SixAtOnce(), contacts, Questions(lambda _who: None, None))  # type: ignore[arg-type]
+    with pytest.raises(VaultLockedError):
+        came.extend(ended.uuid for ended in everyone)
+    assert sorted(came) == sorted(contact.identity.uuid for contact in contacts[1:])
+
+
+class SixAtOnce:
+    """A fixture for a bus on which six nodes are worked on at once."""
+
+    place = "can:test"
+
+    class capabilities:
+        max_parallel = 6
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def on_reader_number(number: int) -> Contact:
+    return contact(Board(uuid=board_of(number + 1)))
