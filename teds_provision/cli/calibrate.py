@@ -129,16 +129,16 @@ def _zero_json(done: ZeroResult, *, dry_run: bool) -> dict[str, Any]:
 def _zero_lines(done: ZeroResult, *, dry_run: bool) -> str:
     channel = done.channel
     named = f"Channel {channel.number}" + (f" ({shown(channel.name)})" if channel.name else "")
-    read = f"{named} read {channel.show(done.before)}"
+    read = f"{named} read {channel.show_reading(done.before)}"
     seen = f"{done.count} samples, spread {channel.show(done.spread, difference=True)}"
     if not done.moved:
-        return f"{named} reads {channel.show(done.before)} ({seen}): nothing to do."
+        return f"{named} reads {channel.show_reading(done.before)} ({seen}): nothing to do."
     offset = f"zero offset {channel.show(done.offset, difference=True)}"
     offset += f" (moved by {channel.show(done.moved, difference=True)})"
     changes = "".join(f"\n  {text}" for text in done.changes)
     if dry_run:
-        return f"Plan: {read} ({seen}); it would read {channel.show(done.after)}, {offset}.{changes}"
-    said = f"{read} ({seen}) and now reads {channel.show(done.after)}: {offset}."
+        return f"Plan: {read} ({seen}); it would read {channel.show_reading(done.after)}, {offset}.{changes}"
+    said = f"{read} ({seen}) and now reads {channel.show_reading(done.after)}: {offset}."
     return f"{said}{changes}\nWritten and verified, sequence {done.sequence}."
 
 
@@ -196,8 +196,8 @@ def capture(
     count = len(done.points)
     app.emit(
         result,
-        f"Channel {own.number}: raw {point.raw:.8g} at {own.show(point.reference)} ({point.count} samples, spread "
-        f"{point.spread:.3g}). {file} holds {count} point{'' if count == 1 else 's'}.",
+        f"Channel {own.number}: raw {point.raw:.8g} at {own.show_reading(point.reference)} ({point.count} samples, "
+        f"spread {point.spread:.3g}). {file} holds {count} point{'' if count == 1 else 's'}.",
     )
 
 

@@ -17,6 +17,7 @@ from teds_provision.measure.runner import Watcher
 from teds_provision.measure.sinks import Sink, ThreadedSink
 from teds_provision.measure.sinks.lines import as_line, data_lines, status_line
 from teds_provision.teds import units
+from teds_provision.teds.channel import within_turn
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -193,11 +194,11 @@ class LiveTable:
         for key, (value, when, count, since) in sorted(newest.items())[:ROWS]:
             known = facts.get(key, ChannelFacts(key[0], "", key[1], ""))
             rate = count / max(monotonic - since, 1e-3)
-            number, unit = in_peoples_units(None if value is None else tidy(value, known.uncertainty), known)
+            text, unit = value_text(value, known)
             table.add_row(
                 escape(shown(known.node or key[0][:8])),
                 escape(shown(known.label)),
-                "not valid" if number is None else f"{number:.6g}",
+                text,
                 escape(unit),
                 f"{max(0.0, now - when):.2f} s",
                 f"{rate:.4g} Hz",
@@ -215,6 +216,16 @@ def in_peoples_units(value: float | None, known: ChannelFacts) -> tuple[float | 
         return value, known.unit
     number, unit = units.in_display_units(value, known.units, known.shown_unit)
     return number, units.short_unit(unit)
+
+
+def value_text(value: float | None, known: ChannelFacts) -> tuple[str, str]:
+    """Return a value in SI units as people read it, and its display unit; an angle over a full turn within its turn."""
+    number, unit = in_peoples_units(None if value is None else tidy(value, known.uncertainty), known)
+    if number is None:
+        return "not valid", unit
+    if known.full_turn and known.units is not None and known.low is not None:
+        return within_turn(number, units.display_unit(known.units, known.shown_unit), known.low), unit
+    return f"{number:.6g}", unit
 
 
 def _line(report: NodeReport) -> str:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import click
 
-from teds_provision import plant, station
+from teds_provision import plant, station, teds
 from teds_provision import steps as steps_room
 from teds_provision.cli.build import calibration_json, order_options
 from teds_provision.cli.context import App, pass_app
@@ -379,7 +379,7 @@ def _print_result(
     }
     if more.get("failure") is not None:
         result["error"] = more["failure"]
-    app.conclude(result, lambda console: _summary(console, done, summary, more), error)
+    app.conclude(result, lambda console: _summary(console, done, summary, _readings(done, units), more), error)
 
 
 def _tell_board(app: App, board: BoardResult, *, warn: bool = True, **line: Any) -> None:
@@ -445,7 +445,20 @@ def _tell_totals(app: App, boards: BatchRun) -> None:
     app.emit(result, f"{counts}{share}, {totals.seconds:.1f} s in total.{steps}")
 
 
-def _summary(console: Console, done: ProvisionResult, summary: NodeSummary, more: Mapping[str, object]) -> None:
+def _readings(done: ProvisionResult, units: Mapping[int, str]) -> dict[int, str]:
+    """Return the readings at the end for people, by channel."""
+    sheet = teds.sheet.Sheet.from_image(done.image).shown_in(units)
+    valid = {sample["channel"]: sample["value"] for sample in done.samples if sample["valid"]}
+    return {own.number: own.show_reading(valid[own.number]) for own in sheet.channels if own.number in valid}
+
+
+def _summary(
+    console: Console,
+    done: ProvisionResult,
+    summary: NodeSummary,
+    readings: Mapping[int, str],
+    more: Mapping[str, object],
+) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -453,13 +466,12 @@ def _summary(console: Console, done: ProvisionResult, summary: NodeSummary, more
     table.add_row("node", f"[bold]{escape(summary.name or '(no name)')}[/]")
     table.add_row("UUID", done.who.uuid.hex())
     table.add_row("key", done.who.fingerprint[:16])
-    now = {sample["channel"]: sample["shown"] for sample in done.samples if sample["valid"]}
     if "unit" in more:
         table.add_row("unit", f"{more['unit']} of {more['of']}")
     for channel in summary.channels:
         calibrated = ", calibrated" if channel.calibrated else ""
-        read = now.get(channel.number)
-        reads = f", reads {read['value']:.6g} {read['unit']}".rstrip() if read is not None else ""
+        read = readings.get(channel.number)
+        reads = f", reads {read}" if read is not None else ""
         what = f"{escape(channel.name)}  {channel.range}{calibrated}{reads}".strip()
         table.add_row(f"channel {channel.number}", what)
     verdict = done.verified.verdict

@@ -167,8 +167,7 @@ def _values(shown: Block | GroupRows, summary: RecordingSummary) -> Iterator[str
 def _value(value: float, known: ChannelFacts) -> str:
     if not math.isfinite(value):
         return "not valid"
-    number, unit = measure_view.in_peoples_units(rendering.tidy(value, known.uncertainty), known)
-    return f"{number:.6g} {unit}".rstrip()
+    return " ".join(measure_view.value_text(value, known)).rstrip()
 
 
 @record.command(

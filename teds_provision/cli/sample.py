@@ -20,6 +20,7 @@ from teds_provision.cli.rendering import print_table, reporter_for, shown, tidy
 from teds_provision.errors import LinkError, NodeRefusedError, UsageError
 from teds_provision.links import LinkSettings
 from teds_provision.protocol import operation
+from teds_provision.teds.channel import within_turn
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -100,6 +101,12 @@ def sample(app: App, node: str, channels: Sequence[int], links: LinkSettings) ->
     app.emit(result, lambda console: _samples(console, samples))
 
 
+def _text(sample: Sample, value: float) -> str:
+    if sample.turn is None or sample.shown is None:
+        return f"{value:.6g}"
+    return within_turn(value, sample.shown, sample.turn)
+
+
 def _samples(console: Console, samples: Sequence[Sample]) -> None:
     from rich.markup import escape
     from rich.table import Table
@@ -112,7 +119,7 @@ def _samples(console: Console, samples: Sequence[Sample]) -> None:
             "unit": sample.unit,
         }
         sure = told["uncertainty"]
-        value = f"{tidy(told['value'], sure):.6g}" if told["value"] is not None else f"not valid: {sample.why}"
+        value = _text(sample, tidy(told["value"], sure)) if told["value"] is not None else f"not valid: {sample.why}"
         uncertainty = f"{sure:.3g}" if sure is not None else ""
         name = escape(shown(sample.name))
         table.add_row(str(sample.channel), name, escape(value), uncertainty, escape(told["unit"]), str(sample.raw))

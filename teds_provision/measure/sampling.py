@@ -27,7 +27,7 @@ ROOM = 180  # octets of data sets in one reply, so that it fits any node's maxMe
 class Sample:
     """One value; ``value`` and ``uncertainty`` in ``unit`` (SI), None if not valid or not stated.
 
-    ``shown`` is the display unit.
+    ``shown`` is the display unit, ``turn`` the beginning (in SI units) of the turn that an angle stays within.
     """
 
     channel: int
@@ -40,6 +40,7 @@ class Sample:
     time: float
     why: str = ""
     shown: WrittenUnit | None = None
+    turn: float | None = None
 
     def as_json(self) -> dict[str, Any]:
         """As `sample --json` has it."""
@@ -143,4 +144,5 @@ def _sample(
         time=stamp,
         why=why,
         shown=channel.shown,
+        turn=channel.low if channel.full_turn else None,
     )

@@ -45,6 +45,7 @@ else:
 
 _NAME = "calibrate zero"
 _AFTERWARDS: Final = 16
+_ROUNDING: Final = 1e-6 * TURN
 """Samples by the new datasheet, one after the other: each takes 6 ms of a bus of 500 kbit/s."""
 
 
@@ -134,7 +135,7 @@ class _ZeroRun:
             turn = turn_of(own, full_turn=channel.full_turn)
             settled = take_samples_of(trusted, channel.number)
             reading = require_still(settled)
-            step.detail = f"{channel.show(_si(channel, own, reading.mean))}, {reading.count} samples"
+            step.detail = f"{channel.show_reading(_si(channel, own, reading.mean))}, {reading.count} samples"
         offset = offset_for(own, reading.mean, wanted, turn)
         moved = float(shortest(np.asarray(offset - own.zero_offset), turn))
         identity = node.proven
@@ -263,6 +264,12 @@ def _adjustable(trusted: VerifiedSession, number: int) -> tuple[Channel, Calibra
 
 
 def _si(channel: Channel, own: Calibration, value: float) -> float:
-    """Return a reading in the calibrated unit, in SI units, as it is shown: within its turn."""
+    """Return a reading in the calibrated unit, in SI units, as it is shown: within its turn.
+
+    The rounding of a Float32 offset leaves a reading of 0 just below it, which must not come back as a whole turn.
+    """
     si = own.unit.to_si(value)
-    return float(wrapped(np.asarray(si), channel.low, channel.high, TURN)) if channel.full_turn else si
+    if not channel.full_turn:
+        return si
+    angle = float(wrapped(np.asarray(si), channel.low, channel.high, TURN))
+    return channel.low if channel.low + TURN - angle < _ROUNDING else angle

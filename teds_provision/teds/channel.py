@@ -66,6 +66,17 @@ def wrapped(values: NDArray[np.float64], low: Ends, high: Ends, turn: Ends) -> N
     return np.where(moved >= high, low, moved)
 
 
+def within_turn(value: float, unit: WrittenUnit, low: float, digits: int = 6) -> str:
+    """Return an angle in a unit as text; one that rounds up to the end of its turn is the turn's beginning.
+
+    ``low`` is the beginning in SI units.
+    """
+    begin = unit.from_si(low)
+    text, end = f"{value:.{digits}g}", f"{begin + unit.difference_from_si(TURN):.{digits}g}"
+    chosen = text if float(text) < float(end) else f"{begin:.{digits}g}"
+    return "0" if float(chosen) == 0 else chosen
+
+
 class ChannelKind(IntEnum):
     """ChanType (field 11 of the TransducerChannel TEDS): what a channel is."""
 
@@ -218,6 +229,13 @@ class Channel:
     def show(self, value: float, *, difference: bool = False, digits: int = 6) -> str:
         """Value in SI units as people see it: ``360 °``, ``0.35 N``; a difference leaves the unit's offset out."""
         return format_value(value, self.shown, difference=difference, digits=digits)
+
+    def show_reading(self, value: float, *, digits: int = 6) -> str:
+        """Show a reading in SI units; over a full turn one that rounds up to the end of the turn is its beginning."""
+        if not self.full_turn or not math.isfinite(value):
+            return self.show(value, digits=digits)
+        text = within_turn(self.shown.from_si(value), self.shown, self.low, digits)
+        return f"{text} {self.shown.text}".strip()
 
 
 def described(number: int, blocks: Mapping[BlockId, bytes]) -> Channel:

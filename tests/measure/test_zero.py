@@ -75,7 +75,7 @@ def test_this_is_0_now_in_one_step(hall: Hall, angle: Shaft) -> None:
     assert done["written"]
     assert done["warnings"] == [], "that it reads otherwise than before is what was asked for"
     assert done["before"] == pytest.approx(before)
-    assert min(done["after"], TURN - done["after"]) < 1e-6
+    assert done["after"] == pytest.approx(0, abs=1e-6), "not a whole turn"
     assert done["offset"] == pytest.approx(-6000 / 65536 * TURN, abs=1e-6)
     assert (done["unit"], done["shown"]["unit"]) == ("rad", "°")
     assert done["shown"]["offset"] == pytest.approx(-6000 / 65536 * 360, abs=1e-4)

@@ -7,18 +7,20 @@ function places(value, uncertainty) {
   return size >= 1e5 || size === 0 ? 0 : Math.min(9, Math.max(0, 4 - Math.floor(Math.log10(size))));
 }
 
-/** A value as people read it; "none" where there is none. Very large and very small ones as 1.2345e-9. */
-export function number(value, uncertainty = null) {
+/** A value as people read it; "none" where there is none. Very large and very small ones as 1.2345e-9. An angle that rounds to the end of its turn is its beginning. */
+export function number(value, uncertainty = null, turn = null) {
   if (typeof value !== "number" || !Number.isFinite(value)) return "none";
   const size = Math.abs(value);
   if (size !== 0 && (size >= 1e7 || (size < 1e-4 && !(uncertainty > size)))) return sign(value.toExponential(4));
-  return sign(value.toFixed(places(value, uncertainty)));
+  const digits = places(value, uncertainty);
+  const text = value.toFixed(digits);
+  return sign(turn && Number(text) >= Number((turn.low + turn.size).toFixed(digits)) ? turn.low.toFixed(digits) : text);
 }
 
 /** The last value of a channel in words where there is no number: never measured, raw values alone, not valid. */
 export function figure(last, channel) {
   if (!last) return "no value yet";
-  if (typeof last.value === "number") return number(last.value, channel.uncertainty);
+  if (typeof last.value === "number") return number(last.value, channel.uncertainty, channel.turn);
   return channel.problem ? "raw value only" : "not valid";
 }
 

@@ -315,7 +315,7 @@ function marks(chart, channels, colours) {
 function there(course, place, channel) {
   const [low, high] = [course[3 * place], course[3 * place + 1]].sort((one, other) => one - other);
   if (typeof low !== "number") return low === null ? "not valid" : "nothing";
-  return low === high || typeof high !== "number" ? number(low, channel.uncertainty) : `${number(low, channel.uncertainty)} to ${number(high, channel.uncertainty)}`;
+  return low === high || typeof high !== "number" ? number(low, channel.uncertainty, channel.turn) : `${number(low, channel.uncertainty)} to ${number(high, channel.uncertainty)}`;
 }
 
 /** Clock time with as many digits as the columns are wide. */

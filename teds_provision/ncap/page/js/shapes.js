@@ -22,6 +22,13 @@ export const toShown = (scale, value) => (typeof value === "number" ? value * sc
 export const fromUnit = (scale, value, unit) => (unit && unit === scale.unit ? value : toShown(scale, value));
 export const toSi = (scale, value) => (value - scale.offset) / scale.factor;
 
+/** Where an angle sensor's turn begins and how long it is, as shown; null for every other channel. */
+function turnOf(wire, scale) {
+  const whole = 2 * Math.PI;
+  if (wire.unit !== "rad" || KINDS[wire.kind] === "actuator" || !(Math.abs(wire.high - wire.low - whole) < 1e-5)) return null;
+  return { low: toShown(scale, wire.low), size: Math.abs(whole * scale.factor) };
+}
+
 function channel(wire) {
   const scale = scaleOf(wire);
   const ends = [toShown(scale, wire.low), toShown(scale, wire.high)];
@@ -36,6 +43,7 @@ function channel(wire) {
     low: ends[0],
     high: ends[1],
     uncertainty: typeof wire.uncertainty === "number" ? Math.abs(wire.uncertainty * scale.factor) : null,
+    turn: turnOf(wire, scale),
     last,
     actuator: wire.actuator ? { ...wire.actuator, value: fromUnit(scale, wire.actuator.value, wire.actuator.unit) } : null,
   };
