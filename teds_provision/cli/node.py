@@ -195,7 +195,7 @@ _DEFAULT_SOURCE = "noise"
     "teds-provision node run bench/angle --can udp_multicast:239.74.163.2 --source sine:2",
     "teds-provision node run bench/a bench/b bench/c --can udp_multicast:239.74.163.2",
     "teds-provision node run bench/torque --can socketcan:can0 --source dbc:torque.dbc --bus socketcan:can1",
-    "teds-provision node run bench/f --can socketcan:can0 --source canopen:cell.eds --bus socketcan:can1 --node-id 5",
+    "teds-provision node run b --can socketcan:can0 --source canopen:c.eds --bus socketcan:can1 --node-id 5",
     short_help="Run the nodes in DIR … until SIGTERM or Ctrl-C.",
 )
 @click.argument("folders", metavar="DIR…", nargs=-1, required=True, type=click.Path(path_type=Path, file_okay=False))

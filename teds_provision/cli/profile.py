@@ -212,7 +212,7 @@ def new(
     output: Path | None,
     dry_run: bool,
 ) -> None:
-    """Write a template for a new type, or a type from XML, or from the description of a sensor.
+    """Write a template for a type, or a type from XML or a sensor.
 
     The template has every key, commented. A type is read from a datasheet XML of your own by a mapping file;
     docs/formats.md says how that is written. From a DBC file, an EDS or an IIO device come channels, units, ranges

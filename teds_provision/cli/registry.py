@@ -765,7 +765,7 @@ def resume(app: App, files: Path | None, yes: bool, dry_run: bool) -> None:
 @command("teds-provision registry seen", name="seen")
 @pass_app
 def seen(app: App) -> None:
-    """Acknowledge all alarms so far, and what others reported of pages that are missing here.
+    """Acknowledge all alarms and reports of missing pages so far.
 
     They are no longer shown (--json lists alarms with "seen"), and commands no longer exit 4 because of them.
     """
