@@ -283,7 +283,7 @@ docs: $(VENV)/.dev
 
 # Before a release: the gate, and what proves the same at greater length.
 test-all: test
-	$(BIN)/python -m pytest tests/release tests/plant/test_returned_pages.py -m soak -rs
+	$(BIN)/python -m pytest tests/release tests/plant/test_returned_pages.py tests/ncap/test_by_topics.py -m soak -rs
 
 # The steps of service/Containerfile on a Debian root, and the demo in it as its user on a read-only root. As root, with
 # debootstrap; no container engine is needed. Keeps the bare root in build/container for the next time.

@@ -165,12 +165,12 @@ ALL: Final = {**CHANGES, **SEEN_BY_A_STATION}
 
 
 def of_the_gate() -> Iterator[Any]:
-    """Each fault; beyond the first of a rule, and beyond the sample, they are left to ``make firmware-faults``."""
-    rules = set()
-    for name in CHANGES:
-        rule = FAULTS[name].rule
-        yield pytest.param(name, marks=[pytest.mark.soak] if rule in rules else [])
-        rules.add(rule)
+    """Yield each fault; but for each sixth, and for the sample, they are left to ``make firmware``.
+
+    ``tests/check/test_faults.py`` holds each rule at the gate, against the faulty nodes in Python.
+    """
+    for number, name in enumerate(CHANGES):
+        yield pytest.param(name, marks=[pytest.mark.soak] if number % 6 else [])
     for name in SEEN_BY_A_STATION:
         yield pytest.param(name, marks=[] if name in SAMPLE else [pytest.mark.soak])
 

@@ -134,6 +134,7 @@ def found(pattern: Pattern, where: list[Module]) -> list[Mutant]:
             module.mutant(node, pattern.now, function, told, _words(module, tree)), test=pattern.test, rule=pattern.rule
         )
         for module in where
+        if pattern.function.rpartition(".")[2] in module.source
         for function, tree in module.functions()
         if function == pattern.function
         for node in ast.walk(tree)

@@ -36,6 +36,13 @@ def ros(request: pytest.FixtureRequest, master: Master) -> Iterator[Ros1 | Ros2]
         yield made
 
 
+@pytest.fixture(params=[pytest.param("ros1", marks=pytest.mark.soak), "ros2"])
+def either_ros(request: pytest.FixtureRequest, master: Master) -> Iterator[Ros1 | Ros2]:  # noqa: F811
+    """One ROS for rules of the daemon, which are the same code with both; make test-all has the other."""
+    with ros_of(request.param, master) as made:
+        yield made
+
+
 @pytest.fixture
 def publishers() -> Iterator[Publishers]:
     """Publishers that a test starts; none outlives it."""
@@ -95,25 +102,25 @@ def test_set_points_move_it_and_whatever_dies_it_is_safe(hall: Hall, ros: Ros1 |
 
 
 def test_beyond_the_limits_nothing_moves_and_the_node_says_why(
-    hall: Hall, ros: Ros1 | Ros2, publishers: Publishers
+    hall: Hall, either_ros: Ros1 | Ros2, publishers: Publishers
 ) -> None:
-    with listening(hall, ros) as service, service.client() as asked:
-        publishers.append(set_points(ros, 5.0))
+    with listening(hall, either_ros) as service, service.client() as asked:
+        publishers.append(set_points(either_ros, 5.0))
         until(lambda: "limits" in (asked.node(hall.nodes["g"].uuid)["measuring"] or {}).get("why", ""), "no word of it")
         assert all(line["safe"] for line in Journal.of(hall).states())
         service.end()
 
 
 def test_a_request_and_a_topic_do_not_pull_at_one_actuator(
-    hall: Hall, ros: Ros1 | Ros2, publishers: Publishers
+    hall: Hall, either_ros: Ros1 | Ros2, publishers: Publishers
 ) -> None:
     """Who came first has it: the other one is refused and told, and has it when the first one lets go."""
     path = f"/nodes/{hall.nodes['g'].uuid}/channels/1"
-    with listening(hall, ros) as service, service.client() as asked:
+    with listening(hall, either_ros) as service, service.client() as asked:
         journal = Journal.of(hall)
         asked.request("PUT", path, {"value": 0.02, "hold": 60})
         journal.moves()
-        publishers.append(set_points(ros, 0.05))
+        publishers.append(set_points(either_ros, 0.05))
         assert service.process is not None
         service.process.wait_for('"state": "refused"', 60)
         time.sleep(DEAD_MAN)
@@ -133,12 +140,14 @@ def test_a_request_and_a_topic_do_not_pull_at_one_actuator(
         service.end()
 
 
-def test_off_the_whitelist_it_is_let_go_and_measured_on(hall: Hall, ros: Ros1 | Ros2, publishers: Publishers) -> None:
+def test_off_the_whitelist_it_is_let_go_and_measured_on(
+    hall: Hall, either_ros: Ros1 | Ros2, publishers: Publishers
+) -> None:
     """A person takes it off the list by a command beside the daemon, while a topic drives it."""
     uuid = hall.nodes["g"].uuid
-    with listening(hall, ros, "--detection", "transparent") as service, service.client() as asked:
+    with listening(hall, either_ros, "--detection", "transparent") as service, service.client() as asked:
         journal = Journal.of(hall)
-        publishers.append(ros.publish())
+        publishers.append(either_ros.publish())
         journal.moves()
         hall.station.ask("whitelist", "remove", uuid, "--yes")
         until(lambda: journal.states()[-1]["safe"], "it still moves")
