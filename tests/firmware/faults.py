@@ -706,8 +706,8 @@ ON_THE_BUS: Final[dict[str, Change]] = {
     ),
     "FAULT_BUSY_SILENT": Change(
         "can.c",
-        "        reason = TEDS_BUSY;\n",
-        "        return;\n",
+        "    if (reason != 0) {\n        refuse(line, frame->data[head]",
+        "    if (reason == TEDS_BUSY) {\n        return;\n    }\n    if (reason != 0) {\n        refuse(line, frame->data[head]",
     ),
     "FAULT_ADDRESS_TOO_SOON": Change(
         "node.c",
