@@ -58,7 +58,7 @@ QUICK := $(wildcard tests/test_[!m]*.py) tests/teds tests/protocol tests/store t
   'tests/links/nfc/test_nfc_exchange.py::test_frames_of_every_size_come_back_whole[4]' \
   tests/links/can/test_can_exchange.py::test_a_node_answers_an_fd_station_in_fd_and_a_classic_one_in_classic \
   tests/links/ble/test_port.py::test_the_address_may_be_named \
-  'tests/e2e/test_whole_runs.py::test_a_tapped_node_is_provisioned_and_a_second_run_finds_nothing_to_do[4]'
+  'tests/e2e/test_whole_runs.py::test_a_tapped_node_is_provisioned_and_a_second_run_finds_nothing_to_do[python-4]'
 quick: $(VENV)/.dev
 	@$(BIN)/ruff check --quiet .
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not slow and $(USUAL)' --hypothesis-profile quick $(QUICK)

@@ -33,6 +33,8 @@ def resolve_named_tuples() -> None:
 def main(folder: str) -> None:
     """Write the pages."""
     warnings.filterwarnings("error", module="pdoc")
+    # A member that is named like a keyword: `from`.
+    warnings.filterwarnings("ignore", "Cannot determine where .* is taken from")
     resolve_named_tuples()
     pdoc.render.configure(docformat="restructuredtext")
     pdoc.pdoc(PACKAGE, output_directory=Path(folder))

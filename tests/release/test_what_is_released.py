@@ -93,6 +93,14 @@ def test_a_released_version_is_in_the_changelog_and_others_say_so() -> None:
     assert (heading in (ROOT / "CHANGELOG.md").read_text()) is (".dev" not in version[1])
 
 
+def test_the_tests_that_make_quick_names_one_by_one_exist() -> None:
+    named = re.findall(r"tests/\S+::[^\s']+", (ROOT / "Makefile").read_text())
+    assert len(named) >= 4
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--collect-only", *named]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
 def test_each_version_of_the_changelog_begins_with_a_date_and_a_summary() -> None:
     for section in re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1:]:
         heading, _, rest = section.partition("\n")
@@ -124,3 +132,12 @@ def test_two_builds_of_a_commit_are_equal_and_the_sdist_is_whole(tmp_path: Path)
     [source] = (tmp_path / "sdist").iterdir()
     subprocess.run(["make", "quick"], cwd=source, check=True)
     shutil.rmtree(source)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1800)
+def test_the_site_has_the_references_that_follow_from_code(tmp_path: Path) -> None:
+    command = [sys.executable, "scripts/api.py", str(tmp_path / "python")]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
+    page = (tmp_path / "python" / "teds_provision" / "client.html").read_text()
+    assert "release_actuator" in page
