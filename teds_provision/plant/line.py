@@ -33,7 +33,11 @@ from teds_provision.steps.teds_read import NodeSnapshot
 from teds_provision.store import EvidenceRow, UnitRow, WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import StepResult
+from teds_provision.teds.certificate import certificate_reference_of
 from teds_provision.teds.codec import security
+from teds_provision.teds.codec.security import SecurityTeds
+from teds_provision.teds.image import Image
+from teds_provision.teds.origin import origin_of
 
 _MAX_CALIBRATION: Final = 1 << 20
 _NO_CALIBRATION: Final = BuildOrder(drop_calibration=True)
@@ -436,6 +440,7 @@ class LineUnit:
         station, shown = self.run.station, security.decode(teds)
         job, row = self.run.job, station.nodes.get(uuid)
         credentials = station.credentials(uuid)
+        certificates, origin = _named_in(station.nodes.datasheet(uuid), shown)
         facts = BoardFacts(
             station=fingerprint(credentials.key.point),
             job=job.id if job is not None else None,
@@ -452,10 +457,29 @@ class LineUnit:
             tool=TOOL,
             begun=self.begun,
             heads=heads_digest(station) if station.plant.joined is not None else None,
+            certificates=certificates,
+            origin=origin,
         )
         claim, finished = EvidenceClaim(uuid, teds, facts), utc_now()
         document = sign_evidence(node, credentials, claim, operator=self.run.operator, finished=finished)
         self.run.keep(document, claim, finished, self)
+
+
+def _named_in(image: Image | None, shown: SecurityTeds) -> tuple[tuple[tuple[int, str], ...], str | None]:
+    """Return the certificates by channel and the origin that a board's datasheet names.
+
+    Only TEDS count whose digest the Security TEDS lists: the image is what was read of the board last.
+    """
+    blocks = {} if image is None else image.blocks
+    listed = {
+        place: blocks[place]
+        for place, digest in shown.signed_blocks.items()
+        if place in blocks and hashlib.sha256(blocks[place]).digest() == digest
+    }
+    found = ((channel, certificate_reference_of(listed, channel)) for channel in sorted({place[0] for place in listed}))
+    origin = origin_of(listed)
+    named = tuple((channel, reference.sha256) for channel, reference in found if reference is not None)
+    return named, origin.lines if origin is not None else None
 
 
 def _step_facts(steps: Sequence[StepResult]) -> tuple[tuple[str, str, int], ...]:

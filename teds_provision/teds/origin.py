@@ -12,7 +12,7 @@ from typing import Final, Literal, cast, get_args
 
 from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.model import AccessCode
-from teds_provision.teds.codec.text_lines import compose_lines, read_lines
+from teds_provision.teds.codec.text_lines import compose_lines, lines_of, read_lines, values_of
 from teds_provision.teds.image import BlockId
 
 OriginKind = Literal["dbc", "eds", "iio"]
@@ -20,6 +20,7 @@ ORIGIN: Final[BlockId] = (0, AccessCode.ORIGIN)
 """Place of the Origin TEDS."""
 _KINDS: Final = frozenset(get_args(OriginKind))
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
+_ORDERS: Final = (("kind", "name", "sha256"), ("kind", "name"))
 _WORDS: Final = {"dbc": "CAN message", "eds": "CANopen device", "iio": "IIO device"}
 
 
@@ -47,6 +48,11 @@ class Origin:
         return compose_lines(AccessCode.ORIGIN, values | ({"sha256": self.sha256} if self.sha256 else {}))
 
     @property
+    def lines(self) -> str:
+        """The text of the TEDS."""
+        return lines_of({"kind": self.kind, "name": self.name} | ({"sha256": self.sha256} if self.sha256 else {}))
+
+    @property
     def text(self) -> str:
         """``CAN message Torque (dbc)``."""
         return f"{_WORDS[self.kind]} {self.name} ({self.kind})"
@@ -58,8 +64,16 @@ class Origin:
 
 def read_origin(teds: bytes) -> Origin:
     """Return what a framed Origin TEDS says; raises BadDataError for any form but the one of the profile."""
-    values = read_lines(AccessCode.ORIGIN, teds, ("kind", "name", "sha256"), ("kind", "name"))
+    return _origin(read_lines(AccessCode.ORIGIN, teds, *_ORDERS))
+
+
+def _origin(values: Mapping[str, str]) -> Origin:
     return Origin(cast("OriginKind", values["kind"]), values["name"], values.get("sha256", ""))
+
+
+def origin_from_text(text: str) -> Origin:
+    """Return the origin from the text of its TEDS; raises BadDataError for any form but the one of the profile."""
+    return _origin(values_of(AccessCode.ORIGIN, text, *_ORDERS))
 
 
 def origin_of(blocks: Mapping[BlockId, bytes]) -> Origin | None:

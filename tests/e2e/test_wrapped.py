@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 import math
@@ -221,5 +222,10 @@ def test_a_type_is_made_from_the_same_file(bench: WrappedBench, tmp_path: Path) 
     assert made["origin"] == bench.made["Torque"]["origin"]
     assert [channel["name"] for channel in made["channels"]] == ["torque", "speed", "temperature", "state"]
     assert bench.station.ask("profile", "check", path)["profiles"][0]["ok"]
-    again = bench.ask("provision", "torque", "--profile", path, "--via", "can", "--yes")
+    again = bench.ask("provision", "torque", "--profile", path, "--via", "can", "--yes", "--evidence")
     assert again["verdict"] == "authentic"  # the type is the node's: its calibration stays
+    bench.station.ask("evidence", "export", tmp_path / "evidence")
+    [file] = (tmp_path / "evidence").glob("*.json")
+    statement = json.loads(base64.b64decode(json.loads(file.read_text())["payload"]))
+    digest = bench.made["Torque"]["origin"]["sha256"]
+    assert statement["predicate"]["facts"]["origin"] == f"kind=dbc\nname=Torque\nsha256={digest}\n"

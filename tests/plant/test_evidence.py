@@ -22,6 +22,7 @@ from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.evidence import EvidenceClaim
 from teds_provision.station.station import Station
 from teds_provision.teds.image import SECURITY
+from teds_provision.teds.origin import Origin
 from tests.bench import Board, MemoryLink, make_station, talk
 from tests.cli.shell import call
 
@@ -239,3 +240,44 @@ def test_a_stations_own_ca_makes_no_evidence_for_another(tmp_path: Path, station
     assert "its station is not certified by this CA" in faults(station, document)
     assert station_key_message(stranger.point) != station_key_message(station.point)
     stranger.close()
+
+
+WRAPPED = Origin("dbc", "Torque", "5a" * 32)
+
+
+def test_evidence_names_the_certificates_and_the_origin_of_the_datasheet(station: Station, board: Board) -> None:
+    """A wrapped node's evidence states what it wraps; a text that no signed TEDS holds is a fault."""
+    document = evidence_of(station, board, certificates=((1, "0" * 64),), origin=None)
+    facts = codec.read(document).facts
+    assert (facts.certificates, facts.origin, faults(station, document)) == (((1, "0" * 64),), None, [])
+    assert json.loads(base64.b64decode(json.loads(document)["payload"]))["predicate"]["facts"]["origin"] is None
+    invented = evidence_of(station, board, certificates=(), origin=WRAPPED.lines)
+    assert codec.read(invented).facts.origin == WRAPPED.lines
+    assert "the origin of the facts is not that of the Origin TEDS (130)" in faults(station, invented)
+
+
+def test_evidence_of_older_versions_has_neither_certificates_nor_origin(station: Station, board: Board) -> None:
+    document = evidence_of(station, board)
+    facts = codec.read(document).facts
+    assert (facts.certificates, facts.origin, faults(station, document)) == (None, None, [])
+    assert not {"certificates", "origin"} & set(facts.to_json())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"certificates": [[1, "x"]]},
+        {"certificates": [[256, "0" * 64]]},
+        {"certificates": [[1]]},
+        {"certificates": "none"},
+        {"certificates": [], "origin": "kind=usb\nname=x\n"},
+        {"certificates": [], "origin": 1},
+    ],
+)
+def test_certificates_and_origin_of_another_form_are_no_evidence(
+    station: Station, board: Board, document: bytes, change: dict[str, Any]
+) -> None:
+    key = station.credentials(board.uuid).key
+    changed = signed_anew(document, key, lambda statement: statement["predicate"]["facts"].update(change))
+    with pytest.raises(BadDataError):
+        codec.read(changed)

@@ -37,6 +37,7 @@ from teds_provision.protocol.keys import (
 )
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
+from teds_provision.teds.origin import ORIGIN, origin_from_text
 
 PAYLOAD_TYPE: Final = "application/vnd.in-toto+json"
 STATEMENT_TYPE: Final = "https://in-toto.io/Statement/v1"
@@ -50,6 +51,7 @@ GOOD_RESULTS: Final = frozenset({"ok", "done", "nothing to do", "skipped"})
 
 _MAX_SEPARATORS: Final = 40_000
 _MAX_STEPS: Final = 64
+LAST_CHANNEL: Final = 255
 _DEPTH: Final = 4
 _spelled: Final = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), ensure_ascii=False, check_circular=False
@@ -65,7 +67,9 @@ class BoardFacts:
 
     ``epoch``, ``sequence`` and ``blocks`` (channel, access code, SHA-256) are those of the Security TEDS. ``job`` and
     ``unit`` are None outside a job, ``heads`` (first 16 digits, number of chains) if no registry was joined. ``steps``:
-    name, result, milliseconds. Times are ``2026-01-31T12:00:00Z``.
+    name, result, milliseconds. Times are ``2026-01-31T12:00:00Z``. ``certificates`` are channel and SHA-256 of the
+    calibration certificates that the datasheet names, ``origin`` is the text of its Origin TEDS; evidence of older
+    versions has neither, and ``certificates`` is None.
     """
 
     station: str
@@ -83,9 +87,18 @@ class BoardFacts:
     tool: str
     begun: str
     heads: tuple[str, int] | None = None
+    certificates: tuple[tuple[int, str], ...] | None = None
+    origin: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Member ``facts`` of the predicate."""
+        found = self._all_json()
+        if self.certificates is None:
+            del found["certificates"], found["origin"]
+            return found
+        return {**found, "certificates": [list(certificate) for certificate in self.certificates]}
+
+    def _all_json(self) -> dict[str, Any]:
         lists = {"blocks": [list(block) for block in self.blocks], "steps": [list(step) for step in self.steps]}
         return {**vars(self), **lists, "heads": None if self.heads is None else list(self.heads)}
 
@@ -342,6 +355,8 @@ def _wrong_datasheet(checked: CheckedEvidence, signatures: Signatures, ca: bytes
         yield "sequence or epoch of the facts are not those of the Security TEDS"
     if blocks_of(shown) != facts.blocks:
         yield "the blocks of the facts are not those of the Security TEDS (field 108)"
+    if facts.origin is not None and not _is_listed(facts.origin, shown):
+        yield "the origin of the facts is not that of the Origin TEDS (130)"
     if evidence.verdict != PASSED:
         return
     if not shown.signed:
@@ -351,6 +366,11 @@ def _wrong_datasheet(checked: CheckedEvidence, signatures: Signatures, ca: bytes
         yield "the station that signed the datasheet is not certified by this CA (field 104)"
     if not signatures.datasheet:
         yield "field 100 does not verify: the datasheet was changed"
+
+
+def _is_listed(origin: str, shown: SecurityTeds) -> bool:
+    """True if field 108 lists the TEDS that holds this origin."""
+    return shown.signed_blocks.get(ORIGIN) == hashlib.sha256(origin_from_text(origin).encode()).digest()
 
 
 def _wrong_signatures(evidence: Evidence, signatures: Signatures, ca: bytes) -> Iterator[str]:
@@ -403,7 +423,31 @@ def _facts(members: Members, raw: dict[str, Any]) -> BoardFacts:
         tool=members.text("tool"),
         begun=_time(members, "begun"),
         heads=None if heads is None else _heads(heads),
+        certificates=_certificates(members),
+        origin=_origin(members),
     )
+
+
+def _certificates(members: Members) -> tuple[tuple[int, str], ...] | None:
+    if members.get("certificates") is None:
+        return None
+    found = members.list_of("certificates")
+    for entry in found:
+        match entry:
+            case [int(channel), str(digest)] if 0 <= channel <= LAST_CHANNEL and _DIGEST.fullmatch(digest):
+                continue
+        raise BadDataError("A certificate of the facts is not a channel and its SHA-256.")
+    return tuple((channel, digest) for channel, digest in found)
+
+
+def _origin(members: Members) -> str | None:
+    origin = members.get("origin")
+    if origin is None:
+        return None
+    if not isinstance(origin, str):
+        raise BadDataError("The origin of the facts is not a text.")
+    origin_from_text(origin)
+    return origin
 
 
 def _require_plain(value: object, depth: int = _DEPTH) -> None:

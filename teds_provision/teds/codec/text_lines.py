@@ -25,13 +25,18 @@ def compose_lines(access_code: int, values: Mapping[str, str]) -> bytes:
             raise BadDataError(
                 f"{key} cannot stand in a TEDS of lines: {value[:40]!r} is not one line of printable text."
             )
-    text = "".join(f"{key}={value}\n" for key, value in values.items()).encode()
+    text = lines_of(values).encode()
     if len(text) > MOST_OCTETS:
         raise BadDataError(
             f"The lines of a TEDS have at most {MOST_OCTETS} octets, these have {len(text)}.",
             hint="Shorten the longest of them.",
         )
     return frame(raw_tuple(TEDSID, _tedsid(access_code)) + raw_tuple(LINES, text))
+
+
+def lines_of(values: Mapping[str, str]) -> str:
+    """Return a ``key=value`` line for each value, each ended by LF."""
+    return "".join(f"{key}={value}\n" for key, value in values.items())
 
 
 def read_lines(access_code: int, teds: bytes, *orders: Sequence[str]) -> dict[str, str]:
@@ -43,6 +48,11 @@ def read_lines(access_code: int, teds: bytes, *orders: Sequence[str]) -> dict[st
         text = parts[1].value.decode()
     except UnicodeDecodeError as error:
         raise BadDataError(f"The lines of the TEDS of access code {access_code} are not UTF-8.") from error
+    return values_of(access_code, text, *orders)
+
+
+def values_of(access_code: int, text: str, *orders: Sequence[str]) -> dict[str, str]:
+    """Return the values of the lines of a TEDS; raises BadDataError as :func:`read_lines` does."""
     *lines, rest = text.split("\n")
     pairs = [line.partition("=") for line in lines]
     keys = [key for key, equals, _ in pairs if equals]
