@@ -172,7 +172,6 @@ coverage: $(VENV)/.dev
 
 # Pages of every public name, from the docstrings.
 api: $(VENV)/.dev
-	@$(BIN)/python -c 'import pdoc' 2>/dev/null || $(BIN)/python -m pip install --quiet --editable '.[api]'
 	$(BIN)/python scripts/api.py build/api
 
 # The suite on another Python, in an environment of its own: make test-other PYTHON=python3.13
@@ -278,7 +277,6 @@ dist: .venv-release/.ready
 # page without an entrance is an error; the gate builds the same.
 docs: $(VENV)/.dev
 	$(BIN)/python -m mkdocs build --strict --quiet
-	@$(BIN)/python -c 'import pdoc' 2>/dev/null || $(BIN)/python -m pip install --quiet --editable '.[api]'
 	$(BIN)/python scripts/api.py build/site/python
 
 # Before a release: the gate, and what proves the same at greater length.
