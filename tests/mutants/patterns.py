@@ -240,6 +240,27 @@ PATTERNS = (
     ),
     # the plant
     Pattern(
+        "another holder's turn is waited for",
+        "NodeKeys.rotates_now",
+        "why is None or not why.startswith(_FROM)",
+        "True",
+        "tests/plant/test_leaving.py",
+    ),
+    Pattern(
+        "a key that no removed station had ends the mark",
+        "_activate",
+        "station.keys.end_removal_mark(record)",
+        "None",
+        "tests/plant/test_leaving.py",
+    ),
+    Pattern(
+        "a parcel of a removed station raises no alarm",
+        "_Reader._junk",
+        "self._is_from_removed(parcel)",
+        "False",
+        "tests/plant/test_parcels.py",
+    ),
+    Pattern(
         "evidence names the epoch of its datasheet",
         "_wrong_datasheet",
         "(shown.sequence, shown.key_epoch) != (facts.sequence, facts.epoch)",
