@@ -14,8 +14,8 @@ from tests.firmware import builds
 pytestmark = pytest.mark.system
 
 PUBLIC = ("teds/version.h", "teds/config.h", "teds/port.h", "teds/node_state.h", "teds/node.h", "teds_bearssl.h")
-PUBLIC += ("teds_psa.h", "teds_zephyr.h")
-FOLDERS = ("include", "port/bearssl", "port/psa", "port/zephyr")
+PUBLIC += ("teds_psa.h", "teds_zephyr.h", "teds_esp32.h")
+FOLDERS = ("include", "port/bearssl", "port/psa", "port/zephyr", "port/esp32")
 NUMBERS = re.compile(r"#define TEDS_VERSION_(?:MAJOR|MINOR|PATCH) (\d+)")
 
 
@@ -98,7 +98,7 @@ def test_every_public_symbol_is_documented() -> None:
 def test_every_file_names_its_licence() -> None:
     files = [path for path in builds.FIRMWARE.rglob("*") if path.is_file() and "build" not in path.parts]
     files += (builds.ROOT / "tests/firmware/c").glob("*.[ch]")
-    files = [path for path in files if path.suffix not in (".md", ".json")]
+    files = [path for path in files if path.suffix not in (".md", ".json", ".properties")]
     assert len(files) > 80
     for path in files:
         assert "SPDX-License-Identifier: Apache-2.0" in path.read_text(encoding="utf-8")[:200], path
