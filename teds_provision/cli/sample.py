@@ -120,6 +120,7 @@ def _samples(console: Console, samples: Sequence[Sample]) -> None:
         }
         sure = told["uncertainty"]
         value = _text(sample, tidy(told["value"], sure)) if told["value"] is not None else f"not valid: {sample.why}"
+        value = f"{value} ({shown(sample.text)})" if sample.text else value
         uncertainty = f"{sure:.3g}" if sure is not None else ""
         name = escape(shown(sample.name))
         table.add_row(str(sample.channel), name, escape(value), uncertainty, escape(told["unit"]), str(sample.raw))

@@ -16,7 +16,7 @@ from teds_provision.measure.sinks.lines import plain
 from teds_provision.measure.verified_session import VerifiedSession, claim, exchange_clock
 from teds_provision.protocol.operation.commands import MOST_SAMPLE_CHANNELS, SampleReply, idle, sample
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
-from teds_provision.teds.sheet import Sheet
+from teds_provision.teds.sheet import Channel, Sheet
 from teds_provision.teds.units import WrittenUnit
 
 LEASE = 5
@@ -27,7 +27,8 @@ ROOM = 180  # octets of data sets in one reply, so that it fits any node's maxMe
 class Sample:
     """One value; ``value`` and ``uncertainty`` in ``unit`` (SI), None if not valid or not stated.
 
-    ``shown`` is the display unit, ``turn`` the beginning (in SI units) of the turn that an angle stays within.
+    ``shown`` is the display unit, ``turn`` the beginning (in SI units) of the turn that an angle stays within; ``text``
+    is that of the value table for this raw number.
     """
 
     channel: int
@@ -41,13 +42,19 @@ class Sample:
     why: str = ""
     shown: WrittenUnit | None = None
     turn: float | None = None
+    text: str = ""
 
     def as_json(self) -> dict[str, Any]:
         """As `sample --json` has it."""
         told = {key: getattr(self, key) for key in ("channel", "name", "value", "unit", "raw", "uncertainty", "valid")}
         if self.shown is not None:
             told["shown"] = shown_json(self.value, self.uncertainty, self.shown)
-        return {**told, "time": self.time, **({"why": self.why} if self.why else {})}
+        return {
+            **told,
+            "time": self.time,
+            **({"text": self.text} if self.text else {}),
+            **({"why": self.why} if self.why else {}),
+        }
 
 
 def shown_json(value: float | None, uncertainty: float | None, unit: WrittenUnit) -> dict[str, Any]:
@@ -116,6 +123,12 @@ def _missing(interpreter: ChannelInterpreter, raws: dict[int, np.ndarray]) -> st
     return f"channel {missing[0]}, which compensates it, is missing" if missing else ""
 
 
+def _state(channel: Channel, raw: np.ndarray) -> str:
+    """Return the text of a raw number in the channel's value table, "" if it has none."""
+    number = raw.tolist()[0]
+    return channel.value_table.get(number, "") if isinstance(number, int) else ""
+
+
 def _sample(
     interpreter: ChannelInterpreter, raws: dict[int, np.ndarray], good: dict[int, bool], stamp: float
 ) -> Sample:
@@ -144,5 +157,6 @@ def _sample(
         time=stamp,
         why=why,
         shown=channel.shown,
+        text=_state(channel, raws[channel.number]) if valid else "",
         turn=channel.low if channel.full_turn else None,
     )

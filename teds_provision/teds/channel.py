@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from enum import IntEnum
 from functools import cached_property
@@ -117,7 +117,8 @@ class Channel:
     ``units`` are the exponents of PhyUnits, ``unit`` the unit in which its values are computed, ``shown`` the display
     unit: ``display`` if a profile names one, else ``unit``. ``kind`` is None for a ChanType that is not known, ``halt``
     is ActHalt (field 36). ``described`` is False if there is no TransducerChannel TEDS. ``calibration`` is None if
-    there is none or none that can be computed; ``calibration_problem`` is then the reason.
+    there is none or none that can be computed; ``calibration_problem`` is then the reason. ``value_table`` holds
+    the texts of raw numbers that stand for states.
     """
 
     number: int
@@ -137,6 +138,7 @@ class Channel:
     calibration: Calibration | None = None
     calibration_problem: str = ""
     display: str = ""
+    value_table: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def actuator(self) -> bool:

@@ -32,6 +32,7 @@ from teds_provision.teds.codec.model import AccessCode, Conformity, DecodedTeds,
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.origin import Origin, origin_of
+from teds_provision.teds.value_table import read_value_table
 
 __all__ = [
     "NOT_STATED",
@@ -175,6 +176,8 @@ class _Reader:
 
     def channel(self, number: int) -> Channel:
         own = read_channel(number, self.name(number), self.decoded(number, AccessCode.CHANNEL))
+        table = read_value_table(self.decoded(number, AccessCode.CHANNEL_ID))
+        own = replace(own, value_table=table) if table else own
         teds = self.decoded(number, AccessCode.CALIBRATION)
         if teds is None:
             return own

@@ -146,6 +146,8 @@ def test_the_other_node_of_the_process_reads_its_own_message(bench: WrappedBench
 def test_a_sensor_that_is_silent_or_out_of_range_gives_no_value_and_says_why(bench: WrappedBench) -> None:
     bench.player.play((TORQUE, "214e701741010000"))  # 200.01 N·m
     until(lambda: "200.01 N·m is outside -200 to 200 N·m" in bench.reasons(bench.sample("torque")))
+    sampled = bench.ask("sample", "torque", "--via", "can")["samples"]
+    assert sampled[3]["text"] == "measuring"  # of the value table
     values = bench.sample("torque")
     assert (values[1], values[3]) == (None, pytest.approx(298.15))
     bench.player.play()

@@ -133,6 +133,8 @@ def test_the_example_has_units_ranges_tables_and_a_calibration_that_the_guard_li
     assert [finding for finding in check_calibration(blocks) if finding.severity == "error"] == []
     assert b'<Value raw="2">overload</Value>' in blocks[4, 4]
     assert b"clockwise is positive" in blocks[1, 4]
+    assert sheet.channels[3].value_table == {0: "starting", 1: "measuring", 2: "overload", 3: "fault"}
+    assert sheet.channels[0].value_table == {}
     origin = origin_of(blocks)
     assert origin is not None
     assert (origin.kind, origin.name, origin.text) == ("dbc", "Torque", "CAN message Torque (dbc)")

@@ -15,6 +15,7 @@ from teds_provision.teds.codec.text_lines import MOST_OCTETS, compose_lines, rea
 from teds_provision.teds.formats import TedsBlock
 from teds_provision.teds.origin import ORIGIN, Origin, origin_of, read_origin
 from teds_provision.teds.show import describe
+from teds_provision.teds.value_table import read_value_table, signal_xml
 
 DIGEST = "5a" * 32
 TORQUE = Origin("dbc", "Torque", DIGEST)
@@ -111,3 +112,18 @@ def test_the_other_edition_has_the_same_form() -> None:
     octets, findings = teds.convert(teds.decode(TORQUE.encode()), 2024)
     assert octets == TORQUE.encode()
     assert [finding.code for finding in findings] == ["one-form"]
+
+
+@given(st.dictionaries(st.integers(0, 10**6), NAMES, max_size=10), st.text(max_size=50), NAMES)
+def test_a_value_table_is_read_back_from_its_teds(rows: dict[int, str], comment: str, name: str) -> None:
+    text = signal_xml(name, comment, rows)
+    octets = teds.compose(4, (("Text", {"LangCode": "en", "Text": text or "-"}),))
+    assert read_value_table(teds.decode(octets)) == rows
+
+
+@given(st.binary(max_size=200))
+def test_a_stranger_s_text_is_no_value_table_and_no_error(octets: bytes) -> None:
+    for content in (octets, b'<Signal name="x">' + octets):
+        made = teds.compose(4, (("Text", {"LangCode": "en", "Text": content.decode("latin-1")}),))
+        assert all(word.isprintable() for word in read_value_table(teds.decode(made)).values())
+    assert read_value_table(None) == {}

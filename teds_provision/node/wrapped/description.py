@@ -14,7 +14,6 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
-from xml.sax.saxutils import escape, quoteattr
 
 from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput
@@ -22,6 +21,7 @@ from teds_provision.teds.image import SECURITY, BlockId
 from teds_provision.teds.origin import ORIGIN, Origin
 from teds_provision.teds.profile.load import parse_profile
 from teds_provision.teds.units import WrittenUnit, parse_unit
+from teds_provision.teds.value_table import signal_xml
 
 DEFAULT_PERIOD: Final = 0.1
 """Seconds between frames if the file states none; a note says so."""
@@ -33,8 +33,6 @@ _EXACT_BITS: Final = 24
 _MOST_BITS: Final = 64
 _LARGEST: Final = 1e30
 """Limit of a float that states none: its limits in SI units still fit a Float32."""
-_MOST_TABLE: Final = 64
-"""Rows of a value table that are put into the datasheet."""
 _NAME_OCTETS: Final = 120
 
 _ALIASES: Final[Mapping[str, str]] = {
@@ -349,12 +347,9 @@ def _channel_lines(number: int, channel: WrappedChannel) -> list[str]:
 
 def _text_of(channel: WrappedChannel) -> str:
     """Return comment and value table as the XML of a Channel Identification TEDS; "" if there is neither."""
-    rows = sorted(channel.choices.items())[:_MOST_TABLE]
-    values = "".join(f'<Value raw="{raw}">{escape(text)}</Value>' for raw, text in rows)
-    if not channel.comment and not values:
-        return ""
-    comment = f" comment={quoteattr(channel.comment[:200])}" if channel.comment else ""
-    return f"<Signal name={quoteattr(channel.name)}{comment}>{values}</Signal>"
+    form = channel.sample
+    rows = {raw + form.shift: text for raw, text in channel.choices.items()} if form.raw else {}
+    return signal_xml(channel.name, channel.comment, {raw: text for raw, text in rows.items() if raw >= 0})
 
 
 def _cut(name: str) -> str:
