@@ -431,8 +431,7 @@ def _moved(probe: Probe, home: int, target: int) -> StationSession:
         probe.move(target)
         slip = Slip(
             "address-before-reply",
-            "the node takes its new address before the reply has left, and no longer hears the flow control that the"
-            " reply needs at the old one",
+            "the node takes its new address before the whole reply has left from the old one",
         )
         text = f"Set CAN address (128.10) {target}: the node is there now, and its reply never came from {home}."
         raise RuleBrokenError(text, slip) from None
