@@ -113,6 +113,7 @@ def _emit_change(
         if output is not None:
             write_new(output, signed.octets + b"\n", mode=SHARED)
         plant.apply_pages.put_roster(station, signed)
+    plant.removed_members.review(station, signed, plant.status.moment(signed))  # marks the keys that a removed one had
     app.emit(
         _to_json(signed), f"Roster {signed.version} is in force here. To tell the others: teds-provision registry sync"
     )
@@ -363,6 +364,7 @@ def sign(app: App, file: Path, output: Path, yes: bool, dry_run: bool) -> None:
     if same:
         with station.lock("registry sign", app.note):
             plant.apply_pages.take_rosters(station, [signed.octets])
+        plant.removed_members.review(station, signed, plant.status.moment(signed))
     app.emit(
         _to_json(signed),
         f"Signed: {output}. To distribute it: registry sync --files DIR, or connect --roster {quote(output.name)}",

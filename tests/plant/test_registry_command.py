@@ -14,11 +14,12 @@ from typing import Any
 import pytest
 
 from teds_provision import plant
-from teds_provision.store import Store
+from teds_provision.station.station import Station
+from teds_provision.store import Holder, Store
 from teds_provision.store.tables.plant import PageRow
 from tests.bench import PASSPHRASE
 from tests.cli.shell import Outcome, call, spawn
-from tests.plant.stations import certified, owner
+from tests.plant.stations import ask, certified, owner
 
 UUID = "8d4d9da65281f7000000"
 KEY = "ab" * 32
@@ -126,6 +127,16 @@ def test_three_stations_join_and_see_the_same(desk: Desk) -> None:
     assert "here" in shown.out
 
 
+def holds_what_west_had(desk: Desk) -> None:
+    """North has a link key that it gave to west."""
+    station = Station.open(desk.folder / "north", ask=ask)
+    station.keys.add_pending(bytes.fromhex(UUID), key=bytes(16), key_id=bytes(8), epoch=1)
+    west = station.plant.roster.named("west")  # type: ignore[union-attr]
+    assert west is not None
+    station.keys.put_holder(Holder(bytes.fromhex(UUID), west.fingerprint))
+    station.close()
+
+
 def test_a_removed_station_is_told_so_and_the_others_go_on(desk: Desk) -> None:
     joined(desk)
     desk.ask("west", "whitelist", "add", UUID, "--fingerprint", KEY)
@@ -133,7 +144,9 @@ def test_a_removed_station_is_told_so_and_the_others_go_on(desk: Desk) -> None:
     refused = desk.run("north", "registry", "remove", "west", "--stolen", "--yes")
     assert refused.code == 2
     assert "--last" in refused.err
+    holds_what_west_had(desk)
     desk.ask("north", "registry", "remove", "west", "--stolen", "--last", 1, "--yes")
+    assert desk.ask("north", "registry", "status")["to_rotate"] == 1, "at once, before any sync"
     desk.sync("north")
     told = desk.ask("west", "registry", "sync", "--files", desk.stick, code=6)
     assert told["error"]["code"] == "not-member"  # type: ignore[index]
