@@ -17,7 +17,15 @@ from teds_provision import measure as measure_room
 from teds_provision import talk, teds
 from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import ChannelNumber, FileToRead, Number, WholeNumber, command, link_options
+from teds_provision.cli.options import (
+    ChannelNumber,
+    FileToRead,
+    Number,
+    WholeNumber,
+    command,
+    file_units_option,
+    link_options,
+)
 from teds_provision.cli.sample import ending, over_the_bus, where_met
 from teds_provision.errors import BadDataError, UsageError
 from teds_provision.lazy import late
@@ -27,6 +35,7 @@ from teds_provision.store.records import COMMAND
 
 if TYPE_CHECKING:
     from teds_provision.cli import measure_view
+    from teds_provision.measure.display_units import FileUnits
     from teds_provision.measure.request import Requirements
     from teds_provision.measure.runner import MeasurementEnd
     from teds_provision.measure.running.measurement_job import MeasurementJob
@@ -66,6 +75,7 @@ KINDS = ("periodic", "event", "free")
     is_flag=True,
     help="Write .csv and .txt as one table: a row per time, a column per channel, no raw values.",
 )
+@file_units_option
 @click.option("--output", type=click.Path(path_type=Path), metavar="FILE", help="With recover: the new file.")
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
@@ -88,6 +98,7 @@ def measure(
     duration: float | None,
     files: Sequence[str],
     wide: bool,
+    file_units: FileUnits,
     mqtt: str | None,
     require: Path | None,
     output: Path | None,
@@ -105,6 +116,7 @@ def measure(
         raise UsageError("--output only works with `measure recover`.", hint="To record, use --to FILE.")
     if wide:
         files = _wide(files)
+    files = [measure_room.sinks.in_units(name, file_units) for name in files]
     links = over_the_bus(links, streams=True)
     if mqtt is not None and not mqtt.startswith(("mqtt://", "mqtts://")):
         raise UsageError(f"--mqtt {mqtt!r} is not a broker URL.", hint="Use mqtt://HOST or mqtts://USER@HOST.")
@@ -121,7 +133,7 @@ def measure(
     )
     for uuid in uuids:
         station.unlock(uuid)
-    _tell_end(app, _run(app, job, links, uuids, duration), job.request.require)
+    _tell_end(app, _run(app, job, links, uuids, duration), job.request.require, file_units)
 
 
 def _require_streams(links: LinkSettings, *, trigger: bool) -> None:
@@ -226,8 +238,10 @@ def _run(
     return ended
 
 
-def _tell_end(app: App, ended: MeasurementEnd, require: Requirements | None) -> None:
+def _tell_end(app: App, ended: MeasurementEnd, require: Requirements | None, file_units: FileUnits) -> None:
     result: dict[str, Any] = {"event": "end", "nodes": ended.nodes, "files": ended.files, "sinks": ended.sinks}
+    if ended.files:
+        result["unit"] = file_units
     if require is not None:
         result["fits"] = require.fits
     if ended.apart:

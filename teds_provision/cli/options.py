@@ -106,6 +106,19 @@ class CalibrationFile(FileToRead):
         return channel, super().convert(value if channel is None else file, param, ctx)
 
 
+def file_units_option(function: Function) -> Function:
+    """Add --unit, which config.toml calls file-units: ``file_units``."""
+    return click.option(
+        "--file-units",
+        "--unit",
+        "file_units",
+        type=click.Choice(["si", "shown"]),
+        default="si",
+        show_default=True,
+        help="Units of values in files: SI, or as they are shown to people; .mcap is always in SI.",
+    )(function)
+
+
 class Day(click.ParamType[datetime]):
     """A day like 2027-10-31, as its first moment in UTC."""
 

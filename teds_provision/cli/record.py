@@ -13,12 +13,20 @@ import click
 
 from teds_provision import measure as measure_room
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import COMMAND_SETTINGS, ChannelNumber, FileToRead, WholeNumber, examples
+from teds_provision.cli.options import (
+    COMMAND_SETTINGS,
+    ChannelNumber,
+    FileToRead,
+    WholeNumber,
+    examples,
+    file_units_option,
+)
 from teds_provision.lazy import late
 
 if TYPE_CHECKING:
     from teds_provision.cli import measure_view, rendering
     from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
+    from teds_provision.measure.display_units import FileUnits
     from teds_provision.measure.recordings.source import Recording
     from teds_provision.measure.recordings.summary import RecordingSummary
 else:
@@ -177,19 +185,21 @@ def _value(value: float, known: ChannelFacts) -> str:
         "teds-provision record convert run.mcap run.csv",
         "teds-provision record convert run.mcap run.csv --wide",
         "teds-provision record convert run.csv run.parquet",
+        "teds-provision record convert run.mcap run.csv --unit shown",
     ),
 )
 @click.argument("source", type=FileToRead(), metavar="FROM")
 @click.argument("target", type=click.Path(path_type=Path), metavar="TO")
 @click.option("--wide", is_flag=True, help="Write one table: a row per time, a column per channel, no raw values.")
+@file_units_option
 @pass_app
-def convert(app: App, source: Path, target: Path, wide: bool) -> None:
+def convert(app: App, source: Path, target: Path, wide: bool, file_units: FileUnits) -> None:
     """Write the recording FROM in the format of TO: .csv, .txt, .mcap, .jsonl, or .parquet (needs pyarrow).
 
     TO appears when it is complete; nothing is overwritten. If datasheets changed midway, CSV and Parquet are split into
     several files (TO, then TO.2 and so on).
     """
-    done = measure_room.recordings.converting.convert(source, target, wide=wide)
+    done = measure_room.recordings.converting.convert(source, target, wide=wide, units=file_units)
     result = done.summary.to_json(done.recording)
     what = f"ends at {result['until']}" if result["until"] is not None else "holds no values"
     if result["being_written"]:
@@ -198,6 +208,6 @@ def convert(app: App, source: Path, target: Path, wide: bool) -> None:
         app.warn(f"{source} was cut off: the result {what}.")
     files = [str(path) for path in done.files]
     app.emit(
-        {"files": files, **result},
+        {"files": files, "unit": "si" if target.suffix.lower() == ".mcap" else file_units, **result},
         f"{', '.join(files)}: {result['samples']} values at {result['messages']} time stamps",
     )

@@ -59,6 +59,9 @@ class ChannelFacts:
     own_period: float | None = None  # seconds between samples as the datasheet has it (SPeriod)
     frame: str = ""  # coordinate frame of its values; {node} in it is replaced by the node's part of its topics
     calibration: Calibration | None = None
+    si_unit: str = ""  # SI unit, in a file whose values are in `unit`, the display unit; empty if `unit` is SI
+    si_factor: float | None = None  # SI = number × factor + offset
+    si_offset: float | None = None
     wrapped: str = ""  # sensor that the node wraps: its proof ends at the wrapper; empty for every other node
     vector: tuple[int, ...] = ()  # channels of the vector group that it is in, axis by axis; empty where in none
 

@@ -63,6 +63,7 @@ class Daemon:
             settings.record,
             actuators=settings.actuators,
             brokers=settings.brokers,
+            units=settings.file_units,
         )
         self.measurements = MeasurementSupervisor(
             station,

@@ -16,6 +16,7 @@ from teds_provision.links import Trace
 from teds_provision.links.ble import spec as ble
 from teds_provision.links.can import spec as can
 from teds_provision.links.can.bus import require_known
+from teds_provision.measure.display_units import FileUnits
 from teds_provision.measure.verified_session import DEAD_MAN
 
 Detection = Literal["transparent", "whitelist"]
@@ -44,6 +45,7 @@ class Settings:
     detection: Detection | None = None
     adopt: bool = False
     trust_dcc: tuple[Path, ...] = ()
+    file_units: FileUnits = "si"
     yes: bool = False
     unverified: bool = False
     http: tuple[str, int] | None = None

@@ -15,7 +15,8 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 from teds_provision.errors import UsageError
-from teds_provision.measure.sinks import FILES, CommandTaker, Sink, open_sink
+from teds_provision.measure.display_units import FileUnits
+from teds_provision.measure.sinks import FILES, CommandTaker, Sink, in_units, open_sink
 from teds_provision.store import KeptMeasurement
 
 RECORDINGS: Final = "recordings"
@@ -32,8 +33,8 @@ _FOLDERS: Final = re.compile(r"(?<![^\s'\"(=:])/(?!api/v1/)(?:[^/\s'\"]+/)+")
 class DaemonSinks:
     """``specs`` are the words of the sinks that take every measurement, ``record`` a folder for recordings of each.
 
-    ``brokers``: URLs by the names that config.toml gives them. ``actuators``: whether set points may come by the topics
-    of any of the sinks. Raises UsageError for a name or URL that is none.
+    ``units`` are those of values in files. ``brokers``: URLs by the names that config.toml gives them. ``actuators``:
+    whether set points may come by the topics of any of the sinks. Raises UsageError for a name or URL that is none.
     """
 
     def __init__(
@@ -44,7 +45,9 @@ class DaemonSinks:
         *,
         actuators: bool,
         brokers: Mapping[str, str] | None = None,
+        units: FileUnits = "si",
     ) -> None:
+        self._units: FileUnits = units
         self._home, self._specs, self.actuators = home, tuple(specs), actuators
         self._record = record.absolute() if record is not None else None
         for spec in self._specs:
@@ -77,7 +80,7 @@ class DaemonSinks:
                 f"Broker {spec!r} is no longer configured.",
                 hint=f'Name it in config.toml: [ncap.brokers], {spec} = "mqtts://HOST".',
             )
-        return open_sink(self._brokers.get(spec, spec), take)
+        return open_sink(in_units(self._brokers.get(spec, spec), self._units), take)
 
     def more(self, kept: KeptMeasurement, take: CommandTaker | None) -> list[Sink]:
         """Return the daemon's own sinks for one run of a measurement, without those that it names itself.
@@ -90,7 +93,7 @@ class DaemonSinks:
             stamp = time.strftime("%Y%m%d-%H%M%S")
             name = re.sub(r"[^A-Za-z0-9_-]+", "_", kept.group or kept.id)[:60] or "measurement"
             specs.append(str(self._folder() / f"{name}-{stamp}.csv"))
-        return [open_sink(spec, take) for spec in specs]
+        return [open_sink(in_units(spec, self._units), take) for spec in specs]
 
     def moves(self, kept: KeptMeasurement) -> bool:
         """Return True if set points may come for this measurement: it and the daemon allow it, with a ROS sink."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 from pathlib import Path
 
 import pytest
@@ -31,12 +30,14 @@ def test_a_zero_offset_of_90_degrees_loses_no_angle(tmp_path: Path, monkeypatch:
     try:
         hall.nodes["a"].start()  # a ramp over the whole turn every 2 s
         run = tmp_path / "run.csv"
-        end = hall.measure("a", "--rate", 100, "--duration", 2.5, "--to", run)[-1]
+        end = hall.measure("a", "--rate", 100, "--duration", 2.5, "--to", run, "--unit", "shown")[-1]
+        assert end["unit"] == "shown"
+        assert "angle [°]" in run.read_text()
         (stream,) = end["nodes"][0]["streams"]
         assert (stream["invalid"], stream["invalid_why"]) == (0, [])
         values = [float(text) for text in values_of(run)]
         assert len(values) == stream["samples"] > 200
-        sixteenth = math.tau / 16  # 125 ms of the ramp: a machine that is held up for less leaves none out
+        sixteenth = 360 / 16  # 125 ms of the ramp: a machine that is held up for less leaves none out
         assert {int(value / sixteenth) for value in values} == set(range(16))
         assert "invalid 0" in run.read_text().splitlines()[-1]
         (sampled,) = hall.ask("sample", "a")["samples"]

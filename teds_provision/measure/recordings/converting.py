@@ -22,14 +22,16 @@ import numpy as np
 from teds_provision.errors import UsageError
 from teds_provision.files import require_new, sync_folder
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
+from teds_provision.measure.display_units import FileUnits, UnitConversion
 from teds_provision.measure.grid import Grid
 from teds_provision.measure.recordings.columns import part_of
 from teds_provision.measure.recordings.opening import open_recording
 from teds_provision.measure.recordings.parquet import ParquetWriter
 from teds_provision.measure.recordings.source import Entry, Recording
 from teds_provision.measure.recordings.summary import RecordingSummary
-from teds_provision.measure.sinks import FILES, TEXT, as_sink_failure
+from teds_provision.measure.sinks import FILES, SHOWN_FILES, TEXT, as_sink_failure
 from teds_provision.measure.sinks.files import FileSink
+from teds_provision.measure.sinks.shown import ShownWideSink
 from teds_provision.measure.sinks.wide import WideSink
 from teds_provision.portable import CLOSING, NOFOLLOW, OPENS_FOLDERS, is_mine, lock
 
@@ -47,8 +49,10 @@ class ConversionResult:
     summary: RecordingSummary
 
 
-def convert(source: Path, target: Path, *, wide: bool = False) -> ConversionResult:
+def convert(source: Path, target: Path, *, wide: bool = False, units: FileUnits = "si") -> ConversionResult:
     """Write a recording in the format of ``target``'s suffix. ``wide``: as rows of one grid (text and Parquet).
+
+    ``units``: values in SI or as they are shown to people; MCAP is always in SI.
 
     Of a recording that is still being written, or was cut off, what is whole by now is taken. Raises UsageError
     (``target`` exists, no such format), NotFoundError, BadDataError, StoreError (disk).
@@ -73,9 +77,11 @@ def convert(source: Path, target: Path, *, wide: bool = False) -> ConversionResu
             if wide and not recording.wide:
                 entries = _gridded(entries, recording)
             if suffix == PARQUET:
-                made = _as_parquet(folder / target.name, entries, recording, wide=wide)
+                made = _as_parquet(folder / target.name, entries, recording, wide=wide, units=units)
             else:
-                sink = WideSink(folder / target.name) if wide else FILES[suffix](folder / target.name)
+                kinds = SHOWN_FILES if units == "shown" and suffix in SHOWN_FILES else FILES
+                rows = ShownWideSink if kinds is SHOWN_FILES else WideSink
+                sink = rows(folder / target.name) if wide else kinds[suffix](folder / target.name)
                 assert isinstance(sink, FileSink)
                 made = sink.copy(entries, tuple(recording.facts.values()), recording.station)
             files = tuple(_published(path, target.parent) for path in made)
@@ -85,9 +91,15 @@ def convert(source: Path, target: Path, *, wide: bool = False) -> ConversionResu
     return ConversionResult(recording, files, summary)
 
 
-def _as_parquet(path: Path, entries: Iterator[Entry], recording: Recording, *, wide: bool) -> list[Path]:
+def _as_parquet(
+    path: Path, entries: Iterator[Entry], recording: Recording, *, wide: bool, units: FileUnits
+) -> list[Path]:
     """One file for each set of facts: with another datasheet the next one begins, as with CSV."""
     known = dict(recording.facts)
+    if units == "shown":
+        conversion = UnitConversion()
+        known = {facts.key: facts for facts in conversion.facts(known.values())}
+        entries = map(conversion.convert, entries)
     made = [path]
     writer = ParquetWriter(path, list(known.values()), recording.station, wide=wide)
     try:

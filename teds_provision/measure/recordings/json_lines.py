@@ -84,7 +84,7 @@ class JsonLines(Recording):
     def _channel(self, event: dict[str, Any]) -> Any:
         return facts_of({name: value for name, value in event.items() if name != "event"}, f"{self.path}:{self._line}")
 
-    def entries(self) -> Iterator[Entry]:
+    def _stored_entries(self) -> Iterator[Entry]:
         """See the class above."""
         joined, numbers = BlockJoiner(), dict[str, dict[tuple[int, ...], int]]()
         together: list[dict[str, Any]] = []  # lines of one block: a line for each channel

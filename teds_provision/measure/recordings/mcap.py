@@ -136,7 +136,7 @@ class McapRecording(Recording):
         except (ValueError, struct.error):
             raise self._bad("a metadata record is damaged") from None
 
-    def entries(self) -> Iterator[Entry]:
+    def _stored_entries(self) -> Iterator[Entry]:
         """See the class above."""
         schemas: dict[int, str] = {0: ""}
         topics: dict[int, _Topic] = {}

@@ -229,7 +229,7 @@ class ParquetRecording(Recording):
             raise self._bad("it is not a recording of this program")
         return words, log
 
-    def entries(self) -> Iterator[Entry]:
+    def _stored_entries(self) -> Iterator[Entry]:
         """See the class above."""
         yield tuple(self._known)
         width, streams = len(self._known), Streams()

@@ -16,6 +16,7 @@ from typing import Any, Final, get_args
 
 from teds_provision.errors import BadDataError
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, Kind, NodeReport, Note, StationFacts
+from teds_provision.measure.display_units import UnitConversion
 from teds_provision.portable import CLOSING, NONBLOCK, lock
 from teds_provision.teds import Units
 from teds_provision.teds.calibration.plain import calibration_from_json
@@ -62,20 +63,31 @@ class Recording(ABC):
         self.path = path
         self.station = StationFacts("")
         self.facts: dict[tuple[str, int], ChannelFacts] = {}
+        self._to_si = UnitConversion(back=True)
         self.torn = 0
         self.complete = True
         """True if the file has its end, in a format that has one."""
         self.being_written = is_locked(path)
 
-    @abstractmethod
     def entries(self) -> Iterator[Entry]:
-        """Yield all that is in it; each call starts from the beginning. Raises BadDataError, NotFoundError."""
+        """Yield all that is in it, in SI units; each call starts from the beginning.
+
+        Raises BadDataError, NotFoundError.
+        """
+        return map(self._to_si.convert, self._stored_entries())
+
+    @abstractmethod
+    def _stored_entries(self) -> Iterator[Entry]:
+        """Yield the entries in the units of the file."""
 
     def know(self, facts: ChannelFacts) -> None:
-        """Keep the first facts of a channel; raises BadDataError for more channels than are read."""
-        if facts.key not in self.facts and len(self.facts) >= MOST.channels:
+        """Keep the first facts of a channel, in SI units; raises BadDataError for more channels than are read."""
+        if facts.key in self.facts:
+            return
+        (facts,) = self._to_si.facts([facts])
+        if len(self.facts) >= MOST.channels:
             raise BadDataError(f"{self.path} names more than {MOST.channels} channels.")
-        self.facts.setdefault(facts.key, facts)
+        self.facts[facts.key] = facts
 
 
 def first_instants(entry: Entry, channels: Collection[int], most: float) -> Block | GroupRows | None:
@@ -137,9 +149,9 @@ def unix_of(text: object) -> float:
 
 _TEXTS = frozenset(
     {"uuid", "node", "name", "unit", "shown_unit", "calibrated", "due", "fingerprint", "sample_form", "quantity"}
-    | {"frame"}
+    | {"frame", "si_unit"}
 )
-_NUMBERS = frozenset({"low", "high", "uncertainty", "period", "deviation", "own_period"})
+_NUMBERS = frozenset({"low", "high", "uncertainty", "period", "deviation", "own_period", "si_factor", "si_offset"})
 _FLAGS = frozenset({"overdue", "unsigned", "unverified"})
 _FIELDS = frozenset(field.name for field in fields(ChannelFacts))
 

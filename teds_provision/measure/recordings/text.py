@@ -100,7 +100,7 @@ class TextRecording(Recording):
         self.station = station_of(words)
         return []  # it ends in its head: a recorder that was killed early
 
-    def entries(self) -> Iterator[Entry]:
+    def _stored_entries(self) -> Iterator[Entry]:
         """See the class above."""
         yield tuple(self._known)
         streams, waiting, headed = Streams(), list[str](), False

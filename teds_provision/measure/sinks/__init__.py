@@ -12,15 +12,17 @@ from typing import TYPE_CHECKING
 
 from teds_provision.errors import UsageError
 from teds_provision.lazy import lazy
+from teds_provision.measure.display_units import FileUnits
 from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, as_sink_failure
 from teds_provision.measure.sinks.mcap.recording import McapSink
 from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
 from teds_provision.measure.sinks.ros.sourced import ros2_sink
+from teds_provision.measure.sinks.shown import SHOWN, ShownJsonLinesSink, ShownTextSink, ShownWideSink
 from teds_provision.measure.sinks.text import JsonLinesSink, TextSink
 from teds_provision.measure.sinks.wide import WIDE, WideSink
 
-__all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "open_sink"]
+__all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "in_units", "open_sink"]
 
 if TYPE_CHECKING:
     from teds_provision.measure.sinks import lines, mcap
@@ -34,6 +36,12 @@ FILES: dict[str, Callable[[Path], Sink]] = {
     ".jsonl": JsonLinesSink,
     ".mcap": McapSink,
 }
+SHOWN_FILES: dict[str, Callable[[Path], Sink]] = {
+    ".csv": ShownTextSink,
+    ".txt": ShownTextSink,
+    ".jsonl": ShownJsonLinesSink,
+}
+"""Formats that can have display units; MCAP is always in SI."""
 SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {
     "ros1": Ros1Sink,
     "ros2": ros2_sink,
@@ -42,18 +50,28 @@ SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {
 }
 
 
+def in_units(spec: str, units: FileUnits) -> str:
+    """Return the string of a sink whose file has these units; of one that is always in SI unchanged."""
+    text = units == "shown" and spec.partition(":")[0] not in SERVICES and Path(spec).suffix.lower() in SHOWN_FILES
+    return f"{SHOWN}{spec}" if text and not spec.startswith(SHOWN) else spec
+
+
 def open_sink(spec: str, commands: CommandTaker | None = None) -> Sink:
     """Return the sink of a spec, not yet opened.
 
-    A file, ``wide:FILE``, ``ros1[:URL]``, ``ros2[:DOMAIN]`` or ``mqtt://HOST``. ``commands`` receives set points that
-    come by the sink; None if no actuator may be moved. Raises UsageError.
+    A file, ``wide:FILE``, either of them behind ``shown:`` for display units, ``ros1[:URL]``, ``ros2[:DOMAIN]`` or
+    ``mqtt://HOST``. ``commands`` receives set points that come by the sink; None if no actuator may be moved. Raises
+    UsageError.
     """
     service = spec.partition(":")[0]
     if service in SERVICES:
         return SERVICES[service](spec, commands)
+    shown, spec = spec.startswith(SHOWN), spec.removeprefix(SHOWN)
     if spec.startswith(WIDE) and Path(spec).suffix.lower() in TEXT:
-        return WideSink(Path(spec.removeprefix(WIDE)))
+        return (ShownWideSink if shown else WideSink)(Path(spec.removeprefix(WIDE)))
     path = Path(spec)
+    if shown and path.suffix.lower() in SHOWN_FILES:
+        return SHOWN_FILES[path.suffix.lower()](path)
     if path.suffix.lower() not in FILES:
         raise UsageError(
             f"Unsupported format: {spec!r}.",

@@ -16,14 +16,16 @@ from collections import Counter
 from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, why_invalid
+from teds_provision.measure.display_units import FileUnits
 from teds_provision.measure.sinks.base import Item
 from teds_provision.measure.sinks.files import FileSink
 from teds_provision.measure.sinks.lines import as_line, data_lines, facts_as_json, iso, status_line
 from teds_provision.sanitize import printable
 
+_UNITS: Final = {"si": "SI", "shown": "as shown to people; each channel states the way to SI"}
 FORMULA = ("=", "+", "-", "@")  # a cell that begins so would be computed by a spreadsheet
 
 
@@ -31,6 +33,7 @@ class TextSink(FileSink):
     """Recorder of text; see the module."""
 
     layout = "text 1"
+    units: FileUnits = "si"
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -104,6 +107,7 @@ class TextSink(FileSink):
         self._line(f"# teds-provision measurement, {self.layout}; times are unix seconds, clock: {clock}")
         self._line(f"# station: {printable(station.name)}; group: {printable(station.group) or 'none'}")
         self._line(f"# started: {iso(station.started)}; part {len(self.files)}")
+        self._line(f"# units: {_UNITS[self.units]}")
         if station.test_pattern:
             self._line("# TEST PATTERN: no line of this file is a measurement")
         for facts in known:
@@ -214,6 +218,8 @@ def heads_of(known: Sequence[ChannelFacts]) -> list[str]:
 class JsonLinesSink(FileSink):
     """Recorder of JSON lines; see the module."""
 
+    units: FileUnits = "si"
+
     def _begin(self) -> None:
         station = self.station
         head = {
@@ -224,6 +230,7 @@ class JsonLinesSink(FileSink):
             "started": iso(station.started),
             "clock": station.clock,
             "test_pattern": station.test_pattern,
+            "units": self.units,
         }
         self._add(as_line(head))
         self._channels(tuple(self.facts.values()))
