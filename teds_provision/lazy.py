@@ -100,10 +100,11 @@ REQUIRED: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
 
 def missing_packages() -> list[str]:
     """Return the names of required packages that are not installed; imports none of them."""
-    return [name for name, (module, _) in REQUIRED.items() if not _is_installed(module)]
+    return [name for name, (module, _) in REQUIRED.items() if not is_installed(module)]
 
 
-def _is_installed(module: str) -> bool:
+def is_installed(module: str) -> bool:
+    """Return True if a module can be found; does not import it."""
     try:
         return util.find_spec(module) is not None
     except (ModuleNotFoundError, ValueError):  # what contains it is missing, or it was taken out of sys.modules

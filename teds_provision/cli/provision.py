@@ -146,6 +146,8 @@ def provision(
     line = None
     if job is not None or evidence:
         _check_line(request, job, only)
+        if label_to is not None:
+            station.label.require_label_packages(label_format)
         found = plant.jobs.find_job(base, job) if job is not None else None
         label = label_to / f"label.{label_format}" if label_to is not None else None
         line = plant.line.LineRun(

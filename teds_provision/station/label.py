@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from teds_provision import files
 from teds_provision.errors import NotFoundError, TedsProvisionError, UsageError
-from teds_provision.lazy import how_to_install
+from teds_provision.lazy import how_to_install, is_installed
 
 if TYPE_CHECKING:
     from teds_provision.station.station import Station
@@ -102,6 +102,14 @@ def _table(layout: str, letters: str) -> dict[int, str]:
 _TABLES: Final = tuple(_table(layout, letters) for layout, letters in _LAYOUTS.items())
 
 
+def require_label_packages(label_format: str) -> None:
+    """Raise TedsProvisionError if a package for labels of this format ("svg", "png") is missing, before any work."""
+    if not is_installed("segno"):
+        raise TedsProvisionError("Labels need segno, which is not installed.", hint=how_to_install("label"))
+    if label_format == "png" and not is_installed("PIL"):
+        raise TedsProvisionError("A PNG needs Pillow, which is not installed.", hint=how_to_install("label"))
+
+
 def write_label(label: Label, path: Path) -> None:
     """Write the label as SVG or PNG, by the suffix; raises UsageError (another one).
 
@@ -110,16 +118,15 @@ def write_label(label: Label, path: Path) -> None:
     suffix = path.suffix.lower()
     if suffix not in (".svg", ".png"):
         raise UsageError(f"Labels are written as .svg or .png, not {path.name}.", hint="Name it LABEL.svg.")
+    require_label_packages(suffix.removeprefix("."))
     rows = _modules(label.text)
     octets = _svg(label, rows).encode() if suffix == ".svg" else _png(label, rows)
     files.write_whole(path, octets, mode=0o644)
 
 
 def _modules(text: str) -> list[list[bool]]:
-    try:
-        import segno
-    except ImportError as error:
-        raise TedsProvisionError("Labels need segno, which is not installed.", hint=how_to_install("label")) from error
+    import segno
+
     code = segno.make(text, micro=False, error="m", boost_error=True)
     return [[bool(module) for module in row] for row in code.matrix]
 
@@ -142,10 +149,8 @@ def _svg(label: Label, rows: list[list[bool]]) -> str:
 
 
 def _png(label: Label, rows: list[list[bool]]) -> bytes:
-    try:
-        from PIL import Image, ImageDraw, ImageFont
-    except ImportError as error:
-        raise TedsProvisionError("A PNG needs Pillow, which is not installed.", hint=how_to_install("label")) from error
+    from PIL import Image, ImageDraw, ImageFont
+
     side = (len(rows) + 2 * _QUIET) * _MODULE
     font = ImageFont.load_default(4 * _MODULE)
     width = side + _QUIET * _MODULE + int(max(font.getlength(line) for line in label.lines))

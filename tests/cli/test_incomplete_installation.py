@@ -59,6 +59,18 @@ def test_provision_names_missing_packages_and_writes_nothing(tmp_path: Path) -> 
     assert (done.returncode, "jaraco.context missing" in done.stderr) == (1, True), done.stderr
 
 
+def test_a_package_for_labels_is_missed_before_a_board_is_built(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home = tmp_path / "home"
+    assert call(home, "init", "--keystore", "file", "--name", "bench").code == 0
+    for missing, label_format, said in (("PIL", "png", "A PNG needs Pillow"), ("segno", "svg", "Labels need segno")):
+        monkeypatch.setitem(sys.modules, missing, None)
+        words = ("--job", "none", "--watch", "--yes", "--label-to", tmp_path / "labels", "--label-format", label_format)
+        done = call(home, "provision", *words)
+        assert (done.code, said in done.err) == (1, True), done.err
+
+
 def test_the_doctor_runs_without_and_says_so(tmp_path: Path) -> None:
     done = without("numpy", "--json", "--home", tmp_path / "home", "doctor")
     checks = json.loads(done.stdout)["checks"]
