@@ -474,7 +474,8 @@ def _summary(
         calibrated = ", calibrated" if channel.calibrated else ""
         read = readings.get(channel.number)
         reads = f", reads {read}" if read is not None else ""
-        what = f"{escape(channel.name)}  {channel.range}{calibrated}{reads}".strip()
+        facts = f"{channel.range}{calibrated}{reads}".removeprefix(", ")
+        what = f"{escape(channel.name)}  {facts}".strip()
         table.add_row(f"channel {channel.number}", what)
     verdict = done.verified.verdict
     table.add_row("verdict", f"[bold {'green' if verdict == 'authentic' else 'red'}]{verdict}[/]")

@@ -7,6 +7,7 @@ like sysfs, and a FIFO in place of the character device, as this machine has no 
 from __future__ import annotations
 
 import json
+import math
 import os
 import struct
 import subprocess
@@ -108,7 +109,9 @@ def test_an_eds_gives_channels_with_range_factor_and_period() -> None:
     )
     assert "no event timer" in temperature.note
     assert (sensor.origin.kind, sensor.origin.name) == ("eds", "Torque cell")
-    assert not Sheet.from_image(Image(UUID, sensor.blocks(UUID))).errors
+    sheet = Sheet.from_image(Image(UUID, sensor.blocks(UUID)))
+    assert not sheet.errors
+    assert [(c.has_range, math.isfinite(c.uncertainty)) for c in sheet.channels] == [(True, False), (False, False)]
 
 
 @pytest.mark.link

@@ -12,7 +12,7 @@ import json
 import math
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from teds_provision.errors import BadDataError
@@ -170,6 +170,11 @@ class WrappedChannel:
         return min(ends), max(ends)
 
     @property
+    def unstated(self) -> tuple[str, ...]:
+        """Fields of the TransducerChannel TEDS that nothing states."""
+        return ("OError", "LowLimit", "HiLimit") if self.limits[1] >= _LARGEST else ("OError",)
+
+    @property
     def sample(self) -> SampleChoice:
         """How its samples travel."""
         if self.is_float:
@@ -300,8 +305,17 @@ class WrappedSensor:
         return "\n".join([*head, *channels, ""])
 
     def blocks(self, uuid: bytes, name: str = "") -> dict[BlockId, bytes]:
-        """Return the TEDS of a node around this sensor, without Security TEDS; raises BadDataError."""
+        """Return the TEDS of a node around this sensor, without Security TEDS; raises BadDataError.
+
+        What no file states is not stated (NaN): the uncertainty, as a step of the raw number is none, and the limits of
+        a float without a range.
+        """
         profile = parse_profile(self.profile_text("wrapped"), "wrapped")
+        unstated = [dict.fromkeys(channel.unstated, math.nan) for channel in self.channels]
+        parts = zip(profile.channels, unstated, strict=True)
+        profile = replace(
+            profile, channels=tuple(replace(part, fields={**part.fields, **gone}) for part, gone in parts)
+        )
         calibrations = {
             number: calibration
             for number, channel in enumerate(self.channels, 1)
