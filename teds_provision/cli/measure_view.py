@@ -68,6 +68,9 @@ class StdoutEvents(ThreadedSink):
             self._last[report.uuid] = (report.state, report.why)
         if before != (report.state, report.why):
             self.report(report)
+            if before is not None and before[0] == "running" and report.state == "refused":  # as `ncap` has it
+                with self._guard:
+                    self._events.append({"event": "left", "uuid": report.uuid, "why": report.why})
 
     def sink(self, sink: Sink) -> None:
         """Print a sink that failed, waits for its consumers, or has them again."""

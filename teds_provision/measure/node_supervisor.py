@@ -39,7 +39,7 @@ from teds_provision.measure.request import Events, MeasurementRequest
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.retry_policy import RetryPolicy
 from teds_provision.measure.running.streams import NodeStreams, added
-from teds_provision.measure.standing import NodeStanding
+from teds_provision.measure.standing import NodeStanding, why_not_measured
 from teds_provision.measure.topic_actuators import TopicActuators
 from teds_provision.measure.verified_session import (
     LEASE_EACH,
@@ -64,6 +64,7 @@ WORKED_ON, TELL, LONGEST_WORK = 0.05, 0.5, 60.0
 LOOK = 0.2  # seconds between looks at how it does
 LOOK_FOR_DATA = 0.4  # seconds after an announcement in which data shows that it was not the node's
 ANNOUNCED = 1.0  # seconds until a node without such data is asked after it
+DECIDED = 0.5  # seconds between looks whether this station's own decision against a node was taken back
 AT_ONCE = 1.0  # seconds between two tries, however often something announces itself as this node
 SLOWER = 10  # halvings of the rate while the firmware reports that its shortest period is longer
 UNLOCKED = 1.0  # seconds between looks whether the vault is open again
@@ -169,7 +170,8 @@ class NodeSupervisor:
                 error = self._failure()
                 if error is None or self._stop.is_set():
                     break
-                self.error = error
+                shared = self._is_shared(error)
+                self.error = error = shared or error
                 if self._request.newcomers:
                     final = isinstance(error, (NotAuthenticError, PolicyError, BadDataError))
                     if isinstance(error, NoRoomError):
@@ -178,14 +180,16 @@ class NodeSupervisor:
                         self._set_state("refused" if final else "lost", error)
                     return
                 decided = self._standing is not None and error is self._standing.ended
-                if patience.gives_up(error, proven=self._proven, decided=decided, elsewhere=self._is_elsewhere):
+                if shared is not None or patience.gives_up(
+                    error, proven=self._proven, decided=decided, elsewhere=self._is_elsewhere
+                ):
                     self._set_state("refused", error)
                     return
                 if time.monotonic() - began > LAST_PAUSE:
                     pause = FIRST_PAUSE
                 lost: State = "refused" if isinstance(error, BadDatasheetError) else "lost"
                 self._set_state(lost if self.ever_ran else "waiting", error, f"; again in {patience.again(pause)}")
-                self._wait(min(pause, patience.seconds_left), began)
+                self._wait(min(pause, patience.seconds_left), began, decided=decided)
                 pause = min(2 * pause, LAST_PAUSE)
             self._set_state("ended", why=self._why)
         finally:
@@ -201,11 +205,33 @@ class NodeSupervisor:
     def _is_elsewhere(self) -> bool:
         return self._buses.presence.elsewhere(self.uuid)
 
-    def _wait(self, pause: float, began: float) -> None:
-        """Wait until it is time to try again: after ``pause`` seconds, or at once when the node announces itself."""
+    def _is_shared(self, error: TedsProvisionError) -> PolicyError | None:
+        """Return the error of a node that lacks room for this stream, because another process has one there too.
+
+        None if that is not so, or the room is waited for. It would last for as long as the other one does.
+        """
+        holder = self._request.beside.get(self.uuid)
+        full = isinstance(error, NodeRefusedError) and error.reason == Reason.DOES_NOT_FIT
+        if holder is None or not full or self.ever_ran or self._request.patient:
+            return None
+        return PolicyError(
+            f"Node {self.uuid.hex()} is also being measured by {holder}, and has no room for this rate beside it.",
+            hint="Use a lower --rate, or end that measurement.",
+        )
+
+    def _wait(self, pause: float, began: float, *, decided: bool) -> None:
+        """Wait until it is time to try again: after ``pause`` seconds, or at once when the node announces itself.
+
+        ``decided``: this station itself does not let it be measured; also at once when that is taken back.
+        """
         if self.sighting is not None:
             self._buses.presence.on_announce(self.sighting, self._anew.set)
-        self._anew.wait(pause)
+        until, changes = time.monotonic() + pause, self._station.changes() if decided else None
+        while (left := until - time.monotonic()) > 0 and not self._anew.wait(min(left, DECIDED) if decided else left):
+            now = self._station.changes() if decided else None
+            if now != changes and not why_not_measured(self._station, self.uuid):
+                break
+            changes = now
         self._buses.presence.let_announce(self.uuid)  # from here on it is looked for
         self._stop.wait(max(0.0, began + AT_ONCE - time.monotonic()))
 

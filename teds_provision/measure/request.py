@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from teds_provision.errors import PolicyError
@@ -93,6 +93,7 @@ class MeasurementRequest:
     require: Requirements | None = None
     newcomers: bool = False  # nodes come and go: no room is kept for one that is away, and its first error ends it
     by: str = "measure"  # the command that a reading of the datasheet is put down to
+    beside: Mapping[bytes, str] = field(default_factory=dict)  # which process measures a node too, in words
 
 
 @dataclass

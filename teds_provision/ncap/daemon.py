@@ -207,6 +207,8 @@ class Daemon:
         while not self._stop.wait(_LOOK):
             try:
                 self._look_at_vault()
+                for uuid in self.directory.follow_profiles():
+                    self.live.event("node", uuid=uuid, state="changed")
                 version = self.station.version()
                 if version == self._version:
                     continue

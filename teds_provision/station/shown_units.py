@@ -20,6 +20,11 @@ def shown_units(station: Station, uuid: bytes) -> Mapping[int, str]:
     return units_of(channel_profiles(station, uuid).values())
 
 
+def units_of_profile(name: str | None, home: Path) -> Mapping[int, str]:
+    """Return the unit of each channel for which a profile names one; none without a profile that can be read."""
+    return units_of(_channels_of(name, home).values()) if name else {}
+
+
 def units_of(channels: Iterable[ChannelProfile]) -> dict[int, str]:
     """Return the display unit of each of these channels that names one."""
     return {channel.number: channel.display for channel in channels if channel.display}

@@ -281,6 +281,8 @@ def _held_by(path: Path, *, shared: bool = False) -> str | None:
 def _holder(descriptor: int) -> str:
     try:
         said = json.loads(_read_at_start(descriptor, 4096))
+        if Path("/proc/self").exists() and not Path(f"/proc/{int(said['pid'])}").exists():
+            return "another process"  # of several who shared it, the last to come has gone
         return f"pid {int(said['pid'])} ({said['command']}) since {said['since']}"
     except (OSError, ValueError, KeyError, TypeError):
         return "another process"

@@ -5,9 +5,15 @@ from __future__ import annotations
 import shutil
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
 
 import pytest
 
+from teds_provision.errors import NodeRefusedError
+from teds_provision.measure.node_supervisor import NodeSupervisor
+from teds_provision.measure.request import Events, MeasurementRequest
+from teds_provision.protocol.messages.frames import Reason
 from tests.e2e.desk import ANGLE
 from tests.measure.hall import Hall, Placed, events, of, ran
 from tests.pace import until
@@ -69,3 +75,22 @@ def test_two_boards_with_one_uuid_at_one_address_are_named_and_end_no_other_meas
     beside.signal(signal.SIGTERM)
     ended = beside.end()
     assert (ended.code, ran(events(ended.out))) == (0, ["running", "ended"]), ended
+
+
+def test_a_node_without_room_beside_its_other_measurement_is_refused_at_once_and_names_it() -> None:
+    """It was tried until the time-out, and then the link's budget was blamed."""
+    request = MeasurementRequest(beside={bytes(10): "pid 7 (measure all)"})
+    full = NodeRefusedError("The node refused to stream.", reason=Reason.DOES_NOT_FIT)
+    unlike = NodeRefusedError("The node is busy.", reason=Reason.BUSY)
+
+    def supervisor(uuid: bytes, wanted: MeasurementRequest) -> NodeSupervisor:
+        none: Any = None
+        events = Events(none, none, none)
+        return NodeSupervisor(none, none, uuid, wanted, none, events, none)
+
+    told = supervisor(bytes(10), request)._is_shared(full)
+    assert told is not None
+    assert "is also being measured by pid 7 (measure all)" in told.message
+    assert supervisor(bytes(10), request)._is_shared(unlike) is None
+    assert supervisor(b"another...", request)._is_shared(full) is None
+    assert supervisor(bytes(10), replace(request, patient=True))._is_shared(full) is None, "ncap waits for room"

@@ -14,6 +14,7 @@ import pytest
 from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.station.station import Station
+from teds_provision.teds.profile import shipped_profiles
 from tests.bench import PASSPHRASE, make_station
 from tests.e2e.desk import Running
 from tests.handover.desk import trust
@@ -120,6 +121,8 @@ def test_measure_ends_with_the_reason_and_marks_its_recording(hall: Hall, decisi
     lines = events(outcome.out)
     [refused] = [line for line in lines if line["event"] == "status" and line.get("state") == "refused"]
     assert decision.why in refused["why"]
+    [left] = [line for line in lines if line["event"] == "left"]
+    assert (left["uuid"], left["why"]) == (hall.nodes["g"].uuid, refused["why"]), "as ncap has it"
     assert decision.why in lines[-1]["error"]["message"]
     assert decision.why in file.read_text()
 
@@ -153,6 +156,34 @@ def test_ncap_releases_the_node_moves_it_no_more_and_marks_its_recording(
         assert recordings
     service.end()
     assert any(decision.why.encode() in file.read_bytes() for file in recordings), recordings
+
+
+def test_a_node_that_is_listed_again_does_not_wait_for_the_next_try(hall: Hall) -> None:
+    """A measurement by UUID waited out its pause, up to 30 s; and the page kept the unit of an edited profile."""
+    uuid = hall.nodes["g"].uuid
+    [entry] = [entry for entry in hall.station.ask("whitelist", "list")["whitelist"] if entry["uuid"] == uuid]
+    service = Service(hall.desk, hall.station).start()
+    assert verdict(verified(service, uuid)) == "authentic"
+    with service.client() as asked:
+        asked.request("POST", "/measurements", {"uuids": [uuid], "rate": 20})
+        until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured")
+        decide(hall, DECISIONS["unlisted"])
+        # 1, 2 and 4 s are over
+        until(lambda: "again in 8 s" in (asked.node(uuid)["measuring"] or {}).get("why", ""), seconds=30.0)
+        units = [channel["shown"]["unit"] for channel in asked.node(uuid)["channels"]]
+        hall.station.ask("whitelist", "add", uuid, "--fingerprint", entry["fingerprint"])
+        listed = time.monotonic()
+        until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured again")
+        assert time.monotonic() - listed < LIMIT + SLACK
+
+        assert "um" not in units
+        folder = hall.station.home / "profiles"
+        folder.mkdir(exist_ok=True)
+        text = (shipped_profiles() / "gripper.toml").read_text()
+        text = text.replace('unit = "mm"\n', 'unit = "mm"\ndisplay-unit = "um"\n', 1)
+        (folder / "gripper.toml").write_text(text)
+        until(lambda: "um" in [channel["shown"]["unit"] for channel in asked.node(uuid)["channels"]], "the old unit")
+    service.end()
 
 
 @pytest.mark.parametrize("decision", DECISIONS.values(), ids=DECISIONS)

@@ -98,6 +98,8 @@ class MeasurementJob:
         """
         uuids = self.station.measurements.nodes_of(self.kept)
         name = self.kept.group or ", ".join(uuid.hex()[:8] for uuid in uuids[:3])
+        # before this process marks them, too: whoever else measures a node has a share of what the node can send
+        beside = {uuid: holder for uuid in uuids if (holder := self.station.measurements.holder(uuid)) is not None}
         with ExitStack() as stack:
             stack.enter_context(self.station.measurements.running(uuids, group=self.kept.group, what=f"measure {name}"))
             if self.kept.group is not None:
@@ -108,7 +110,7 @@ class MeasurementJob:
                 self.station,
                 buses,
                 uuids,
-                self.request,
+                replace(self.request, beside=beside),
                 self.sinks,
                 self._facts(),
                 watcher or Watcher(),

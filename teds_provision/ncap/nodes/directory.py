@@ -10,7 +10,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -19,7 +19,7 @@ from teds_provision.api.operations import MOST_NODES
 from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.sinks import for_readers
-from teds_provision.station.shown_units import shown_units
+from teds_provision.station.shown_units import shown_units, units_of_profile
 from teds_provision.station.station import Station
 from teds_provision.steps.inventory import with_verdicts
 from teds_provision.steps.readings import NodeVerdict
@@ -66,6 +66,7 @@ class NodeDirectory:
         self._rows: dict[str, dict[str, Any]] = {}
         self._judged: dict[str, NodeVerdict | None] = {}  # as the store and today's trust have it, beside each row
         self._channels: dict[str, tuple[str, list[dict[str, Any]]]] = {}
+        self._shown_in: dict[str, Mapping[int, str]] = {}  # the display units with which the channels were decoded
         self._own_names: dict[str, str] = {}  # from the datasheet of each
         self._origins: dict[str, dict[str, Any] | None] = {}  # what each wraps
         self.changes = 0  # grows with each change of a node's name or datasheet
@@ -109,10 +110,24 @@ class NodeDirectory:
         channels = [channel_facts(channel) for channel in sheet.channels] if sheet is not None else []
         with self._lock:
             self.changes += 1
-            self._channels[uuid] = digest, channels
+            self._channels[uuid], self._shown_in[uuid] = (digest, channels), shown
             self._own_names[uuid] = sheet.meta.name if sheet is not None else ""
             self._origins[uuid] = _origin(sheet)
         return channels
+
+    def follow_profiles(self) -> list[str]:
+        """Show channels in the display units that their profiles name now; return the nodes with other ones."""
+        with self._lock:
+            known = {uuid: (self._rows.get(uuid, {}).get("profile"), units) for uuid, units in self._shown_in.items()}
+        home = self._station.home
+        now = {profile: units_of_profile(profile, home) for profile in {profile for profile, _ in known.values()}}
+        changed = [uuid for uuid, (profile, units) in known.items() if now[profile] != units]
+        with self._lock:
+            for uuid in changed:
+                self._channels.pop(uuid, None)
+                self._shown_in.pop(uuid, None)
+                self.changes += 1
+        return changed
 
     def show_sheet(self, uuid: str, sheet: Sheet | None) -> None:
         """Show the channels of a datasheet that was read just now; None: those of the one that is kept."""
@@ -121,7 +136,8 @@ class NodeDirectory:
             if sheet is None:
                 self._channels.pop(uuid, None)
             else:
-                known = sheet.shown_in(shown_units(self._station, bytes.fromhex(uuid)))
+                self._shown_in[uuid] = shown_units(self._station, bytes.fromhex(uuid))
+                known = sheet.shown_in(self._shown_in[uuid])
                 self._channels[uuid] = _READ_NOW, [channel_facts(channel) for channel in known.channels]
                 self._own_names[uuid] = sheet.meta.name
                 self._origins[uuid] = _origin(sheet)
