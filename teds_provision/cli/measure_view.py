@@ -58,6 +58,7 @@ class StdoutEvents(ThreadedSink):
         self._stop = stop
         self._facts: dict[tuple[str, int], ChannelFacts] = {}
         self._last: dict[str, tuple[str, str]] = {}
+        self._printed: dict[str, str] = {}  # the state of each node in its last line
         self._events: list[dict[str, Any]] = []
         self._guard = threading.Lock()
 
@@ -68,9 +69,6 @@ class StdoutEvents(ThreadedSink):
             self._last[report.uuid] = (report.state, report.why)
         if before != (report.state, report.why):
             self.report(report)
-            if before is not None and before[0] == "running" and report.state == "refused":  # as `ncap` has it
-                with self._guard:
-                    self._events.append({"event": "left", "uuid": report.uuid, "why": report.why})
 
     def sink(self, sink: Sink) -> None:
         """Print a sink that failed, waits for its consumers, or has them again."""
@@ -90,6 +88,9 @@ class StdoutEvents(ThreadedSink):
             self._put_out(b"".join(as_line(line) for line in data_lines(item, self._facts)))
         elif isinstance(item, NodeReport):
             self._put_out(as_line(status_line(item)))
+            if self._printed.get(item.uuid) == "running" and item.state == "refused":  # behind its last values
+                self._put_out(as_line({"event": "left", "uuid": item.uuid, "why": item.why}))
+            self._printed[item.uuid] = item.state
         elif isinstance(item, tuple):
             self._facts.update((facts.key, facts) for facts in item)
         self._idle(time.monotonic())
