@@ -31,7 +31,10 @@ def costs_at_most(seconds: float) -> Iterator[None]:
 
 
 def best_of(tries: int, limit: float, attempt: Callable[[], float]) -> None:
-    """Try until ``attempt``, which gives the seconds that it took, took less than ``limit``; once if all is quiet."""
+    """Try until ``attempt``, which returns the seconds that it took, took less than ``limit``; once if all is quiet.
+
+    Each failed try is a warning of the run. More than five tries need a comment that says why.
+    """
     took: list[float] = []
     while not took or took[-1] >= limit:
         assert len(took) < tries, f"{took} s, never less than {limit} s"

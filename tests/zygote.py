@@ -8,7 +8,7 @@ fault bench) the library begins anew in each child (``faults_begin``).
 What such a child cannot show is how the program starts: what it imports, what the interpreter makes of its environment,
 how much memory it takes. Tests of that start an interpreter; ``forkable`` tells environments that only a start obeys.
 
-As a program: python -m tests.zygote FD (the control socket that its parent holds the other end of).
+As a program: python -m tests.zygote FD [MODULE] (the control socket that its parent holds the other end of).
 """
 
 from __future__ import annotations
@@ -157,6 +157,7 @@ class Zygote:
 
     environment: dict[str, str]  # in which it imports
     library: Path | None = None  # what is to be loaded before the system's own
+    module: str = ""  # another one than the program, which alone is imported, with all that it imports
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
 
     def __post_init__(self) -> None:
@@ -167,7 +168,7 @@ class Zygote:
         more = {"LD_PRELOAD": str(self.library)} if self.library else {}
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.zygote", str(theirs.fileno())],
+                [sys.executable, "-m", "tests.zygote", str(theirs.fileno()), *([self.module] if self.module else [])],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(),),
@@ -353,7 +354,11 @@ def main() -> None:
     """Import, then serve; in a child: run what was asked for."""
     control = socket.socket(fileno=int(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: for the tests, which end this one
-    _import_all()
+    if sys.argv[2:]:
+        importlib.import_module(sys.argv[2])
+        del sys.modules[sys.argv[2]]  # it runs as __main__
+    else:
+        _import_all()
     assert threading.active_count() == 1
     gc.collect()
     gc.freeze()

@@ -213,11 +213,12 @@ class Everything:
 
 
 async def main() -> None:
-    """Serve until stdin ends."""
+    """Serve until stdin ends, or the descriptor that is named instead of it."""
     logging.basicConfig(level=logging.ERROR)
     loop = asyncio.get_running_loop()
     lines = asyncio.StreamReader()
-    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
+    source = open(int(sys.argv[1])) if sys.argv[1:] else sys.stdin  # noqa: SIM115  until the process ends
+    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), source)
     everything = Everything()
     await everything.open(json.loads(await lines.readline()))
     print(json.dumps({"nodes": [node._address.address.text for node in everything.nodes]}), flush=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import functools
 import json
 import os
 import shutil
@@ -9,10 +11,13 @@ import subprocess
 import sys
 import threading
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import pytest
+
+from tests.zygote import FIRST_FD, Forked, Zygote
 
 ROOT = Path(__file__).resolve().parents[3]
 CONFIG = """<!DOCTYPE busconfig PUBLIC "-//freedesktop//DTD D-Bus Bus Configuration 1.0//EN"
@@ -22,6 +27,24 @@ CONFIG = """<!DOCTYPE busconfig PUBLIC "-//freedesktop//DTD D-Bus Bus Configurat
 
 needs_dbus = pytest.mark.skipif(shutil.which("dbus-daemon") is None, reason="dbus-daemon is not installed")
 """For tests that need the private bus."""
+
+
+AIR = "tests.links.ble.air"
+
+
+@dataclass
+class AirProcess(Forked):
+    """The air as a fork of one that has imported bumble: its two ends."""
+
+    stdin: TextIO
+    stdout: TextIO
+
+
+@functools.cache
+def _zygote() -> Zygote:
+    made = Zygote(os.environ | {"PYTHONPATH": str(ROOT)}, module=AIR)
+    atexit.register(made.close)
+    return made
 
 
 class Radio:
@@ -38,13 +61,13 @@ class Radio:
         in_c: bool = False,
     ) -> None:
         self.path = folder / "bus"
-        self._processes: list[subprocess.Popen[str]] = []
+        self._processes: list[subprocess.Popen[str] | AirProcess] = []
         config = folder / "bus.conf"
         config.write_text(CONFIG.format(path=self.path))
         daemon = self._start(["dbus-daemon", f"--config-file={config}", "--nofork", "--nopidfile", "--print-address"])
         assert daemon.stdout is not None
         daemon.stdout.readline()
-        self._air = self._start([sys.executable, "-m", "tests.links.ble.air"])
+        self._air = self._start_air()
         self._lock = threading.Lock()
         self.addresses: list[str] = self._say(
             {
@@ -91,6 +114,19 @@ class Radio:
             line = self._air.stdout.readline()
         assert line, f"the air ended with {self._air.poll()}"
         return json.loads(line)
+
+    def _start_air(self) -> subprocess.Popen[str] | AirProcess:
+        if "COVERAGE_PROCESS_START" in os.environ or "COVERAGE_PROCESS_CONFIG" in os.environ:
+            return self._start([sys.executable, "-m", AIR])
+        (asked, ask), (answers, answered) = os.pipe(), os.pipe()
+        try:
+            forked = _zygote().run(AIR, [str(FIRST_FD)], dict(os.environ), out=answered, err=2, given=(asked,))
+        finally:
+            os.close(asked)
+            os.close(answered)
+        process = AirProcess(forked.pid, forked.status, os.fdopen(ask, "w"), os.fdopen(answers))
+        self._processes.append(process)
+        return process
 
     def _start(self, words: list[str]) -> subprocess.Popen[str]:
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
