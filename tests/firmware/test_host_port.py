@@ -21,22 +21,26 @@ pytestmark = pytest.mark.system
 
 OF_A_BUS = {
     "can-flow-control", "can-busy", "can-form", "keyed-untapped", "confirm-other-link", "confirm-beside",
-    "two-sessions", "stranger-ends-nothing", "repetition-everyone", "repetition-two", "staging-shared",
+    "two-sessions", "stranger-ends-nothing", "repetition-everyone", "repetition-two", "staging-shared", "session-bound",
+    "can-other-address", "can-functional", "can-lengths", "can-sequence", "can-flow-obeyed", "can-announce",
+    "stream-messages", "drive-replay", "trigger-token",
 }  # fmt: skip
-"""What a tag alone cannot show: no second station can ask."""
-OF_OTHER_LINKS = {"nfc-wait-time", "nfc-wtx", "confirm-elsewhere", "operate-lease"}
-"""What a node with a bus alone cannot show; Operate wants a Channel TEDS that fits, which a factory node has not."""
+"""What a tag alone cannot show: no second station can ask, and there are no frames of CAN."""
+OF_OTHER_LINKS = {"nfc-wait-time", "nfc-wtx", "confirm-elsewhere", "write-read-only"}
+"""What a node with a bus alone cannot show, and this one has no TEDS that is read-only."""
+WITH_AN_ACTUATOR = "1 sensor 0 2 100000\n2 actuator 0 2 1000000\n"
 
 
 @pytest.mark.parametrize("fd", [False, True], ids=["classic", "fd"])
 def test_it_keeps_every_rule_of_the_profile(desk: Desk, station: Station, node: CNode, fd: bool) -> None:
+    node.channels = node.channels if fd else WITH_AN_ACTUATOR
     node.start(*(["--fd"] if fd else []))
     links = ["--via", "can", "--can", desk.links.can + ("&fd=1" if fd else "")]
     checked = station.ask("node", "check", "--factory", "--yes", *links)
     wrong = [rule for rule in checked["checks"] if rule["result"] == "failed"]
     assert not wrong
     skipped = {rule["rule"] for rule in checked["checks"] if rule["result"] == "skipped"}
-    assert skipped == {"nfc-wait-time", "nfc-wtx", "confirm-elsewhere", "operate-lease"}
+    assert skipped == OF_OTHER_LINKS | ({"drive-replay"} if fd else set())
 
 
 def test_its_tag_keeps_every_rule_of_the_profile(desk: Desk, station: Station, node: CNode) -> None:
@@ -45,7 +49,7 @@ def test_its_tag_keeps_every_rule_of_the_profile(desk: Desk, station: Station, n
     checked = station.ask("node", "check", "--factory", "--yes", *desk.links.over("nfc"))
     assert [rule for rule in checked["checks"] if rule["result"] == "failed"] == []
     skipped = {rule["rule"] for rule in checked["checks"] if rule["result"] == "skipped"}
-    assert skipped == OF_A_BUS | {"nfc-wtx", "operate-lease", "address-moves", "address-back"}
+    assert skipped == OF_A_BUS | {"nfc-wtx", "write-read-only", "address-moves", "address-back"}
 
 
 def test_a_node_that_was_tapped_is_written_over_the_bus(desk: Desk, station: Station, node: CNode) -> None:
@@ -162,7 +166,7 @@ def test_its_identity_key_may_lie_in_psa_and_never_leave_it(desk: Desk, station:
     node.start(cwd=desk.folder)
     links = desk.links.over("can")
     checked = station.ask("node", "check", "--factory", "--yes", *links)
-    assert (checked["failed"], checked["skipped"]) == (0, len(OF_OTHER_LINKS))
+    assert (checked["failed"], checked["skipped"]) == (0, len(OF_OTHER_LINKS | {"drive-replay"}))
     assert station.provision("can", "--profile", ANGLE)["verdict"] == "authentic"
     fingerprint = node.ready["fingerprint"]
     node.kill()
