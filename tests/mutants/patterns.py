@@ -330,4 +330,33 @@ PATTERNS = (
     Pattern(
         "a job's count is checked again", "_require_room", "given >= job.total", "False", "tests/plant/test_office.py"
     ),
+    # wrapped sensors (node/wrapped)
+    Pattern(
+        "a late value of a wrapped sensor is invalid",
+        "LatestValues.at",
+        "moment - arrival.at > self._longest and time.monotonic() - arrival.at > self._longest + _UNREAD",
+        "False",
+        "tests/node/test_wrapped_dbc.py",
+    ),
+    Pattern(
+        "a value outside its signal's range is invalid",
+        "LatestValues._outside",
+        "self._low <= value <= self._high",
+        "True",
+        "tests/node/test_wrapped_dbc.py",
+    ),
+    Pattern(
+        "a wrapped node runs from the file that it was made from",
+        "_require_same",
+        "sensor.origin != origin",
+        "False",
+        "tests/node/test_wrapped_dbc.py",
+    ),
+    Pattern(
+        "the origin in evidence is the one that was signed",
+        "_wrong_datasheet",
+        "facts.origin is not None and not _is_listed(facts.origin, shown)",
+        "False",
+        "tests/plant/test_evidence.py",
+    ),
 )

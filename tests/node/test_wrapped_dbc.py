@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from pathlib import Path
 
+import can
 import cantools
 import pytest
 from hypothesis import given
@@ -15,11 +17,12 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.links.can.sensor_bus import SensorFrame
+from teds_provision.links.can.spec import parse_spec
 from teds_provision.node import node_template
 from teds_provision.node.hardware.board import Board
 from teds_provision.node.sources.base import Reading
 from teds_provision.node.wrapped import dbc_message
-from teds_provision.node.wrapped.can_reader import MessageReader
+from teds_provision.node.wrapped.can_reader import CanReader, MessageReader
 from teds_provision.node.wrapped.dbc_message import DbcMessage, pgn_of
 from teds_provision.node.wrapped.description import WrappedChannel, written_unit
 from teds_provision.node.wrapped.latest_values import LatestValues
@@ -35,6 +38,8 @@ from teds_provision.teds.origin import ORIGIN, origin_of
 from teds_provision.teds.profile.load import parse_profile
 from teds_provision.teds.sheet import Sheet
 from tests.e2e.desk import ROOT
+from tests.pace import until
+from tests.places import free_bus
 
 DBC = ROOT / "examples" / "bench" / "torque.dbc"
 UUID = bytes(range(10))
@@ -322,3 +327,43 @@ def test_a_certificate_of_a_wrapped_sensor_corrects_what_its_frames_indicate() -
     assert made.uncertainty == pytest.approx(0.2)
     assert made.certificate is not None
     assert made.certificate.number == "M-2026-0311"
+
+
+@pytest.mark.link
+def test_a_bus_that_is_lost_makes_values_invalid_and_is_opened_again() -> None:
+    told: list[str] = []
+    torque, bus = reader("Torque"), free_bus()
+    running = CanReader(parse_spec(bus), [torque], told.append)
+    running.start()
+    group, port = bus.removeprefix("udp_multicast:").split("?port=")
+    frame = can.Message(arbitration_id=291, is_extended_id=False, data=bytes(8))
+
+    def arrives() -> bool:
+        before = torque.frames
+        sender.send(frame)
+        time.sleep(0.02)
+        return torque.frames > before
+
+    try:
+        with can.Bus(interface="udp_multicast", channel=group, port=int(port), hop_limit=0, fd=False) as sender:
+            until(arrives)
+            assert running._bus is not None
+            running._bus._bus.shutdown()  # as an adapter that is pulled out
+            until(lambda: bool(told))
+            assert "invalid until the bus is back" in told[0]
+            assert "cannot be read" in torque.values[0].at(time.monotonic() + 10)[1]
+            until(arrives)
+            assert "cannot be read" not in torque.values[0].at(time.monotonic() + 10)[1]
+    finally:
+        running.stop()
+
+
+def test_filters_let_the_wanted_frames_through() -> None:
+    """What SocketCAN is given: an identifier, or for J1939 the group alone, and of a group with a destination any."""
+    assert dbc_message.FrameKey(291, False).filter == (291, 0x7FF, False)
+    assert dbc_message.FrameKey(0x1ABCDEF0, True).filter == (0x1ABCDEF0, 0x1FFFFFFF, True)
+    for identifier, other in ((0x18FEF121, 0x0CFEF1FE), (0x18EA2133, 0x1CEAFF01)):
+        number, mask, extended = dbc_message.FrameKey(pgn_of(identifier), True, True).filter
+        assert extended
+        assert identifier & mask == number & mask == other & mask
+        assert 0x18FEF221 & mask != number & mask
