@@ -66,6 +66,22 @@ def scripts() -> dict[str, frozenset[str]]:
     return found
 
 
+def c_sources() -> dict[str, frozenset[str]]:
+    """Return, for each source of the C library, the sources whose headers it includes: one header per source."""
+    sources = {path.stem: path for path in (PACKAGE.parent / "firmware" / "src").glob("*.c")}
+    included = {name: re.findall(r'^#include "(\w+)\.h"$', path.read_text(), re.M) for name, path in sources.items()}
+    return {name: frozenset(sources.keys() & set(headers) - {name}) for name, headers in included.items()}
+
+
+def c_shared_names() -> list[str]:
+    """Return the static functions of the C library that have one name in several files: a backtrace confuses them."""
+    found: dict[str, list[str]] = {}
+    for path in sorted((PACKAGE.parent / "firmware" / "src").glob("*.c")):
+        for name in re.findall(r"^static [^=;]*?\b(\w+)\([^;]*?\)\n\{", path.read_text(), re.M):
+            found.setdefault(name, []).append(path.name)
+    return [f"{name} in {', '.join(files)}" for name, files in sorted(found.items()) if len(files) > 1]
+
+
 def circles(imports: Mapping[str, Collection[str]]) -> list[list[str]]:
     """Return groups of files that import each other (Tarjan's strongly connected components of more than one)."""
     number: dict[str, int] = {}
@@ -227,6 +243,13 @@ def report() -> Iterator[str]:
     yield from (f"    {shared_name}" for shared_name in shared)
     yield f"files in the fullest folder             {drawers()[0][0]:6}   aim 15 at most"
     yield from (f"    {number:3} {folder}" for number, folder in drawers() if number > 15)
+    c_files = c_sources()
+    yield f"C: sources of firmware/src              {len(c_files):6}"
+    rings_of_c = circles(c_files)
+    yield f"C: sources in a circle                  {sum(map(len, rings_of_c)):6}   aim 0"
+    yield from (f"    {' ~ '.join(ring)}" for ring in rings_of_c)
+    yield f"C: static functions of several files    {len(c_shared_names()):6}   aim 0"
+    yield from (f"    {shared_name}" for shared_name in c_shared_names())
     yield f"provision of a factory node             {entered()}"
     yield f"lines                                   {sum(number for number, _ in lines(found)):6}"
     yield from (f"    {number:6} {room}" for number, room in lines(found))

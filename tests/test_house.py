@@ -54,3 +54,14 @@ def test_scripts_of_the_page_import_each_other_one_way(house: ModuleType) -> Non
     found = house.scripts()
     assert found["views/node.js"], "the scripts' imports are not read"
     assert house.circles(found) == []
+
+
+def test_the_c_library_has_a_header_for_each_source_and_no_more_circles(house: ModuleType) -> None:
+    """Eleven sources still include each other in one circle; the lower ones must stay out of it."""
+    found = house.c_sources()
+    headers = {path.stem for path in (ROOT / "firmware" / "src").glob("*.h")}
+    assert found.keys() - headers == {"t4t"}, "its interface is the boards' alone, in teds/node.h"
+    ring = {name for group in house.circles(found) for name in group}
+    assert len(ring) <= 11
+    assert not ring & {"octets", "clock", "ndef", "isotp", "security_teds", "t4t"}
+    assert house.c_shared_names() == [], "a backtrace tells which file it was"

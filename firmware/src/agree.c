@@ -4,6 +4,10 @@
  * NIST SP 800-56A ECC CDH over two one-time keys and the station's static one, HKDF of RFC 5869. The node's identity
  * key only signs. Z, OKM and both one-time keys are wiped after use.
  */
+#include "agree.h"
+#include "clock.h"
+#include "operation.h"
+#include "teds_store.h"
 #include "inside.h"
 
 #define PENDING_NS (60u * TEDS_SECOND)

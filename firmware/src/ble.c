@@ -1,6 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* BLE (wire.md): commands and replies as frames `transaction 2, total 2, offset 2, piece` over two characteristics. The
  * GATT server, its connections and advertising are the chip's stack; when to advertise and whom to drop is said here. */
+#include "ble.h"
+#include "clock.h"
+#include "drive.h"
+#include "node.h"
+#include "session.h"
+#include "stream.h"
 #include "inside.h"
 
 #if TEDS_BLE
@@ -12,7 +18,7 @@
 #define STRANGER_NS (10u * TEDS_SECOND)
 #define TAPPED_NS (60u * TEDS_SECOND)
 
-static teds_ble_line *line_of(teds_node *node, uint8_t connection)
+static teds_ble_line *find_connection(teds_node *node, uint8_t connection)
 {
     return connection < TEDS_BLE_CONNECTIONS && node->ble.lines[connection].used ? &node->ble.lines[connection] : NULL;
 }
@@ -37,7 +43,7 @@ void teds_ble_connected(teds_node *node, uint8_t connection, uint16_t mtu)
 
 void teds_ble_mtu(teds_node *node, uint8_t connection, uint16_t mtu)
 {
-    teds_ble_line *line = line_of(node, connection);
+    teds_ble_line *line = find_connection(node, connection);
     if (line != NULL) {
         line->mtu = mtu > LEAST_MTU ? mtu : LEAST_MTU;
     }
@@ -45,14 +51,14 @@ void teds_ble_mtu(teds_node *node, uint8_t connection, uint16_t mtu)
 
 void teds_ble_disconnected(teds_node *node, uint8_t connection)
 {
-    teds_ble_line *line = line_of(node, connection);
+    teds_ble_line *line = find_connection(node, connection);
     if (line != NULL) {
         teds_wipe(line, sizeof *line);
         teds_node_link_lost(node, link_of(connection));
     }
 }
 
-static void request(teds_node *node, uint8_t connection, teds_ble_line *line)
+static void run_request(teds_node *node, uint8_t connection, teds_ble_line *line)
 {
     const teds_arrival arrival = {TEDS_AT_BLE, false, false, teds_now(node)};
     uint8_t transaction[2];
@@ -68,7 +74,7 @@ static void request(teds_node *node, uint8_t connection, teds_ble_line *line)
 /* Offset 0 begins anew; a frame that does not continue what is held drops it. Nothing is answered to either. */
 void teds_ble_written(teds_node *node, uint8_t connection, const uint8_t *value, size_t length)
 {
-    teds_ble_line *line = line_of(node, connection);
+    teds_ble_line *line = find_connection(node, connection);
     size_t octets = length - HEAD;
     uint16_t transaction, total, offset;
     if (line == NULL) {
@@ -98,13 +104,13 @@ void teds_ble_written(teds_node *node, uint8_t connection, const uint8_t *value,
     line->held = (uint16_t)(offset + octets);
     if (line->held == total) {
         line->holds = false;
-        request(node, connection, line);
+        run_request(node, connection, line);
     }
 }
 
 size_t teds_ble_notify(teds_node *node, uint8_t connection, uint8_t out[MOST_VALUE])
 {
-    teds_ble_line *line = line_of(node, connection);
+    teds_ble_line *line = find_connection(node, connection);
     const teds_stored_reply *reply;
     size_t room, left;
     if (line == NULL || !line->sends) {
@@ -141,7 +147,7 @@ uint16_t teds_ble_longest(const teds_node *node, teds_link link)
 
 void teds_ble_hears(teds_node *node, uint8_t connection, bool hears)
 {
-    teds_ble_line *line = line_of(node, connection);
+    teds_ble_line *line = find_connection(node, connection);
     teds_session *session = teds_session_on(node, link_of(connection));
     if (line == NULL) {
         return;
@@ -162,7 +168,7 @@ size_t teds_ble_data(teds_node *node, uint8_t *connection, uint8_t out[TEDS_BLE_
 
 void teds_ble_driven(teds_node *node, uint8_t connection, const uint8_t *value, size_t length)
 {
-    if (line_of(node, connection) != NULL && length > 0 && value[0] == 0) {
+    if (find_connection(node, connection) != NULL && length > 0 && value[0] == 0) {
         teds_drive_message(node, link_of(connection), value + 1, length - 1);
     }
 }
@@ -186,7 +192,7 @@ bool teds_ble_advertises(const teds_node *node)
 
 bool teds_ble_drops(teds_node *node, uint8_t connection)
 {
-    teds_ble_line *line = line_of(node, connection);
+    teds_ble_line *line = find_connection(node, connection);
     if (line == NULL) {
         return false;
     }

@@ -1,6 +1,14 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* CAN (wire.md): lines to stations, one long request at a time, replies, Identify asked of everyone, Announce and Claim,
  * and what leaves next. */
+#include "can.h"
+#include "clock.h"
+#include "drive.h"
+#include "isotp.h"
+#include "node.h"
+#include "operation.h"
+#include "session.h"
+#include "stream.h"
 #include "inside.h"
 
 #define PHYSICAL 0x18DA0000u

@@ -1,6 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* The commit of a datasheet (security-teds.md, 5): every check in its order, then one transaction; and the other changes
  * of the durable state. */
+#include "commit.h"
+#include "agree.h"
+#include "security_teds.h"
+#include "teds_store.h"
 #include "inside.h"
 
 #define SEQUENCE_WINDOW 65536u

@@ -1,6 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* Drive (operation.md, 4 and 6): values for actuators by message, without a reply. Whatever is wrong with a message, it is
  * dropped without a word; a good tag uses its counter up all the same. */
+#include "drive.h"
+#include "clock.h"
+#include "isotp.h"
+#include "operation.h"
+#include "session.h"
 #include "inside.h"
 
 #if TEDS_OPERATION

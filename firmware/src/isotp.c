@@ -4,6 +4,7 @@
  * Its own 2 KB instead of an operating system's: the profile wants a reply for each pair of addresses, refusals from a
  * first frame, and frames that can be taken back.
  */
+#include "isotp.h"
 #include "inside.h"
 
 #define PADDING 0xCC

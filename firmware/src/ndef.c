@@ -1,5 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* NDEF messages, their framing alone (NFC Forum NDEF 1.0, 3.2): what a reader wrote, and the records that a node gives. */
+#include "ndef.h"
 #include "inside.h"
 
 #if TEDS_NFC

@@ -1,22 +1,23 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* One node: which command may be run when (security-teds.md, 4), routing, and the commands that need little. */
+#include "node.h"
+#include "agree.h"
+#include "ble.h"
+#include "can.h"
+#include "clock.h"
+#include "commit.h"
+#include "drive.h"
+#include "isotp.h"
+#include "operation.h"
+#include "session.h"
+#include "stream.h"
+#include "teds_store.h"
+#include "tnep.h"
 #include "inside.h"
 
 #define ADDRESS_NS (10u * TEDS_SECOND)
 #define STRANGER_NS TEDS_SECOND
 #define KEEP_NS (20u * TEDS_SECOND)
-
-uint64_t teds_now(const teds_node *node)
-{
-    return node->port->now(node->port->user);
-}
-
-void teds_sooner(uint64_t *due, uint64_t at)
-{
-    if (at < *due) {
-        *due = at;
-    }
-}
 
 /* -- permission: the first question asked of a command --------------------------------------------------------------- */
 

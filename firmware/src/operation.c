@@ -1,6 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* Measurement operation inside a session (operation.md, 1, 2, 5): claims, leases, dead-men, single values. Streams,
  * clock and trigger are stream.c. Checks run in the order in which operation.md writes them. */
+#include "operation.h"
+#include "clock.h"
+#include "drive.h"
+#include "stream.h"
+#include "teds_store.h"
 #include "inside.h"
 
 #if TEDS_OPERATION

@@ -1,5 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* The Security TEDS (security-teds.md, 1): the initial one, and the canonical form of a signed one. Octets alone. */
+#include "security_teds.h"
 #include "inside.h"
 
 /* Checksum of a TEDS whose `length` octets stand before it. */

@@ -1,6 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* Sessions (security-teds.md, 4): Open, Sealed, their lives and ends. Sessions and half-open Opens are tables apart, so
  * that nobody's plain question, and nobody's Open, ends a session. */
+#include "session.h"
+#include "agree.h"
+#include "clock.h"
+#include "operation.h"
+#include "teds_store.h"
 #include "inside.h"
 
 #define HALF_OPEN_NS (60u * TEDS_SECOND)

@@ -2,6 +2,13 @@
 /* Streams and trigger (operation.md, 3, 4, 5): Subscribe, Stop, samples when they are due, data messages sealed and cut
  * into frames, Arm. A stream has one message being filled and one that waits; a waiting one is dropped when the next is
  * full: newest wins. One message at a time is being sent. */
+#include "stream.h"
+#include "agree.h"
+#include "ble.h"
+#include "clock.h"
+#include "isotp.h"
+#include "operation.h"
+#include "session.h"
 #include "inside.h"
 
 #if TEDS_OPERATION

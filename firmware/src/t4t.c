@@ -1,6 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* A Type 4 tag (NFC Forum T4T 2.0): one NDEF file that anybody reads and writes, its APDUs, and ISO-DEP below them
  * (ISO/IEC 14443-4, 7). For chips whose hardware or library does neither. */
+#include "tnep.h"
 #include "inside.h"
 
 #if TEDS_NFC

@@ -6,6 +6,14 @@
  * RAM follows. The old slot is erased when the reply has left. At a start the good slot with the higher counter counts,
  * and the other one is erased if it is not blank: whatever was cut, there is the old state or the new one, whole.
  */
+#include "teds_store.h"
+#include "agree.h"
+#include "ble.h"
+#include "can.h"
+#include "clock.h"
+#include "commit.h"
+#include "operation.h"
+#include "security_teds.h"
 #include "inside.h"
 
 /* identity area: magic 4, version 1, 0 0 0, UUID 10, key 32, point 65, field 102 64, zeros, CRC-32 in the last 4 */

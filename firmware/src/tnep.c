@@ -3,6 +3,10 @@
  *
  * One buffer is the NDEF file: the reader's message is read from it, the answer is put there. While a command runs it is
  * empty, which says "need more time". */
+#include "tnep.h"
+#include "clock.h"
+#include "ndef.h"
+#include "node.h"
 #include "inside.h"
 
 #if TEDS_NFC
@@ -29,7 +33,7 @@ static size_t most(const teds_node *node)
     return told != 0 && told < TEDS_MAX_NDEF ? told : TEDS_MAX_NDEF;
 }
 
-static void put(teds_node *node, size_t length)
+static void show_message(teds_node *node, size_t length)
 {
     node->nfc.length = (uint16_t)length;
     teds_put16(node->nfc.file, (uint16_t)length);
@@ -110,7 +114,7 @@ static void show_initial(teds_node *node)
     node->nfc.shows_initial = true;
     at += 23;
     at += airs ? out_of_band(node, out + at) : 0;
-    put(node, at);
+    show_message(node, at);
 }
 
 /* -- pieces ----------------------------------------------------------------------------------------------------------- */
@@ -140,7 +144,7 @@ static size_t put_status(uint8_t *out, uint8_t marks, uint8_t status)
 
 static void say_status(teds_node *node, uint8_t status)
 {
-    put(node, put_status(node->nfc.file + 2, TEDS_NDEF_BEGINS | TEDS_NDEF_ENDS, status));
+    show_message(node, put_status(node->nfc.file + 2, TEDS_NDEF_BEGINS | TEDS_NDEF_ENDS, status));
 }
 
 /* Te 00 and a piece, whose body is copied in. */
@@ -160,7 +164,7 @@ static void say_piece(teds_node *node, const piece *own)
         memcpy(payload + PIECE_HEAD, own->body, own->length);
     }
     teds_put32(payload + 8, teds_crc32(teds_crc32(0, payload, 8), payload + PIECE_HEAD, own->length));
-    put(node, at + PIECE_HEAD + own->length);
+    show_message(node, at + PIECE_HEAD + own->length);
 }
 
 static size_t room(const teds_node *node)
@@ -271,14 +275,14 @@ static void answer_other(teds_node *node, size_t length)
     } else {
         const size_t at = put_status(out, octets == 0 ? TEDS_NDEF_BEGINS | TEDS_NDEF_ENDS : TEDS_NDEF_BEGINS, SUCCESS);
         memcpy(out + at, node->nfc.request, (size_t)octets);
-        put(node, at + (size_t)octets);
+        show_message(node, at + (size_t)octets);
     }
     teds_wipe(node->nfc.request, sizeof node->nfc.request);
 }
 
 /* -- the conversation --------------------------------------------------------------------------------------------------- */
 
-static void answer(teds_node *node, size_t length)
+static void answer_message(teds_node *node, size_t length)
 {
     teds_nfc *nfc = &node->nfc;
     teds_ndef came;
@@ -364,7 +368,7 @@ void teds_nfc_came(teds_node *node, size_t length)
     node->nfc.busy_until = node->nfc.tick + BUSY_NS;
     node->nfc.came = (uint16_t)length;
     node->nfc.shows_initial = false;
-    put(node, 0);
+    show_message(node, 0);
 }
 
 bool teds_nfc_written(teds_node *node, const uint8_t *message, size_t length)
@@ -390,7 +394,7 @@ void teds_nfc_poll(teds_node *node)
     }
     if (node->nfc.stage == TEDS_NFC_WRITTEN) {
         node->nfc.stage = TEDS_NFC_QUIET;
-        answer(node, node->nfc.came);
+        answer_message(node, node->nfc.came);
         node->nfc.busy_until = teds_now(node) + BUSY_NS;
     } else if (node->nfc.shows_initial) {
         uint8_t identity[23];

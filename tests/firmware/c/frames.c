@@ -1,6 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* ISO-TP, Announce and Claim as the bus sees them: frames in, frames out, time in the test's hands. */
 #include "check.h"
+#include "isotp.h"
 #include "inside.h"
 #include "memory.h"
 

@@ -1,6 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 #include "memory.h"
 
+#include "can.h"
+#include "operation.h"
+#include "security_teds.h"
+#include "session.h"
+#include "stream.h"
+#include "teds_store.h"
 #include "inside.h"
 
 #include <bearssl.h>

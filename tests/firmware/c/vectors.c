@@ -1,6 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* The published vectors (`make vectors-c`), in C alone: canonical forms, every transcript, every exchange on CAN. */
 #include "check.h"
+#include "security_teds.h"
 #include "inside.h"
 #include "memory.h"
 #include "teds_vectors.h"

@@ -1,0 +1,17 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+/* The conversation with a reader over NDEF messages. */
+#ifndef TEDS_SRC_TNEP_H
+#define TEDS_SRC_TNEP_H
+
+#include "inside.h"
+
+#if TEDS_NFC
+enum { TEDS_NFC_QUIET, TEDS_NFC_WRITTEN };
+/* True if the application's services have names and room in the initial message. */
+bool teds_nfc_services_good(const teds_config *config);
+void teds_nfc_start(teds_node *node);
+void teds_nfc_came(teds_node *node, size_t length);
+void teds_nfc_poll(teds_node *node);
+#endif
+
+#endif
