@@ -239,7 +239,12 @@ def fit(
     """
     if laboratory is not None and dcc is None:
         raise UsageError("--laboratory belongs to a certificate.", hint="Add --dcc OUT.xml.")
-    text = read_text(file, LIMITS.text_file, "calibration")
+    if file.suffix.lower() == ".xml" and profile is None:
+        raise UsageError(
+            "A certificate is fitted for a transducer type.",
+            hint=f"Add --profile P, or see: teds-provision show {file}",
+        )
+    text = "" if file.suffix.lower() == ".xml" else read_text(file, LIMITS.text_file, "calibration")
     warnings: tuple[str, ...] = ()
     if profile is not None:
         if method is not None or degree is not None:

@@ -124,3 +124,8 @@ def test_a_fit_is_written_as_a_certificate_that_calibrates(home: Path, tmp_path:
     assert bare.code == 0
     assert "does not state: laboratory, country, person, customer, certificate" in bare.err
     assert call(home, *fit, "--laboratory", EXAMPLES / "laboratory.toml").code == 2
+    certified = call(home, "--json", "calibrate", "fit", out)
+    assert certified.code == 2
+    assert "--profile" in certified.json["error"]["hint"]
+    again = call(home, "--json", "calibrate", "fit", out, "--profile", "magnetic-angular-position-sensor")
+    assert again.json["residuals"][0]["raw"] == POINTS[0][0]

@@ -6,6 +6,7 @@ What nobody stated is written as ``not stated``; the schema demands a name there
 from __future__ import annotations
 
 import hashlib
+import re
 import xml.etree.ElementTree as ET  # writing only
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -25,6 +26,7 @@ VERSION: Final = "3.2.1"
 NOT_STATED: Final = "not stated"
 UNKNOWN_COUNTRY: Final = "ZZ"
 """ISO 3166-1 leaves this code to its users: no country was stated."""
+_VERSION: Final = re.compile(r"[0-9]{1,3}(?:\.[0-9]{1,3}){0,3}")
 _REFERENCE: Final = "basic_referenceValue"
 _INDICATED: Final = "basic_measuredValue teds_rawValue"
 _FITTED: Final = "teds_fittedValue"
@@ -124,7 +126,7 @@ def write_certificate(
     data = ET.SubElement(root, "dcc:administrativeData")
     used = ET.SubElement(ET.SubElement(data, "dcc:dccSoftware"), "dcc:software")
     _name(used, "teds-provision")
-    _text(used, "dcc:release", software)
+    _text(used, "dcc:release", _release(software))
     _core(data, laboratory, performed, today, hashlib.sha256(source).hexdigest())
     _item(data, laboratory, node)
     _contact(ET.SubElement(data, "dcc:calibrationLaboratory"), "dcc:contact", laboratory.laboratory, laboratory)
@@ -208,7 +210,10 @@ def _result(results: ET.Element, number: int, calibration: Calibration, laborato
         _write_conditions(measured, laboratory.conditions)
     result = ET.SubElement(ET.SubElement(measured, "dcc:results"), "dcc:result")
     _name(result, f"Points of channel {number}")
-    table = ET.SubElement(ET.SubElement(result, "dcc:data"), "dcc:list", {"id": f"channel-{number}"})
+    data = ET.SubElement(
+        result, "dcc:data", {"refId": f"channel-{number}"}
+    )  # PTB's rules ask that an id is referred to
+    table = ET.SubElement(data, "dcc:list", {"id": f"channel-{number}"})
     unit = calibration.unit
     uncertainty = calibration.uncertainty
     expanded = None if uncertainty is None else uncertainty * laboratory.coverage_factor
@@ -266,6 +271,12 @@ def _column(
         _text(stated, "si:uncertaintyXMLList", f"{expanded * abs(scale):.6g}")
         _text(stated, "si:coverageFactorXMLList", _number(factor))
         _text(stated, "si:coverageProbabilityXMLList", "0.95")
+
+
+def _release(version: str) -> str:
+    """``v0.1.0`` of ``0.1.0.dev3``: the form that PTB's rules ask for."""
+    found = _VERSION.match(version)
+    return f"v{found[0]}" if found is not None else "v0"
 
 
 def _number(value: float) -> str:
