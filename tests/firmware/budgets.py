@@ -43,7 +43,7 @@ POINTS: Final = {
 }
 STEPS: Final = {
     "m0": {
-        "first-start": Cost(25_885_200, 3796),
+        "first-start": Cost(25_901_880, 3892),
         "identify": Cost(400, 196),
         "prove": Cost(14_765_480, 3820),
         "one-time-key": Cost(10_506_920, 2476),
@@ -58,7 +58,7 @@ STEPS: Final = {
         "data-message-of-25": Cost(138_600, 1364),
     },
     "m4": {
-        "first-start": Cost(10_282_280, 2760),
+        "first-start": Cost(10_294_200, 2856),
         "identify": Cost(280, 160),
         "prove": Cost(5_570_320, 2752),
         "one-time-key": Cost(4_334_600, 1244),
@@ -73,8 +73,8 @@ STEPS: Final = {
         "data-message-of-25": Cost(82_000, 1264),
     },
     "m33": {
-        "first-start": Cost(10_284_850, 2760),
-        "identify": Cost(300, 160),
+        "first-start": Cost(10_296_800, 2856),
+        "identify": Cost(250, 160),
         "prove": Cost(5_571_950, 2752),
         "one-time-key": Cost(4_335_000, 1244),
         "request": Cost(31_414_100, 2808),
