@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 MOST_OCTETS: Final = 32 << 20
 _SHOWN: Final = 12
+_NO_MESSAGE: Final = "VECTOR__INDEPENDENT_SIG_MSG"
+"""Holds signals that no message carries."""
 _J1939_SIZES: Final = (8, 16, 24, 32)
 _ERROR, _NOT_AVAILABLE = 0xFE, 0xFF
 """Highest octet of a J1939 parameter that is in error or not available (SAE J1939-71, table 1)."""
@@ -109,6 +111,7 @@ def read(path: Path, message: str | None = None) -> DbcMessage:
     octets = read_limited(path, MOST_OCTETS, "DBC file")
     messages = _messages(path, octets)
     found = _chosen(path, messages, message)
+    _require_sound(path, found)
     period = found.cycle_time / 1000 if found.cycle_time else 0.0
     origin = Origin("dbc", found.name, hashlib.sha256(octets).hexdigest())
     channels = tuple(_channel(found, signal, period) for signal in _in_order(found))
@@ -129,11 +132,24 @@ def _messages(path: Path, octets: bytes) -> list[Message]:
     except UnicodeDecodeError:
         text = octets.decode("cp1252", errors="replace")  # the encoding of the tools that write DBC files
     try:
-        loaded = database.load_string(text, database_format="dbc")
+        # another message of the file may overlap itself: the one that is wrapped is checked alone
+        loaded = database.load_string(text, database_format="dbc", strict=False)
     except Exception as error:  # parsers under cantools raise their own errors, KeyError and ValueError
         reason = str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
         raise BadDataError(f"{path} is not a DBC file that can be read: {reason}", hint="Check the file.") from error
-    return [message for message in getattr(loaded, "messages", ()) if message.signals]
+    messages = getattr(loaded, "messages", ())
+    return [message for message in messages if message.signals and message.name != _NO_MESSAGE]
+
+
+def _require_sound(path: Path, message: Message) -> None:
+    """Raise BadDataError if signals of the message overlap, or lie outside it."""
+    from cantools.database.errors import Error
+
+    try:
+        message.refresh(strict=True)
+    except Error as error:
+        why = f"{path}: the message {message.name} cannot be decoded: {error}"
+        raise BadDataError(why, hint="Check the file.") from error
 
 
 def _chosen(path: Path, messages: list[Message], name: str | None) -> Message:
