@@ -14,6 +14,7 @@ from teds_provision.errors import UsageError
 from teds_provision.lazy import lazy
 from teds_provision.measure.display_units import FileUnits
 from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, as_sink_failure
+from teds_provision.measure.sinks.foxglove import FoxgloveSink
 from teds_provision.measure.sinks.mcap.recording import McapSink
 from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
@@ -47,6 +48,7 @@ SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {
     "ros2": ros2_sink,
     "mqtt": MqttSink,
     "mqtts": MqttSink,
+    "foxglove": FoxgloveSink,
 }
 
 

@@ -1,9 +1,11 @@
-"""MCAP recorder: one topic for each stream at full rate, the datasheet's facts beside it, reports as diagnostics.
+"""MCAP recorder: one topic for each stream at full rate, one for each channel, the datasheet's facts, reports.
 
-A message holds one instant of a stream (definition SAMPLES below, CDR, described in the file itself, so that readers of
-ROS 2 messages decode it): calibrated values, NaN where not valid, and the raw values. Its log time is the instant.
-Chunks are 64 KiB and at most FLUSH old. The facts of channels are in the metadata of their stream's topic, in a
-metadata record, and in a ``std_msgs/String`` on ``…/teds`` at the start of each file, where ``ros2 bag`` users look.
+A message of a stream holds one instant of it (definition SAMPLES below, CDR, described in the file itself, so that
+readers of ROS 2 messages decode it): calibrated values, NaN where not valid, and the raw values. Its log time is the
+instant. Unless the sink was made without, each channel also has a topic of ``std_msgs/Float64``, which viewers plot
+without a panel of their own. Chunks are 64 KiB and at most FLUSH old. The facts of channels are in the metadata of
+their stream's topic, in a metadata record, and in a ``std_msgs/String`` on ``…/teds`` at the start of each file, where
+``ros2 bag`` users look.
 """
 
 from __future__ import annotations
@@ -46,6 +48,8 @@ int32 sec
 uint32 nanosec
 """
 STRING = "string data\n"
+FLOAT_TYPE, FLOAT = "std_msgs/msg/Float64", "float64 data\n"
+"""One value of one channel in its SI unit, NaN if it is not valid; the log time is that of the sample."""
 QOS = "offered_qos_profiles"
 """QoS that rosbag2 keeps of each topic, so that `ros2 bag play` offers the publisher's: YAML, as from Iron on."""
 _NEVER = "{sec: 9223372036, nsec: 854775807}"
@@ -63,8 +67,9 @@ LITTLE_ENDIAN = int.from_bytes(_HEAD, "little")
 class McapSink(FileSink):
     """Recorder of MCAP; see the module."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, scalars: bool = True) -> None:
         super().__init__(path)
+        self._scalars: dict[tuple[str, int], np.ndarray] | None = {} if scalars else None
         self._writer: McapWriter | None = None
         self._opened = 0.0
         self._schemas: dict[str, int] = {}
@@ -92,6 +97,8 @@ class McapSink(FileSink):
             TYPE: self._writer.schema(TYPE, SAMPLES),
             "": self._writer.schema("std_msgs/msg/String", STRING),
         }
+        if self._scalars is not None:
+            self._schemas[FLOAT_TYPE], self._scalars = self._writer.schema(FLOAT_TYPE, FLOAT), {}
         self._writer.metadata(
             "measurement",
             {
@@ -144,6 +151,8 @@ class McapSink(FileSink):
             self._string(self._names.of_node(uuid, "teds"), json.dumps({"uuid": uuid, "channels": every}), time.time())
         # A stream's topic carries facts in its metadata, so changed ones need a topic record of their own.
         self._streams = {key: value for key, value in self._streams.items() if key[0] not in uuids}
+        if self._scalars is not None:
+            self._scalars = {key: value for key, value in self._scalars.items() if key[0] not in uuids}
 
     def _string(self, topic: str, words: str, at: float) -> None:
         if topic not in self._strings:
@@ -153,17 +162,12 @@ class McapSink(FileSink):
         self._out.add_message(self._strings[topic], 0, int(at * 1e9), data)
 
     def _report(self, report: NodeReport) -> None:
-        words = {
-            name: getattr(report, name)
-            for name in ("uuid", "state", "why", "samples", "lost", "late", "bad", "invalid")
-        }
-        words["clock_error"] = report.clock_error
-        words["invalid_why"] = [asdict(invalid) for invalid in report.invalid_why]
-        self._string(f"/{self._names.station}/reports", json.dumps(words), report.time or time.time())
+        words = json.dumps(report_as_json(report))
+        self._string(f"/{self._names.station}/reports", words, report.time or time.time())
 
     def _stream(self, block: Block) -> tuple[int, np.ndarray]:
         """Return the topic of a stream, and a message of it with all that is the same in each."""
-        integral = block.raw.dtype.kind in "uib"
+        integral = is_integral(block)
         key = (block.uuid, block.stream, block.channels, "i" if integral else "f")
         if key not in self._streams:
             known = [self.facts.get((block.uuid, number)) for number in block.channels]
@@ -174,36 +178,34 @@ class McapSink(FileSink):
             topic = self._names.of_node(block.uuid, f"stream_{block.stream}")
             metadata = {QOS: RELIABLE, "uuid": block.uuid, "channels": json.dumps(labels)}
             number = self._out.channel(topic, self._schemas[TYPE], metadata)
-            self._streams[key] = number, _plain(number, len(block.channels), integral)
+            self._streams[key] = number, plain_samples(number, len(block.channels), integral)
         return self._streams[key]
 
     def _block(self, block: Block) -> None:
-        raw = block.raw
-        if raw.dtype.kind == "O":
-            # Octet strings have no place in this message; what is a number in them is kept as nearly as a float can.
-            raw = np.array(
-                [[cell if isinstance(cell, int | float) else np.nan for cell in row] for row in raw.tolist()],
-                dtype=np.float64,
-            )
         channel, plain = self._stream(block)
-        n = len(block.time)
-        nanoseconds = np.rint(block.time * 1e9).astype(np.uint64)
-        rows = plain.repeat(n)
-        index = np.arange(block.index, block.index + n)
-        rows["sequence"] = index & 0xFFFFFFFF
-        rows["times"] = nanoseconds[:, None]
-        rows["sec"], rows["nanosec"] = np.divmod(nanoseconds, 10**9)
-        rows["index"] = index
-        rows["tick"] = block.tick
-        if block.clock_error is not None:
-            rows["clock_error"] = block.clock_error
-        if block.test_pattern:
-            rows["test"] = True
-        rows["value"] = block.value
-        rows["raw"] = raw.view(np.int64) if raw.dtype == np.uint64 else raw
-        self._out.add_messages(channel, rows.tobytes(), nanoseconds.tolist())
+        rows, times = samples(block, plain), nanoseconds(block.time).tolist()
+        self._out.add_messages(channel, rows.tobytes(), times)
+        if self._scalars is not None and not block.test_pattern:  # a Float64 cannot be marked as a test pattern
+            for column, number in enumerate(block.channels):
+                self._scalar(block, column, number, times)
         self._in_chunk += block.value.size
-        self._count(written=block.value.size, messages=n)
+        self._count(written=block.value.size, messages=len(times))
+
+    def _scalar(self, block: Block, column: int, number: int, times: list[int]) -> None:
+        """Write one channel of a block as messages of one value."""
+        assert self._scalars is not None
+        key = (block.uuid, number)
+        if key not in self._scalars:
+            facts = self.facts.get(key)
+            unit = facts.unit if facts is not None else ""
+            metadata = {QOS: RELIABLE, "uuid": block.uuid, "channel": str(number), "unit": unit}
+            topic = self._out.channel(self._names.channel(block.uuid, number), self._schemas[FLOAT_TYPE], metadata)
+            self._scalars[key] = _plain_float(topic)
+        rows = self._scalars[key].repeat(len(times))
+        rows["sequence"] = np.arange(block.index, block.index + len(times)) & 0xFFFFFFFF
+        rows["times"] = nanoseconds(block.time)[:, None]
+        rows["data"] = block.value[:, column]
+        self._out.add_messages(int(rows["channel"][0]), rows.tobytes(), times)
 
     def _note(self, at: float, text: str) -> None:
         self._out.metadata("note", {"time": iso(at), "note": text})
@@ -224,12 +226,63 @@ class McapSink(FileSink):
             recover(path)
 
 
+def report_as_json(report: NodeReport) -> dict[str, Any]:
+    """Return the report of a node as it is on ``reports``."""
+    names = ("uuid", "state", "why", "samples", "lost", "late", "bad", "invalid", "clock_error")
+    why = [asdict(invalid) for invalid in report.invalid_why]
+    return {**{name: getattr(report, name) for name in names}, "invalid_why": why}
+
+
+def nanoseconds(times: np.ndarray) -> np.ndarray:
+    """Return unix seconds as whole nanoseconds."""
+    return np.rint(times * 1e9).astype(np.uint64)
+
+
+def samples(block: Block, plain: np.ndarray) -> np.ndarray:
+    """Return a message record of SAMPLES for each instant of a block; ``plain`` comes from :func:`plain_samples`."""
+    raw = block.raw
+    if raw.dtype.kind == "O":
+        # Octet strings have no place in this message; what is a number in them is kept as nearly as a float can.
+        raw = np.array(
+            [[cell if isinstance(cell, int | float) else np.nan for cell in row] for row in raw.tolist()],
+            dtype=np.float64,
+        )
+    times = nanoseconds(block.time)
+    rows = plain.repeat(len(times))
+    index = np.arange(block.index, block.index + len(times))
+    rows["sequence"] = index & 0xFFFFFFFF
+    rows["times"] = times[:, None]
+    rows["sec"], rows["nanosec"] = np.divmod(times, 10**9)
+    rows["index"] = index
+    rows["tick"] = block.tick
+    if block.clock_error is not None:
+        rows["clock_error"] = block.clock_error
+    if block.test_pattern:
+        rows["test"] = True
+    rows["value"] = block.value
+    rows["raw"] = raw.view(np.int64) if raw.dtype == np.uint64 else raw
+    return rows
+
+
+def is_integral(block: Block) -> bool:
+    """Return True if the raw values of a block go into ``raw`` of SAMPLES, rather than ``raw_float``."""
+    return block.raw.dtype.kind in "uib"
+
+
+def _plain_float(channel: int) -> np.ndarray:
+    """Return an array of one message record of Float64 without its number."""
+    row = np.zeros(1, dtype=_FLOAT_LAYOUT)
+    row["code"], row["length"], row["channel"] = MESSAGE, row.dtype.itemsize - 9, channel
+    row["cdr"] = LITTLE_ENDIAN
+    return row
+
+
 def _as_texts(facts: dict[str, Any]) -> dict[str, str]:
     """Return metadata of MCAP as texts: other values become JSON."""
     return {name: value if isinstance(value, str) else json.dumps(value) for name, value in facts.items()}
 
 
-def _plain(channel: int, channels: int, integral: bool) -> np.ndarray:
+def plain_samples(channel: int, channels: int, integral: bool) -> np.ndarray:
     """Return an array of one message record without its numbers; those of a block are as many copies of it."""
     row = np.zeros(1, dtype=layout(channels, integral))
     row["code"], row["length"], row["channel"] = MESSAGE, row.dtype.itemsize - 9, channel
@@ -237,6 +290,19 @@ def _plain(channel: int, channels: int, integral: bool) -> np.ndarray:
     row["clock_error"] = np.nan
     row["values"] = row["raws" if integral else "floats"] = channels
     return row
+
+
+_FLOAT_LAYOUT = np.dtype(
+    [
+        ("code", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("times", "<u8", (2,)),  # logged, published
+        ("cdr", "<u4"),
+        ("data", "<f8"),
+    ]
+)
 
 
 def layout(channels: int, integral: bool) -> np.dtype[Any]:

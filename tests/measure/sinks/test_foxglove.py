@@ -1,0 +1,93 @@
+"""``foxglove``: the live server, read by a client of another process that decodes every schema that it is sent.
+
+The client speaks the protocol itself over ``websockets``; Foxglove's own application is not run here.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from teds_provision.errors import LinkError, UsageError
+from teds_provision.measure.blocks import NodeReport
+from teds_provision.measure.sinks.foxglove import FoxgloveSink, address_of
+
+from .parts import ANGLE, ARM, STATION, block
+
+pytest.importorskip("foxglove")
+CLIENT = Path(__file__).parent / "foxglove_client.py"
+
+
+def client(port: int, messages: int, channels: int) -> subprocess.Popen[str]:
+    """Start a client that reads so many messages; its first line says that it has subscribed."""
+    return subprocess.Popen(
+        [sys.executable, str(CLIENT), str(port), str(messages), str(channels)],
+        stdout=subprocess.PIPE,
+        stdin=subprocess.PIPE,
+        text=True,
+    )
+
+
+def received(sink: FoxgloveSink, items: list[Any], messages: int, channels: int) -> dict[str, Any]:
+    sink.open((ANGLE,), STATION)
+    sink.write(items[0])  # so that its channels exist when the client subscribes
+    with client(sink.port, messages, channels) as reader:
+        assert reader.stdout is not None
+        assert json.loads(reader.stdout.readline())["subscribed"]
+        for item in items[1:]:
+            sink.report(item) if isinstance(item, NodeReport) else sink.write(item)
+        try:
+            found: dict[str, Any] = json.loads(reader.stdout.readline())
+        finally:
+            reader.kill()
+    sink.close()
+    assert sink.stats.error == ""
+    return found
+
+
+def test_a_client_of_another_process_decodes_streams_channels_reports_and_parameters() -> None:
+    data = block([[10, 20], [11, 21]], valid=[[True, False], [True, True]], channels=(1, 2), index=5)
+    report = NodeReport(ARM, "running", lost=3, time=1_795_000_001.0)
+    found = received(FoxgloveSink("foxglove:127.0.0.1:0"), [block(channels=(1, 2), raw=[[1, 2]]), data, report], 7, 5)
+    streams = found["messages"]["/bench/arm/stream_0"]
+    assert [message["index"] for message in streams] == [5, 6]
+    assert [message["raw"] for message in streams] == [[10, 20], [11, 21]]
+    assert [message["time"] / 1e9 for message in streams] == pytest.approx(data.time.tolist(), abs=1e-6)
+    angles = found["messages"]["/bench/arm/angle"]
+    np.testing.assert_array_equal([message["data"] for message in angles], data.value[:, 0])
+    assert [message["time"] for message in angles] == [message["time"] for message in streams]
+    assert np.isnan(found["messages"]["/bench/arm/ch2"][0]["data"])
+    assert json.loads(found["messages"]["/bench/reports"][0]["data"])["lost"] == 3
+    facts = json.loads(found["parameters"]["/bench/arm/angle"])
+    assert (facts["unit"], facts["fingerprint"]) == ("rad", "ab" * 32)
+    assert found["set"] == found["parameters"], "nothing can be set"
+    assert json.loads(found["messages"]["/bench/arm/teds"][0]["data"])["uuid"] == ARM, (
+        "a late subscriber gets the facts"
+    )
+
+
+def test_without_scalars_there_are_streams_alone() -> None:
+    sink = FoxgloveSink("foxglove:127.0.0.1:0", scalars=False)
+    found = received(sink, [block([[1]]), block([[7]])], 1, 3)
+    assert set(found["channels"]) == {"/bench/arm/stream_0", "/bench/arm/teds", "/bench/reports"}
+
+
+def test_only_this_machine_is_served_and_a_taken_port_is_said() -> None:
+    assert address_of("foxglove") == ("127.0.0.1", 8765)
+    assert address_of("foxglove:[::1]:9000") == ("::1", 9000)
+    for spec in ("foxglove:192.168.1.2:8765", "foxglove:0.0.0.0:8765", "foxglove:bench:8765", "foxglove:127.0.0.1:x"):
+        with pytest.raises(UsageError):
+            address_of(spec)
+    first = FoxgloveSink("foxglove:127.0.0.1:0")
+    first.open((ANGLE,), STATION)
+    try:
+        with pytest.raises(LinkError, match=str(first.port)):
+            FoxgloveSink(f"foxglove:127.0.0.1:{first.port}").open((ANGLE,), STATION)
+    finally:
+        first.close()
