@@ -80,6 +80,9 @@ KINDS = ("periodic", "event", "free")
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
 @click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST, with Home Assistant discovery.")
+@click.option("--foxglove", is_flag=True, help="Serve live values to Foxglove on 127.0.0.1:8765.")
+@click.option("--foxglove-at", metavar="HOST:PORT", help="Serve them on this address of this machine.")
+@click.option("--no-scalars", is_flag=True, help="Leave out the single-value topics of MCAP and Foxglove.")
 @click.option("--actuators/--no-actuators", default=True, show_default=True, help="Accept set points from ROS topics.")
 @click.option("--dead-man", type=WholeNumber(20, 10_000), default=1000, show_default=True, metavar="MS",
               help="Time without set points before an actuator goes to its safe state.")  # fmt: skip
@@ -100,6 +103,9 @@ def measure(
     wide: bool,
     file_units: FileUnits,
     mqtt: str | None,
+    foxglove: bool,
+    foxglove_at: str | None,
+    no_scalars: bool,
     require: Path | None,
     output: Path | None,
     **wished: Any,
@@ -125,7 +131,11 @@ def measure(
     links = where_met(station, links, uuids)
     _require_streams(links, trigger=wished["trigger"])
     ros = [name for name in ("ros1", "ros2") if wished[name]]
-    kept = _asked(group, uuids, [*files, *ros, *filter(None, [mqtt])], wished | {"require": _requirements(require)})
+    live = [f"foxglove:{foxglove_at}"] if foxglove_at else ["foxglove"] if foxglove else []
+    sinks = [*files, *ros, *filter(None, [mqtt]), *live]
+    if no_scalars:
+        sinks = [measure_room.sinks.without_scalars(sink) for sink in sinks]
+    kept = _asked(group, uuids, sinks, wished | {"require": _requirements(require)})
     if group and duration is None:
         kept = _carried_on(app, station, kept)
     job = measure_room.running.measurement_job.MeasurementJob(

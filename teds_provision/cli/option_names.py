@@ -12,7 +12,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "provision": frozenset({"profile", "calibration", "item", "trust-dcc", "due", "no-calibration", "name", "accept-calibration", "retype", "adopt", "watch", "batch", "report", "all", "job", "calibrations", "files", "only", "label-to", "label-format", "scan", "evidence", "operator", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "verify": frozenset({"accept-calibration", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "nodes": frozenset({"state", "profile", "group", "due", "since", "fits", "format", "plant"}),
-    "measure": frozenset({"rate", "duration", "channel", "kind", "trigger", "test-pattern", "unsigned", "to", "wide", "file-units", "output", "ros1", "ros2", "mqtt", "actuators", "dead-man", "require", "scalar-rate", "via", "nfc", "can", "ble", "timeout", "trace"}),
+    "measure": frozenset({"rate", "duration", "channel", "kind", "trigger", "test-pattern", "unsigned", "to", "wide", "file-units", "output", "ros1", "ros2", "mqtt", "foxglove", "foxglove-at", "no-scalars", "actuators", "dead-man", "require", "scalar-rate", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "trust add": frozenset({"from", "role", "fingerprint", "yes", "dry-run"}),
     "trust ca drop": frozenset({"yes"}),
     "trust ca sign": frozenset({"output", "yes", "dry-run"}),

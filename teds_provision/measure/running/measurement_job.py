@@ -29,6 +29,7 @@ from teds_provision.measure.buses import Buses
 from teds_provision.measure.request import MeasurementRequest, Requirements
 from teds_provision.measure.runner import Measurement, MeasurementEnd, Watcher
 from teds_provision.measure.sinks import CommandTaker, Sink, open_sink
+from teds_provision.measure.sinks.foxglove import ARRAYS
 from teds_provision.measure.sinks.shown import SHOWN
 from teds_provision.measure.sinks.wide import WIDE
 from teds_provision.protocol.operation.stream_commands import StreamKind
@@ -42,14 +43,16 @@ AGAIN, LONGEST = 1.0, 30.0  # seconds until a measurement that failed as a whole
 
 def whole_path(spec: str) -> str:
     """Return the string of a sink as it can be stored: a file's absolute path, whatever the folder is next time."""
-    if spec.partition(":")[0] in _SERVICES:
+    if spec.removeprefix(ARRAYS).partition(":")[0] in _SERVICES:
         return spec
+    if spec.startswith(ARRAYS):
+        return ARRAYS + str(Path(spec.removeprefix(ARRAYS)).absolute())
     shown = SHOWN if spec.startswith(SHOWN) else ""
     wide = WIDE if spec.removeprefix(shown).startswith(WIDE) else ""
     return shown + wide + str(Path(spec.removeprefix(shown + wide)).absolute())
 
 
-_SERVICES = frozenset({"ros1", "ros2", "mqtt", "mqtts"})
+_SERVICES = frozenset({"ros1", "ros2", "mqtt", "mqtts", "foxglove"})
 
 
 class MeasurementJob:

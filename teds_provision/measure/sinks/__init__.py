@@ -14,7 +14,7 @@ from teds_provision.errors import UsageError
 from teds_provision.lazy import lazy
 from teds_provision.measure.display_units import FileUnits
 from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, as_sink_failure
-from teds_provision.measure.sinks.foxglove import FoxgloveSink
+from teds_provision.measure.sinks.foxglove import ARRAYS, FoxgloveSink
 from teds_provision.measure.sinks.mcap.recording import McapSink
 from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
@@ -52,6 +52,17 @@ SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {
 }
 
 
+def without_scalars(spec: str) -> str:
+    """Return the string of a sink without topics of single channels; of one that never has them unchanged."""
+    plain = is_foxglove(spec) or (spec.partition(":")[0] not in SERVICES and Path(spec).suffix.lower() == ".mcap")
+    return f"{ARRAYS}{spec}" if plain and not spec.startswith(ARRAYS) else spec
+
+
+def is_foxglove(spec: str) -> bool:
+    """Return True for ``foxglove`` and ``foxglove:HOST:PORT``."""
+    return spec.partition(":")[0] == "foxglove"
+
+
 def in_units(spec: str, units: FileUnits) -> str:
     """Return the string of a sink whose file has these units; of one that is always in SI unchanged."""
     text = units == "shown" and spec.partition(":")[0] not in SERVICES and Path(spec).suffix.lower() in SHOWN_FILES
@@ -61,10 +72,13 @@ def in_units(spec: str, units: FileUnits) -> str:
 def open_sink(spec: str, commands: CommandTaker | None = None) -> Sink:
     """Return the sink of a spec, not yet opened.
 
-    A file, ``wide:FILE``, either of them behind ``shown:`` for display units, ``ros1[:URL]``, ``ros2[:DOMAIN]`` or
-    ``mqtt://HOST``. ``commands`` receives set points that come by the sink; None if no actuator may be moved. Raises
-    UsageError.
+    A file, ``wide:FILE``, either of them behind ``shown:`` for display units, ``ros1[:URL]``, ``ros2[:DOMAIN]``,
+    ``mqtt://HOST`` or ``foxglove[:HOST:PORT]``; MCAP and Foxglove behind ``arrays:`` have no topics of single channels.
+    ``commands`` receives set points that come by the sink; None if no actuator may be moved. Raises UsageError.
     """
+    if spec.startswith(ARRAYS):
+        bare = spec.removeprefix(ARRAYS)
+        return FoxgloveSink(bare, scalars=False) if is_foxglove(bare) else McapSink(Path(bare), scalars=False)
     service = spec.partition(":")[0]
     if service in SERVICES:
         return SERVICES[service](spec, commands)

@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     import foxglove
 
 FOXGLOVE: Final = "foxglove"
+ARRAYS: Final = "arrays:"
+"""Prefix of the string of a sink without topics of single channels: this one and MCAP."""
 PORT: Final = 8765
 """The port that Foxglove offers when a connection is opened."""
 _HEAD: Final = b"\x00\x01\x00\x00"

@@ -16,6 +16,8 @@ import pytest
 
 from teds_provision.errors import LinkError, UsageError
 from teds_provision.measure.blocks import NodeReport
+from teds_provision.measure.running.measurement_job import whole_path
+from teds_provision.measure.sinks import open_sink, without_scalars
 from teds_provision.measure.sinks.foxglove import FoxgloveSink, address_of
 
 from .parts import ANGLE, ARM, STATION, block
@@ -76,6 +78,15 @@ def test_without_scalars_there_are_streams_alone() -> None:
     sink = FoxgloveSink("foxglove:127.0.0.1:0", scalars=False)
     found = received(sink, [block([[1]]), block([[7]])], 1, 3)
     assert set(found["channels"]) == {"/bench/arm/stream_0", "/bench/arm/teds", "/bench/reports"}
+
+
+def test_a_kept_sink_is_made_again_as_it_was_asked_for(tmp_path: Path) -> None:
+    for spec in ("foxglove", "foxglove:127.0.0.1:9000", str(tmp_path / "run.mcap")):
+        bare = without_scalars(spec)
+        assert whole_path(bare) == bare == f"arrays:{spec}"
+        assert type(open_sink(bare)) is type(open_sink(spec))
+    assert without_scalars("ros2") == "ros2"
+    assert without_scalars("run.csv") == "run.csv"
 
 
 def test_only_this_machine_is_served_and_a_taken_port_is_said() -> None:
