@@ -64,7 +64,7 @@ class FoxgloveSink(ThreadedSink):
 
     @property
     def port(self) -> int:
-        """The port on which it listens, 0 before :meth:`open`."""
+        """The port on which it listens, 0 before it is opened."""
         return int(self._server.port) if self._server is not None else 0
 
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
