@@ -93,6 +93,13 @@ def zygote() -> Zygote:
     return made
 
 
+def _imports_ours(program: tuple[str, ...]) -> bool:
+    """Return True for the program and for modules of the tests; the strangers share nothing with either."""
+    if program[:2] != PROGRAM[:2] or len(program) != len(PROGRAM):
+        return False
+    return program == PROGRAM or (program[2].startswith("tests.") and not program[2].startswith("tests.strangers."))
+
+
 def begin(
     *words: object,
     out: int,
@@ -105,18 +112,19 @@ def begin(
 ) -> Forked | subprocess.Popen[bytes]:
     """Start the program as a process of its own that writes to two files; the passphrase goes by --passphrase-fd.
 
-    By a fork of the zygote where nobody could tell, else (and without ``fork``) by starting an interpreter.
+    It, and a module of the tests, is a fork of the zygote where nobody could tell, else (and without ``fork``) a start
+    of an interpreter.
     """
     read, write = os.pipe()
     asked = environment if environment is not None else clean_environment()
-    fork = fork and program == PROGRAM and forkable(asked, zygote().environment)
+    fork = fork and _imports_ours(program) and forkable(asked, zygote().environment)
     given = [] if passphrase is None else ["--passphrase-fd", str(FIRST_FD if fork else read)]
     os.write(write, (passphrase or "").encode() + b"\n")
     os.close(write)
     whole, folder = [*given, *map(str, words)], cwd or Path.cwd()
     try:
         if fork:
-            return zygote().run(PROGRAM[-1], whole, asked, out=out, err=err, given=(read,), cwd=folder)
+            return zygote().run(program[-1], whole, asked, out=out, err=err, given=(read,), cwd=folder)
         return subprocess.Popen(
             [*program, *whole],
             stdin=subprocess.DEVNULL,

@@ -3,15 +3,17 @@ from __future__ import annotations
 import json
 import os
 import selectors
-import subprocess
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.cli.shell import begin
 from tests.pace import PATIENCE
 from tests.places import free_reader
 
@@ -23,11 +25,13 @@ class Process:
     """A helper process whose lines of output are waited for."""
 
     def __init__(self, module: str, argument: str) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", f"tests.links.nfc.{module}", argument], cwd=ROOT, stdout=subprocess.PIPE, bufsize=0
-        )
-        assert self._process.stdout is not None
-        self._out = self._process.stdout
+        read, write = os.pipe()
+        program = (sys.executable, "-m", f"tests.links.nfc.{module}")
+        try:
+            self._process = begin(argument, out=write, err=2, cwd=ROOT, program=program)
+        finally:
+            os.close(write)
+        self._out = FileIO(read)
         os.set_blocking(self._out.fileno(), False)
         self._lines: list[str] = []
         self._rest = b""
@@ -56,11 +60,11 @@ class Process:
 
     def kill(self) -> None:
         self._process.kill()
-        self._process.wait()
+        self._process.wait(PATIENCE)
 
     def end(self) -> None:
-        self._process.terminate()
-        self._process.wait(60)
+        self._process.send_signal(signal.SIGTERM)
+        self._process.wait(PATIENCE)
 
     def close(self) -> None:
         if self._process.poll() is None:
