@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 @click.option(
     "--factory",
     is_flag=True,
-    help="Also key, write and reset the node; it ends in factory state, and one of this station's nodes loses its key.",
+    help="Also key, write and reset the node, and claim an actuator without moving it; the node ends in factory state,"
+    " and one of this station's nodes loses its key.",
 )
 @click.option(
     "--explain",
@@ -52,12 +53,18 @@ def check(app: App, factory: bool, explain: bool, yes: bool, dry_run: bool, link
     """
     station = app.station()
     if dry_run:
-        plan = "key, write and reset the node, then every rule" if factory else "the rules that change no key"
+        plan = (
+            "key, write and reset the node, claim an actuator, every rule"
+            if factory
+            else "the rules that change no key"
+        )
         app.emit({"plan": plan}, f"Plan: {plan}.")
         return
     if factory:
         app.confirm(
-            "Key, write and reset the node found? If it is one of yours, it loses its key and datasheet.", yes=yes
+            "Key, write and reset the node found, and claim an actuator that it has? If the node is one of yours, it loses"
+            " its key and datasheet.",
+            yes=yes,
         )
     report = check_room.run.check_at(station, links, reporter_for(app), factory=factory, explained=explain)
     counts = {result: report.count(result) for result in ("passed", "failed", "skipped")}
