@@ -37,6 +37,8 @@ class Limits:
     """A calibration certificate (DCC), with the documents that it embeds."""
     certificate_tables: int = 200
     certificate_values: int = 10_000
+    certificate_pairs: int = 1000
+    """Pairs of columns of one table that could be indication and reference value."""
     toml_parts: int = 32
     toml_depth: int = 16
     toml_keys: int = 20_000

@@ -26,7 +26,7 @@ ChooseItem = Callable[[str, Sequence[tuple[str, str]]], str]
 
 
 def split_channel(text: str) -> tuple[int | None, str]:
-    """``2=cell.xml`` as channel and file; None without a number before the file."""
+    """Return channel and file of ``2=cell.xml``; None without a number before the file."""
     number, equals, file = text.partition("=")
     if equals and file and number.isascii() and number.isdecimal() and len(number) < 4:
         return int(number), file

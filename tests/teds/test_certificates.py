@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from datetime import UTC, date, datetime
@@ -283,6 +284,24 @@ def test_a_hostile_or_broken_certificate_is_refused_with_its_place(octets: bytes
     with pytest.raises(BadDataError, match=r"c\.xml") as told:
         read_certified(octets, "c.xml", angle)
     assert why in told.value.message
+
+
+def test_the_largest_certificates_that_are_read_cost_seconds(angle: Profile) -> None:
+    """Many columns were paired each with each: thousands of millions of pairs of a file of 8 MiB."""
+    text = ANGLE.decode()
+    start, end = text.index('<dcc:list id="channel-1">'), text.index("</dcc:list>", text.index("channel-1"))
+    column = (
+        "<dcc:quantity><si:realListXMLList><si:valueXMLList>1 2</si:valueXMLList><si:unitXMLList>\\one</si:unitXMLList>"
+        "</si:realListXMLList></dcc:quantity>"
+    )
+    whole = f'{text[:start]}<dcc:list id="channel-1">{column * 3_000}{text[end:]}'.encode()
+    began = time.process_time()
+    with pytest.raises(BadDataError, match="pairs of columns"):
+        read_certified(whole, "c.xml", angle)
+    assert time.process_time() - began < 10
+    rows = f"<dcc:list>{column.replace('1 2', '1')}{column.replace('1 2', '2')}</dcc:list>" * 1_500
+    assert read_certificate(f"{text[:start]}<dcc:list>{rows}{text[end:]}".encode(), "c.xml").tables
+    assert time.process_time() - began < 10
 
 
 def test_columns_of_unequal_length_make_no_points(angle: Profile) -> None:

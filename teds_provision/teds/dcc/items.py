@@ -12,6 +12,7 @@ from itertools import pairwise
 from typing import Final
 
 from teds_provision.errors import BadDataError, UsageError
+from teds_provision.limits import LIMITS, check_count
 from teds_provision.teds.calibration.order import CalibrationOrder
 from teds_provision.teds.certificate import CertificateChoice
 from teds_provision.teds.codec.model import Units
@@ -49,7 +50,7 @@ class CertificateItem:
 
     @property
     def title(self) -> str:
-        """The item for people: name, state, what is in it."""
+        """Return the item for people: name, state, content."""
         state = f", {self.table.state}" if self.table.state else ""
         name = self.table.name or "(no name)"
         if self.indicated is None:
@@ -58,7 +59,7 @@ class CertificateItem:
         return f"{name}{state}: {len(self.reference.values)} points, {of}"
 
     def to_json(self) -> dict[str, object]:
-        """The item as ``show`` and errors give it."""
+        """Return the item as ``show`` gives it."""
         return {
             "id": self.id,
             "name": self.table.name,
@@ -74,7 +75,7 @@ class CertificateItem:
 
 
 def items_of(certificate: DigitalCertificate) -> list[CertificateItem]:
-    """Every result that could calibrate a channel of some unit."""
+    """Return every result that could calibrate a channel of some unit."""
     return [item for table in certificate.tables for item in _items(table)]
 
 
@@ -90,19 +91,21 @@ def _items(table: ResultTable) -> list[CertificateItem]:
 
 
 def _pairs(table: ResultTable) -> Iterator[tuple[Quantity, Quantity]]:
-    """Columns that can be indication and reference value: by their reference types, else any two."""
-    columns = [quantity for quantity in table.quantities if not quantity.has_role(*_ERROR, *_ASIDE)]
+    """Yield columns that can be indication and reference value: by their reference types, else any two."""
+    columns = [q for q in table.quantities if len(q.values) > 1 and not q.has_role(*_ERROR, *_ASIDE)]
     references = [column for column in columns if column.has_role(*_REFERENCE)]
     indicated = [column for column in columns if column.has_role(*_INDICATED)]
     unnamed = [column for column in columns if column not in references and column not in indicated]
-    for reference in references or unnamed:
-        for other in indicated or unnamed:
-            if other is not reference and len(other.values) == len(reference.values) > 1:
+    firsts, seconds = references or unnamed, indicated or unnamed
+    check_count(len(firsts) * len(seconds), LIMITS.certificate_pairs, "pairs of columns in a table of the certificate")
+    for reference in firsts:
+        for other in seconds:
+            if other is not reference and len(other.values) == len(reference.values):
                 yield other, reference
 
 
 def _of_coefficients(table: ResultTable) -> Iterator[CertificateItem]:
-    """Coefficients of a polynomial of the raw number: a list c0, c1 …, or slope and intercept."""
+    """Yield coefficients of a polynomial of the raw number: a list c0, c1 …, or slope and intercept."""
     for quantity in table.quantities:
         if quantity.has_role("coefficients"):
             yield CertificateItem(table.id, table, quantity, coefficients=(quantity,))
@@ -169,7 +172,7 @@ def _listed(items: Sequence[CertificateItem]) -> str:
 
 
 def _misfit(item: CertificateItem, channel: ChannelProfile) -> str:
-    """Why an item cannot calibrate a channel; "" if it can."""
+    """Return why an item cannot calibrate a channel; "" if it can."""
     if not _same_kind(item.reference.unit, channel.units):
         return f"its values are in {_unit_name(item.reference.unit)}"
     if item.indicated is None:
@@ -238,7 +241,7 @@ def order_of(certificate: DigitalCertificate, item: CertificateItem, channel: Ch
 
 
 def _raw(value: float, unit: WrittenUnit, channel: ChannelProfile, *, is_raw: bool) -> float:
-    """The raw number of an indication: a plain number as it is, a value as the profile or a float channel says."""
+    """Return the raw number of an indication: a plain number itself, a value by the profile or as a float channel."""
     indication = channel.calibration.indication
     if is_raw or indication is None:
         return value if unit.scale == 1 and unit.offset == 0 else unit.to_si(value)
@@ -247,7 +250,7 @@ def _raw(value: float, unit: WrittenUnit, channel: ChannelProfile, *, is_raw: bo
 
 
 def _converted(value: float, unit: WrittenUnit, to: WrittenUnit) -> float:
-    """A value in another unit of the same kind; unchanged, to the last digit, in an equal one."""
+    """Return a value in another unit of the same kind; unchanged, to the last digit, in an equal one."""
     if (unit.scale, unit.offset) == (to.scale, to.offset):
         return value
     return to.from_si(unit.to_si(value))
@@ -264,7 +267,7 @@ def _coefficients(item: CertificateItem, channel: ChannelProfile) -> list[float]
 
 
 def _uncertainty(item: CertificateItem, channel: ChannelProfile, points: Sequence[tuple[float, float]]) -> float | None:
-    """Largest standard uncertainty that the table states, in the unit of the channel.
+    """Return the largest standard uncertainty that the table states, in the unit of the channel.
 
     One of the indication counts with the steepest part of the curve, if the indication is a raw number.
     """
@@ -278,7 +281,7 @@ def _uncertainty(item: CertificateItem, channel: ChannelProfile, points: Sequenc
 
 
 def _largest_uncertainty(table: ResultTable, unit: WrittenUnit) -> float | None:
-    """Largest standard uncertainty of the quantities of one kind in a table, in this unit."""
+    """Return the largest standard uncertainty of the quantities of one kind in a table, in this unit."""
     stated = [
         _difference(quantity.standard_uncertainty, quantity.unit, unit)
         for quantity in table.quantities

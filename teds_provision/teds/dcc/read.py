@@ -75,7 +75,7 @@ class ResultTable:
 
 @dataclass(frozen=True)
 class Condition:
-    """Something that held during the calibration, as text with its unit."""
+    """A condition during the calibration, as text with its unit."""
 
     name: str
     text: str
@@ -83,7 +83,7 @@ class Condition:
 
 @dataclass(frozen=True)
 class Device:
-    """What was calibrated; ``identifications`` are (who gave it, the value)."""
+    """A calibrated device; ``identifications`` are (issuer, value)."""
 
     name: str
     manufacturer: str
@@ -173,7 +173,7 @@ def _untried(version: str) -> str:
 
 
 def _numbered(tables: Sequence[ResultTable]) -> tuple[ResultTable, ...]:
-    """Tables without an id get their number, which no XML id can be."""
+    """Return the tables; those without an id get their number, which no XML id can be."""
     named = [replace(table, id=table.id or str(number)) for number, table in enumerate(tables, 1)]
     seen: set[str] = set()
     for table in named:
@@ -208,7 +208,7 @@ class _Reader:
         self.warnings: tuple[str, ...] = ()
 
     def name(self, node: Node, *, required: bool = False) -> str:
-        """Text of ``dcc:name``: in the language, else without one, else the first."""
+        """Return the text of ``dcc:name``: in the language, else without one, else the first."""
         holder = node.one("dcc:name") if required else node.maybe("dcc:name")
         contents = holder.every("dcc:content") if holder is not None else []
         by_language = {content.element.get("lang"): content.text for content in reversed(contents)}
@@ -218,7 +218,7 @@ class _Reader:
         return "".join(letter for letter in text if letter.isprintable())[:_TEXT]
 
     def device(self, item: Node) -> Device:
-        """One calibrated item."""
+        """Read one calibrated item."""
         maker, model = item.maybe("dcc:manufacturer"), item.maybe("dcc:model")
         return Device(
             self.name(item),
@@ -231,7 +231,7 @@ class _Reader:
         )
 
     def conditions(self, result: Node) -> list[Condition]:
-        """Influence conditions with their numbers; a condition with tables is a result, and not listed here."""
+        """Read influence conditions with their numbers; a condition with tables is a result, and not listed here."""
         found = []
         for condition in result.all_of("dcc:influenceConditions/dcc:influenceCondition"):
             quantities = condition.all_of("dcc:data/dcc:quantity")
@@ -252,7 +252,7 @@ class _Reader:
         return f"{numbers}{' …' * (len(quantity.values) > 8)}{unit}"
 
     def tables(self, result: Node) -> list[ResultTable]:
-        """Tables of the results, and of influence conditions that state what was found before an adjustment."""
+        """Read tables of the results, and of influence conditions that state what was found before an adjustment."""
         found: list[ResultTable] = []
         for holder in (
             *result.all_of("dcc:influenceConditions/dcc:influenceCondition"),
@@ -285,7 +285,7 @@ class _Reader:
         return table + [inner for row in rows for inner in self._table(row, name, state or _state_of(row))]
 
     def _rows(self, rows: Sequence[Node]) -> tuple[Quantity, ...] | None:
-        """Columns of a list of points, each of which is a list of single values in the same order."""
+        """Return the columns of a list of points, each of which is a list of single values in the same order."""
         points = []
         for row in rows:
             if row.every("dcc:list"):
@@ -325,7 +325,7 @@ class _Reader:
 
 
 def _state_of(node: Node) -> str:
-    """State that a reference type names: ``basic_beforeAdjustment``."""
+    """Return the state that a reference type names: ``basic_beforeAdjustment``."""
     words = {ref.rpartition("_")[2] for ref in node.ref_types}
     return next((text for word, text in _STATES.items() if word in words), "")
 

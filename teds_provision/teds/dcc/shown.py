@@ -25,7 +25,7 @@ class ShownCertificate:
         return cls(certificate, tuple(items_of(certificate)))
 
     def to_json(self) -> dict[str, Any]:
-        """Everything that was read."""
+        """Return everything that was read."""
         known = self.certificate
         return {
             "file": known.file,
@@ -56,7 +56,7 @@ class ShownCertificate:
         }
 
     def lines(self) -> Iterator[tuple[str, str]]:
-        """Lines of (label, text)."""
+        """Yield lines of (label, text)."""
         known = self.certificate
         yield "certificate", known.number
         yield "laboratory", f"{known.laboratory}, {known.country}"
@@ -75,7 +75,7 @@ class ShownCertificate:
 
 
 def points_of(item: CertificateItem) -> Sequence[tuple[str, str]]:
-    """Rows of an item for people: indication and reference value, the first of many."""
+    """Return rows of an item for people: indication and reference value, the first of many."""
     if item.indicated is None:
         values = [value for part in item.coefficients for value in part.values]
         return [(f"c{power}", f"{value:.9g}") for power, value in enumerate(values)]

@@ -35,7 +35,7 @@ _RESIDUAL: Final = "teds_residual"
 
 @dataclass(frozen=True)
 class QuantityCondition:
-    """A number that held during the calibration."""
+    """A number that describes the circumstances of a calibration."""
 
     name: str
     value: float
@@ -225,7 +225,7 @@ def _result(results: ET.Element, number: int, calibration: Calibration, laborato
 
 
 def _formula(calibration: Calibration) -> str:
-    """Coefficients of a curve of one segment, as text; "" for a table."""
+    """Return the coefficients of a curve of one segment, as text; "" for a table."""
     part = calibration.inputs[0]
     if len(calibration.inputs) != 1 or part.segments != 1:
         return ""
@@ -274,13 +274,13 @@ def _column(
 
 
 def _release(version: str) -> str:
-    """``v0.1.0`` of ``0.1.0.dev3``: the form that PTB's rules ask for."""
+    """Return ``v0.1.0`` for ``0.1.0.dev3``: the form that PTB's rules ask for."""
     found = _VERSION.match(version)
     return f"v{found[0]}" if found is not None else "v0"
 
 
 def _number(value: float) -> str:
-    """A number as D-SI writes it, with all its digits; a whole number without a point."""
+    """Return a number as D-SI writes it, with all its digits; a whole number without a point."""
     return str(int(value)) if value == int(value) and abs(value) < 1e15 else repr(value)
 
 

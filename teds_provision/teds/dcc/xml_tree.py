@@ -34,7 +34,7 @@ class XmlElement(Protocol):
     sourceline: int | None
 
     def get(self, key: str) -> str | None:
-        """Value of an attribute."""
+        """Return the value of an attribute."""
 
     def __iter__(self) -> Iterator[XmlElement]: ...
     def __len__(self) -> int: ...
@@ -92,7 +92,7 @@ def _check_depth(root: XmlElement, file: str) -> None:
 
 
 def qualified(name: str) -> str:
-    """``dcc:result`` as lxml names it."""
+    """Return the name that lxml gives to ``dcc:result``."""
     prefix, _, local = name.partition(":")
     return f"{{{NAMESPACES[prefix]}}}{local}"
 
@@ -125,7 +125,7 @@ class Node:
         return tuple((self.element.get("refType") or "").split())
 
     def every(self, *names: str) -> list[Node]:
-        """Children of these names, in the order of the document."""
+        """Return the children of these names, in the order of the document."""
         wanted = {qualified(name) for name in names}
         return [Node(child, self.file) for child in self.element if child.tag in wanted]
 
