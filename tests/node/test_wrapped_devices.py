@@ -353,3 +353,13 @@ def test_iio_devices_that_cannot_be_wrapped(sysfs: Callable[..., Path], tmp_path
             require_match(place, [origin], ["a"])
     with pytest.raises(UsageError, match="one node only"):
         require_match(SensorPlace("iio:bmp280"), [origin, origin], ["a", "b"])
+
+
+def test_what_a_device_sends_by_default_is_measured_whoever_may_write_it(tmp_path: Path) -> None:
+    path = tmp_path / "cell.eds"
+    text = EDS.read_text()
+    before, torque, after = text.partition("ParameterName=torque")
+    path.write_text(before + torque + after.replace("AccessType=ro", "AccessType=rw", 1))
+    assert [channel.name for channel in canopen_device.read(path).channels] == ["torque", "temperature"]
+    path.write_text(path.read_text().replace("DefaultValue=0x60000110", "DefaultValue=0x60000210"))
+    assert [channel.name for channel in canopen_device.read(path).channels] == ["temperature"]

@@ -1,6 +1,6 @@
 """A CANopen device as a wrapped sensor: its channels from the EDS or DCF (python-canopen).
 
-Channels are the objects that can be mapped into a PDO and only read: what a sensor measures.
+Channels are the objects that are in a transmit PDO by default, and those that could be and are only read.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ _FIRST_OBJECT: Final = 0x2000
 """Objects below this one describe the communication (CiA 301)."""
 _COMMUNICATION, _MAPPING = 0x1800, 0x1A00
 _MOST_PDOS: Final = 512
+_MOST_MAPPED: Final = 64
 _EVENT_TIMER: Final = 5
 _BOOLEAN = 1
 _SIGNED: Final = {2: 8, 3: 16, 4: 32, 0x10: 24, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64}
@@ -59,11 +60,10 @@ def read(path: Path) -> WrappedSensor:
 def described(path: Path, octets: bytes, objects: ObjectDictionary) -> WrappedSensor:
     """Return the sensor of an object dictionary."""
     name = " ".join((objects.device_information.product_name or path.stem).split())
-    periods = _periods(objects)
-    channels = tuple(_channels(objects, periods))
+    channels = tuple(_channels(objects, _sent_objects(objects)))
     if not channels:
         raise BadDataError(
-            f"{path} has no object that can be mapped into a PDO and only read.",
+            f"{path} has no object that is sent in a PDO, or could be and is only read.",
             hint="A sensor has objects with PDOMapping=1 and AccessType=ro.",
         )
     origin = Origin("eds", name[:60], hashlib.sha256(octets).hexdigest())
@@ -74,12 +74,14 @@ def measured_objects(objects: ObjectDictionary) -> Iterator[ODVariable]:
     """Yield the objects that become channels, by index and sub-index."""
     import canopen
 
+    sent = _sent_objects(objects)
     for entry in sorted(objects.values(), key=lambda entry: entry.index):
         if entry.index < _FIRST_OBJECT:
             continue
         parts = [entry] if isinstance(entry, canopen.objectdictionary.ODVariable) else list(entry.values())
         for part in sorted(parts, key=lambda part: part.subindex):
-            if part.pdo_mappable and part.access_type in ("ro", "rwr") and _bits(part):
+            readable = part.pdo_mappable and part.access_type in ("ro", "rwr")
+            if _bits(part) and (readable or (part.index, part.subindex) in sent):
                 yield part
 
 
@@ -88,14 +90,14 @@ def _bits(variable: ODVariable) -> int:
     return _SIGNED.get(kind) or _UNSIGNED.get(kind) or _FLOATS.get(kind) or 0
 
 
-def _channels(objects: ObjectDictionary, periods: dict[tuple[int, int], float]) -> Iterator[WrappedChannel]:
+def _channels(objects: ObjectDictionary, sent: dict[tuple[int, int], float]) -> Iterator[WrappedChannel]:
     found = list(measured_objects(objects))
     names = [_name(variable, found) for variable in found]
     for variable, name in zip(found, names, strict=True):
         unit, note = written_unit(variable.unit or "")
-        period = periods.get((variable.index, variable.subindex))
+        period = sent.get((variable.index, variable.subindex))
         notes = [note] if note else []
-        if period is None:
+        if not period:
             notes.append(f"the file states no event timer for it, so {DEFAULT_PERIOD * 1000:g} ms is assumed")
         is_float = variable.data_type in _FLOATS
         scale = float(variable.factor or 1)
@@ -127,18 +129,16 @@ def _name(variable: ODVariable, others: list[ODVariable]) -> str:
     return f"{variable.qualname} {variable.index:04X}.{variable.subindex}"
 
 
-def _periods(objects: ObjectDictionary) -> dict[tuple[int, int], float]:
-    """Return the event timer in seconds of the PDO that each object is in by default."""
-    periods: dict[tuple[int, int], float] = {}
+def _sent_objects(objects: ObjectDictionary) -> dict[tuple[int, int], float]:
+    """Return the objects that are in a transmit PDO by default, with its event timer in seconds; 0 if none is set."""
+    sent: dict[tuple[int, int], float] = {}
     for number in range(_MOST_PDOS):
         timer = _default(objects, _COMMUNICATION + number, _EVENT_TIMER)
-        if not timer:
-            continue
-        for place in range(1, 65):
+        for place in range(1, _MOST_MAPPED + 1):
             mapped = _default(objects, _MAPPING + number, place)
             if mapped:
-                periods.setdefault((mapped >> 16, mapped >> 8 & 0xFF), timer / 1000)
-    return periods
+                sent.setdefault((mapped >> 16, mapped >> 8 & 0xFF), timer / 1000)
+    return sent
 
 
 def _default(objects: ObjectDictionary, index: int, subindex: int) -> int:
