@@ -22,6 +22,7 @@ from teds_provision.errors import (
     TedsProvisionError,
     UsageError,
 )
+from teds_provision.handover.life import is_retired
 from teds_provision.measure.blocks import ChannelFacts, NodeReport, SetPointCommand, StationFacts
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.discovery import CanDiscovery
@@ -69,6 +70,7 @@ class RunningMeasurement:
     past: set[str] = field(default_factory=set)  # whose reports are obsolete
     stop: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
+    asked: KeptMeasurement | None = None  # as it was asked for; ``kept`` has the nodes of a frozen expression
 
 
 @dataclass(eq=False)
@@ -480,7 +482,7 @@ class MeasurementSupervisor:
 
     def _begin(self, kept: KeptMeasurement) -> RunningMeasurement:
         uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
-        one = RunningMeasurement(kept, uuids)
+        one = RunningMeasurement(kept, uuids, asked=kept)
         comes = kept.match is not None and not kept.frozen
         with self._guard:
             self._running[kept.id] = one
@@ -498,7 +500,9 @@ class MeasurementSupervisor:
     def _take_new_members(self, running: RunningMeasurement) -> bool:
         """Read again which nodes a measurement has; False if it is not kept any more, because none is left."""
         try:
-            kept = self._station.measurements.get(running.kept.id)
+            kept = running.asked  # of a frozen expression the nodes are looked for again
+            if kept is None or kept.match is None:
+                kept = self._station.measurements.get(running.kept.id)
             uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
         except NotFoundError as error:
             self._publish_state(running, "ended", error.message)
@@ -511,9 +515,14 @@ class MeasurementSupervisor:
             running.reports = {uuid: report for uuid, report in running.reports.items() if uuid in uuids}
         return True
 
+    def _is_retired(self, uuid: str) -> bool:
+        return is_retired(self._station.nodes.get(bytes.fromhex(uuid)))
+
     def _has_other_members(self, running: RunningMeasurement, job: MeasurementJob) -> bool:
         """Return True if `replace` or `decommission` changed the nodes of a measurement in the store."""
-        if running.kept.match is not None or running.kept.frozen:
+        if running.kept.frozen:  # nobody else joins or leaves
+            return any(self._is_retired(uuid) for uuid in running.uuids)
+        if running.kept.match is not None:
             return False
         kept = next((kept for kept in self._station.measurements.all() if kept.id == running.kept.id), None)
         if kept is None:  # deleted by `decommission`, unless it came to its end
@@ -586,6 +595,7 @@ class MeasurementSupervisor:
                 if not why_not_measured(self._station, uuid)
                 and not match.why_not(self._station, uuid)
                 and self._station.nodes.datasheet(uuid) is not None
+                and not self._is_retired(uuid.hex())
                 and self.measurement_of(uuid.hex()) is None
             ]
             if meant:

@@ -218,3 +218,17 @@ def test_a_consumer_that_goes_on_moves_nothing_after_its_signer_lost_trust(hall:
         finally:
             publisher.kill()
             publisher.wait()
+
+
+def test_a_node_that_was_taken_out_of_service_is_not_tried_for_ever_by_a_frozen_measurement(hall: Hall) -> None:
+    uuid = hall.nodes["g"].uuid
+    service = Service(hall.desk, hall.station).start()
+    assert verdict(verified(service, uuid)) == "authentic"
+    with service.client() as asked:
+        asked.request("POST", "/measurements", {"match": "type:gripper", "frozen": True, "rate": 20})
+        until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured")
+        hall.station.ask("decommission", uuid, "--force", "--yes", "--can", hall.can, "--timeout", 2)
+        [one] = until(lambda: [known for known in asked.measurements() if not known["uuids"]], asked.measurements)
+        assert (one["state"], one["why"]) == ("waiting", "no known node matches")
+        until(lambda: asked.node(uuid)["measuring"] is None, lambda: asked.node(uuid)["measuring"])
+    service.end()
