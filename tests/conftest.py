@@ -129,7 +129,11 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Print what was not tested for want of a package; ``make test`` repeats it as its last line."""
-    skipped = [report for report in terminalreporter.stats.get("skipped", []) if "system" in report.keywords]
+    skipped = [
+        report
+        for report in terminalreporter.stats.get("skipped", [])
+        if isinstance(report, pytest.TestReport) and "system" in report.keywords  # a module may be skipped, too
+    ]
     if skipped:
         line = f"Not tested: {len(skipped)} tests that need Debian packages. As root: sh scripts/install-test-packages"
         terminalreporter.write_line(line)
