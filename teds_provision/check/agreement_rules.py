@@ -49,7 +49,7 @@ from teds_provision.teds.image import SECURITY, BlockId
 
 _OFF_CURVE: Final = b"\x04" + bytes(64)
 _CONFIRMATIONS: Final = 6
-"""Slips of tagS that are tried, each with a Request of its own."""
+"""The slips of tagS that are tried, each with its own Request."""
 _SIGNATURES: Final = 8
 """Replies to Request whose sigN is looked at for a high s: each costs a slow node some seconds."""
 _HIGH_S: Final = "s of sigN is in the upper half of the group order; n - s is due then."
@@ -66,12 +66,12 @@ class StrangerStation:
 
     @classmethod
     def make(cls) -> StrangerStation:
-        """New keys."""
+        """Return a station with new keys."""
         return cls(SoftwareKey.generate(), SoftwareKey.generate())
 
     @property
     def credentials(self) -> Credentials:
-        """What they show."""
+        """The credentials of this station."""
         return Credentials(self.station, self.ca.sign(station_key_message(self.station.point)), self.ca.point)
 
     def request(self, *, certified: bool = True, one_time: bytes = b"", message: bytes = b"") -> bytes:
@@ -88,7 +88,7 @@ def request(payload: bytes) -> Command:
 
 
 def tapped_or_bus(probe: Probe) -> None:
-    """Whether Request is looked at on this link at all: tapped, or the bus of a node without NFC in factory state."""
+    """Raise NotApplicableError unless the link is tapped, or the bus of a factory node without NFC."""
     if probe.tapped:
         return
     if probe.plain(request(b"")).reason == Reason.NOT_PERMITTED:
@@ -109,8 +109,8 @@ class TriedRequest:
 def try_agreement(probe: Probe, credentials: Credentials, *, sealed: bool = False) -> TriedRequest:
     """Send a good Request and check its reply; nothing is kept on either side yet.
 
-    Raises RuleBrokenError where no reply of the right length with a point came; what is wrong with its tag, signature
-    or epoch stands in ``broken``.
+    Raises RuleBrokenError if no reply of the right length with a valid point came. A fault of its tag, signature or
+    epoch is returned in ``broken``.
     """
     one_time = SoftwareKey.generate()
     agreement = StationAgreement(credentials, probe.uuid, one_time=one_time)
@@ -140,7 +140,7 @@ def try_agreement(probe: Probe, credentials: Credentials, *, sealed: bool = Fals
 
 
 def _explained(made: slips.Agreement, otherwise: str) -> RuleBrokenError:
-    """What is wrong with a reply whose octets this station did not accept, and which slip would explain it."""
+    """Return the error for a reply whose octets this station did not accept, with the slip that explains it."""
     script = made.transcripts()[0][1]
     okm = made.material(made.shared, script)[0][1]
     if made.tag != next(made.tags(okm, script))[1]:
@@ -154,7 +154,10 @@ def _explained(made: slips.Agreement, otherwise: str) -> RuleBrokenError:
 
 
 def _slip_of_request(probe: Probe) -> slips.Slip | None:
-    """What a node that refuses a good SIG104 may look for: strangers' Requests are signed so, in factory state."""
+    """Return the slip by which a node that refuses a good SIG104 verifies it.
+
+    For Requests of strangers, in factory state.
+    """
     if probe.identity().state != NodeState.FACTORY:
         return None
     strange = StrangerStation.make()
@@ -168,7 +171,10 @@ def _slip_of_request(probe: Probe) -> slips.Slip | None:
 
 
 def stranger_asks(probe: Probe) -> bytes:
-    """The payload of a reply to a good Request of a stranger, which nobody confirms; raises NotApplicableError."""
+    """Return the payload of a reply to a good Request of a stranger that is never confirmed.
+
+    May raise NotApplicableError.
+    """
     return _stranger_asks(probe, request(StrangerStation.make().request())).payload
 
 
@@ -182,9 +188,9 @@ def _stranger_asks(probe: Probe, command: Command) -> Reply:
 def agree(
     probe: Probe, credentials: Credentials | None = None, *, sealed: bool = False
 ) -> tuple[AgreedKey, TriedRequest]:
-    """As :func:`try_agreement`, by this station unless told otherwise; raises RuleBrokenError for whatever is wrong.
+    """Call :func:`try_agreement`, by default for this station; raises RuleBrokenError for any fault.
 
-    The next time it raises NotApplicableError.
+    A second call after a fault raises NotApplicableError.
     """
     if probe.no_agreement:
         raise NotApplicableError(f"Needs a good reply to Request, and none came: {probe.no_agreement}")
@@ -230,13 +236,13 @@ def factory_reset(probe: Probe) -> str:
 
 @rule("reset-low-s", "Notation", Stage.FACTORY)
 def reset_low_s(probe: Probe) -> str:
-    """Whoever signs puts s into the lower half: proofs of Reset, too."""
+    """Check that the node signs with s in the lower half, in proofs of Reset too."""
     return low_s(probe, Function.RESET, "Reset (128.9)")
 
 
 @rule("confirm-without-request", "Key agreement", Stage.FACTORY)
 def confirm_without_request(probe: Probe) -> str:
-    """A Confirm with nothing pending gets 2, whatever its length."""
+    """Check that a Confirm without a pending Request gets 2, for any length."""
     tapped_or_bus(probe)
     for octets in (0, 15, 17):
         probe.refused(security_command(Function.CONFIRM, bytes(octets)), Reason.WRONG_STATE, "nothing pending")
@@ -269,7 +275,7 @@ def request_one_time(probe: Probe) -> str:
 
 @rule("request-high-s", "Notation", Stage.FACTORY)
 def request_high_s(probe: Probe) -> str:
-    """Whoever verifies refuses an s in the upper half: a Request whose SIG104 has one gets 5."""
+    """Check that the node refuses an s in the upper half: a Request with such a SIG104 gets 5."""
     tapped_or_bus(probe)
     good = StrangerStation.make().request()
     high = GROUP_ORDER - int.from_bytes(good[97:129], "big")
@@ -279,7 +285,7 @@ def request_high_s(probe: Probe) -> str:
 
 @rule("request", "Key agreement", Stage.FACTORY)
 def request_answered(probe: Probe) -> str:
-    """A good Request of whatever station is answered in factory state, by 165 octets."""
+    """Check that a good Request of any station is answered in factory state, by 165 octets."""
     tapped_or_bus(probe)
     command = request(StrangerStation.make().request())
     reply = probe.plain(command)
@@ -293,7 +299,7 @@ def request_answered(probe: Probe) -> str:
 
 @rule("agreement-epoch", "Key agreement", Stage.FACTORY)
 def agreement_epoch(probe: Probe) -> str:
-    """The epoch that Request offers is the stored one + 1, and Request alone changes nothing."""
+    """Check that Request offers the stored epoch + 1, and alone changes nothing."""
     before = probe.identity()
     offered = int.from_bytes(stranger_asks(probe)[16:20], "big")
     little = int.from_bytes((before.epoch + 1).to_bytes(4, "little"), "big")
@@ -309,7 +315,7 @@ def agreement_epoch(probe: Probe) -> str:
 
 @rule("agreement-low-s", "Notation", Stage.FACTORY)
 def agreement_low_s(probe: Probe) -> str:
-    """Whoever signs puts s into the lower half: sigN, too."""
+    """Check that the node signs with s in the lower half, in sigN too."""
     for _ in range(_SIGNATURES):
         reply = stranger_asks(probe)
         holds(not slips.high_s(reply[-SIGNATURE_OCTETS:]),
@@ -319,7 +325,7 @@ def agreement_low_s(probe: Probe) -> str:
 
 @rule("agreement-fresh", "Key agreement", Stage.FACTORY)
 def agreement_fresh(probe: Probe) -> str:
-    """Each Request gets a nonce and a one-time key of its own."""
+    """Check that each Request gets a fresh nonce and a fresh one-time key."""
     first, second = stranger_asks(probe), stranger_asks(probe)
     holds(first[:16] != second[:16], "Two Requests (128.1) were answered with the same nonceN.")
     holds(first[20:85] != second[20:85], "Two Requests (128.1) were answered with the same one-time key En.")
@@ -341,7 +347,7 @@ def agreement_tags(probe: Probe) -> str:
 
 @rule("confirm-checks", "Key agreement", Stage.FACTORY)
 def confirm_checks(probe: Probe) -> str:
-    """A Confirm of wrong length gets 4 and leaves what pends; a wrong tagS gets 12, and what pends goes."""
+    """Check that a Confirm of wrong length gets 4 and keeps the pending agreement; a wrong tagS gets 12 and ends it."""
     before = probe.identity()
     stranger_asks(probe)
     probe.refused(security_command(Function.CONFIRM, bytes(15)), Reason.BAD_FORM)
@@ -354,7 +360,7 @@ def confirm_checks(probe: Probe) -> str:
 
 @rule("repetition-request", "Repetition", Stage.FACTORY)
 def repetition_request(probe: Probe) -> str:
-    """A repeated Request gets the stored reply and is not run again: nonceN, En and what pends stay."""
+    """Check that a repeated Request gets the stored reply and does not run again: nonceN, En and the agreement stay."""
     line, command = probe.resending, request(StrangerStation.make().request())
     first = _stranger_asks(probe, command)
     again = decode_reply(line.again(command.encode()))
@@ -365,7 +371,7 @@ def repetition_request(probe: Probe) -> str:
 
 @rule("reset-ends-request", "Reset", Stage.FACTORY)
 def reset_ends_request(probe: Probe) -> str:
-    """A Reset ends the agreement that is pending: the Confirm after it gets 2, not 12."""
+    """Check that a Reset ends the pending agreement: the next Confirm gets 2, not 12."""
     stranger_asks(probe)
     probe.good(security_command(Function.RESET, os.urandom(CHALLENGE_OCTETS)))
     return probe.refused(_WRONG_CONFIRM, Reason.WRONG_STATE, "a Reset between Request and Confirm")
@@ -373,7 +379,7 @@ def reset_ends_request(probe: Probe) -> str:
 
 @rule("confirm-other-link", "Key agreement", Stage.FACTORY)
 def confirm_other_link(probe: Probe) -> str:
-    """A Confirm from another link than its Request gets 2, and leaves what pends."""
+    """Check that a Confirm from another link than its Request gets 2 and keeps the pending agreement."""
     other = probe.beside(1)
     stranger_asks(probe)
     seen = other.refused(_WRONG_CONFIRM, Reason.WRONG_STATE, "from another station's address")
@@ -386,7 +392,7 @@ def confirm_other_link(probe: Probe) -> str:
 
 @rule("confirm-newest", "Key agreement", Stage.AGREEMENT)
 def confirm_newest(probe: Probe) -> str:
-    """What pends goes at a new good Request: the tagS of the one before gets 12."""
+    """Check that a new good Request replaces the pending agreement: the tagS of the former gets 12."""
     tapped_or_bus(probe)
     first, _ = agree(probe)
     if probe.keep is not None:  # a node that takes it shall not be lost
@@ -414,7 +420,7 @@ def confirm_whole_tag(probe: Probe) -> str:
 
 @rule("agreement", "Key agreement", Stage.AGREEMENT)
 def agreement(probe: Probe) -> str:
-    """A good Confirm is taken: Identify says keyed, and the epoch that was offered."""
+    """Check that a good Confirm is accepted: Identify then shows state keyed and the offered epoch."""
     tapped_or_bus(probe)
     before = probe.identity()
     confirm(probe, sealed=False)
@@ -440,9 +446,9 @@ def confirm(probe: Probe, *, sealed: bool) -> None:
 
 
 def _slip_of_confirm(probe: Probe) -> slips.Slip | None:
-    """What a node that refuses a good tagS may be waiting for: each is tried, with a Request of its own.
+    """Return the slip by which a node that refuses a good tagS computes it; each is tried with its own Request.
 
-    The right one and one of zeros before them: a node that takes either is not explained by a slip.
+    The right tag, and one of zeros, are tried first: no slip explains a node that accepts either.
     """
     for number in range(-2, _CONFIRMATIONS):
         agreed, tried = agree(probe)
@@ -490,7 +496,7 @@ def keyed_security(probe: Probe) -> str:
 
 @rule("confirm-elsewhere", "Key agreement", Stage.KEYED)
 def confirm_elsewhere(probe: Probe) -> str:
-    """A Confirm that is not by the same session as its Request gets 2, looked at before its tag."""
+    """Check that a Confirm outside the session of its Request gets 2, before its tag is checked."""
     if not probe.tapped:
         raise NotApplicableError(f"Needs a tap. {OVER_NFC}")
     probe.sealed_good(StationAgreement(probe.station, probe.uuid).request())
@@ -505,7 +511,7 @@ def confirm_elsewhere(probe: Probe) -> str:
 
 @rule("confirm-other-session", "Key agreement", Stage.KEYED)
 def confirm_other_session(probe: Probe) -> str:
-    """What pends goes with its session: a Confirm in the next one of the same link gets 2."""
+    """Check that the pending agreement ends with its session: a Confirm in the next one of the same link gets 2."""
     probe.sealed_good(StationAgreement(probe.station, probe.uuid).request())
     probe.close()
     seen = probe.sealed_refused(_WRONG_CONFIRM, Reason.WRONG_STATE, "of a Request in an earlier session")
@@ -515,7 +521,7 @@ def confirm_other_session(probe: Probe) -> str:
 
 @rule("confirm-beside", "Key agreement", Stage.KEYED)
 def confirm_beside(probe: Probe) -> str:
-    """A Confirm in another station's session gets 2, and leaves what pends."""
+    """Check that a Confirm in another station's session gets 2 and keeps the pending agreement."""
     other = probe.beside(1)
     probe.sealed_good(StationAgreement(probe.station, probe.uuid).request())
     seen = other.sealed_refused(_WRONG_CONFIRM, Reason.WRONG_STATE, "of a Request in another session")
@@ -527,13 +533,13 @@ def confirm_beside(probe: Probe) -> str:
 
 @rule("keyed-reset", "Which command when", Stage.KEYED)
 def keyed_reset(probe: Probe) -> str:
-    """A plain Reset of a node with a key gets 3. It is sent too short, so that no node obeys it."""
+    """Check that a plain Reset of a keyed node gets 3. It is sent too short, so that no node obeys it."""
     return probe.refused(security_command(Function.RESET), Reason.NOT_PERMITTED)
 
 
 @rule("first-owner-wins", "Key agreement", Stage.KEYED)
 def first_owner_wins(probe: Probe) -> str:
-    """A Request that shows another CA, tapped or in a session, gets 14, looked at after points and before SIG104."""
+    """Check that a Request with another CA gets 14, tapped or in a session, after the points and before SIG104."""
     probe.require(NodeState.KEYED, NodeState.PROVISIONED)
     refused = probe.refused if probe.tapped else probe.sealed_refused
     strange = StrangerStation.make()
@@ -605,9 +611,9 @@ def _teds_of(probe: Probe) -> dict[BlockId, bytes]:
 
 @dataclass(frozen=True)
 class ExplainedRequest:
-    """One Request of a test, its reply, and what the profile makes of both; hex in words by whoever shows it.
+    """One Request of a test, its reply, and the intermediate values of the profile; keys as bytes.
 
-    The agreement was never confirmed and is ended on the node: none of it is, or becomes, anybody's key.
+    The agreement is never confirmed, and the node ends it: none of these values is, or becomes, a key in use.
     """
 
     request: bytes
@@ -622,14 +628,14 @@ class ExplainedRequest:
 
     @property
     def confirmation_key(self) -> bytes:
-        """M."""
+        """The confirmation key M."""
         return self.okm[16:]
 
 
 def explain(probe: Probe) -> ExplainedRequest:
-    """Make a Request that is never confirmed, end it on the node, and give what it comes to.
+    """Make a Request that is never confirmed, end it on the node, and return its values.
 
-    A node in factory state is asked by a station and CA made for this one question; a node of ours, which answers its
+    A node in factory state is asked by a station and CA made for this request; a node of ours, which answers its
     owner alone, by this station, with a one-time key on both sides. Raises RuleBrokenError, NotApplicableError.
     """
     factory = probe.identity().state == NodeState.FACTORY

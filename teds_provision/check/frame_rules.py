@@ -63,7 +63,7 @@ class _Stranger:
         self._transaction = 0
 
     def transaction(self) -> int:
-        """A transaction number of its own."""
+        """Return a fresh transaction number."""
         self._transaction = self._transaction % 255 + 1
         return self._transaction
 
@@ -76,11 +76,11 @@ class _Stranger:
         self._frames.send(FUNCTIONAL | self.own, data, fd=self.fd)
 
     def flow(self, status: int, block: int = 0, gap: int = 0) -> None:
-        """A flow control."""
+        """Send a flow control frame."""
         self.send(bytes([status, block, gap]))
 
     def next(self, seconds: float, kind: int | None = None) -> BusFrame | None:
-        """The next frame to this station, of this kind alone; None after ``seconds``."""
+        """Return the next frame to this station, of this kind if given; None after ``seconds``."""
         until = time.monotonic() + seconds
         while (frame := self._frames.next(max(0.0, until - time.monotonic()))) is not None:
             ends = addresses(frame.identifier)
@@ -118,7 +118,7 @@ class _Stranger:
         return True
 
     def reply(self, seconds: float = _ANSWER) -> bytes | None:
-        """A whole reply, transaction first; None if none begins."""
+        """Return a whole reply, transaction first; None if none begins."""
         frame = self.next(seconds)
         if frame is None or frame.octets[0] >> 4 not in (0, _FIRST):
             return None
@@ -153,7 +153,7 @@ def _thrice(one: Callable[[], str]) -> str:
 
 @contextmanager
 def _stranger(probe: Probe) -> Iterator[_Stranger]:
-    """A third base station beside those of the other rules; raises NotApplicableError where there is no bus."""
+    """Connect a third base station beside those of the other rules; raises NotApplicableError if there is no bus."""
     link, own = probe.framed, probe.free_source(3)
     assert probe.contact.address is not None
     with link.single_frames() as frames:
@@ -171,7 +171,7 @@ def _long_write(fd: bool) -> Command:
 
 @rule("can-other-address", "CAN", Stage.PLAIN)
 def can_other_address(probe: Probe) -> str:
-    """A frame for another address is not the node's to answer."""
+    """Check that the node does not answer a frame for another address."""
     with _stranger(probe) as stranger:
         home = stranger.node
         tried = (home % LAST_ADDRESS + 1, (home - 1 ^ 0x40) % LAST_ADDRESS + 1, (home - 1 ^ 0x80) % LAST_ADDRESS + 1)
@@ -233,7 +233,7 @@ def can_lengths(probe: Probe) -> str:
 
 @rule("can-sequence", "CAN", Stage.PLAIN)
 def can_sequence(probe: Probe) -> str:
-    """A consecutive frame out of sequence ends the message (ISO 15765-2): the request is not run, and not answered."""
+    """Check that a consecutive frame out of sequence ends the message (ISO 15765-2): it is not run and not answered."""
     return _thrice(lambda: _torn_request(probe))
 
 
@@ -260,7 +260,7 @@ def _torn_request(probe: Probe) -> str:
 
 @rule("can-flow-obeyed", "CAN", Stage.PLAIN)
 def can_flow_obeyed(probe: Probe) -> str:
-    """The node waits when it is told to, sends as many frames as a block has, and leaves the gap that is asked for."""
+    """Check that the node obeys flow control: it waits on WAIT, and keeps to block size and gap."""
     due = probe.teds(SECURITY)
     return _thrice(lambda: _reply_in_blocks(probe, due))
 
@@ -309,7 +309,7 @@ def _obeyed(stranger: _Stranger, right: bool, text: str) -> None:
 
 @rule("can-announce", "CAN", Stage.PLAIN)
 def can_announce(probe: Probe) -> str:
-    """The node keeps its address against an Announce with a greater CRC, and announces its own state and CRC again."""
+    """Check that the node keeps its address after an Announce with a greater CRC, and repeats its own Announce."""
     own, state = uuid_crc(probe.uuid), probe.identity().state
     if own == _GREATEST:
         raise NotApplicableError("The CRC-32 of this UUID is the greatest: no other claim loses against it.")
@@ -337,7 +337,7 @@ def can_announce(probe: Probe) -> str:
 
 
 def _announced(frames: BusFrames, home: int, own: int) -> BusFrame | None:
-    """The Announce from the node's address, or of its CRC from another one; None if there is none."""
+    """Return the Announce from the node's address, or of its CRC from another address; None if there is none."""
     until = time.monotonic() + _ANSWER
     while (frame := frames.next(max(0.0, until - time.monotonic()))) is not None:
         mine = frame.identifier & 0xFF == home or own.to_bytes(4, "big") in frame.octets

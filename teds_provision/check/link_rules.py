@@ -1,4 +1,7 @@
-"""Rules of the link itself, where its frames were heard: ISO-TP on CAN, ISO-DEP and TNEP over NFC; changes nothing."""
+"""Rules of the link itself, for links whose frames were recorded: ISO-TP on CAN, ISO-DEP and TNEP over NFC.
+
+They change nothing on the node.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ _LONG: Final = write_teds(0, 12, 0, bytes(96))
 
 
 def _of_the_node(probe: Probe) -> tuple[HeardFrame, list[HeardFrame]]:
-    """The first CAN frame that asks, and those by which the node takes a long question and gives a long answer."""
+    """Return the first CAN frame of a request, and the node's frames of a long request and a long answer."""
     if probe.heard is None or probe.contact.address is None:
         raise NotApplicableError(f"A rule of CAN. {OVER_CAN}")
     began = len(probe.heard.frames)
@@ -42,9 +45,9 @@ def _is_from(frame: HeardFrame, node: int) -> bool:
 
 
 def _used(frames: list[HeardFrame]) -> Iterator[tuple[HeardFrame, int]]:
-    """Each frame, and how many of its octets say something (ISO 15765-2, N_PDU table).
+    """Yield each frame with the number of its octets in use (ISO 15765-2, N_PDU table).
 
-    What stands behind a frame that was lost, or heard twice, is left out until the next message.
+    After a frame that was lost or heard twice, the rest of that message is left out.
     """
     left = number = 0
     for frame in frames:
@@ -66,7 +69,7 @@ def _used(frames: list[HeardFrame]) -> Iterator[tuple[HeardFrame, int]]:
 
 @rule("can-flow-control", "CAN", Stage.PLAIN)
 def can_flow_control(probe: Probe) -> str:
-    """Flow control is well formed; block size, STmin and padding are the node's choice and are told.
+    """Check that flow control is well formed; block size, STmin and padding are the node's choice and are reported.
 
     A reserved STmin counts as 127 ms (ISO 15765-2, table of STmin).
     """
@@ -107,7 +110,7 @@ def can_busy(probe: Probe) -> str:
 
 @rule("can-form", "CAN", Stage.PLAIN)
 def can_form(probe: Probe) -> str:
-    """The node answers in the form, classic or FD, in which it was asked."""
+    """Check that the node answers in the form of the request: classic or FD."""
     asked, frames = _of_the_node(probe)
     form = {True: "CAN FD", False: "classic CAN"}
     same = all(frame.fd == asked.fd for frame in frames)
@@ -117,7 +120,7 @@ def can_form(probe: Probe) -> str:
 
 @rule("nfc-wait-time", "NFC", Stage.PLAIN)
 def nfc_wait_time(probe: Probe) -> str:
-    """The service record announces a WT_INT that is a multiple of 4."""
+    """Check that the service record announces a WT_INT that is a multiple of 4."""
     link = probe.contact.link
     if not isinstance(link, AnnouncingLink):
         raise NotApplicableError(f"A rule of NFC. {OVER_NFC}")
@@ -128,7 +131,7 @@ def nfc_wait_time(probe: Probe) -> str:
 
 @rule("nfc-wtx", "NFC", Stage.PLAIN)
 def nfc_wtx(probe: Probe) -> str:
-    """An S(WTX) asks for 1 to 59 times the frame waiting time (ISO/IEC 14443-4, clause 7.3)."""
+    """Check that an S(WTX) asks for 1 to 59 times the frame waiting time (ISO/IEC 14443-4, clause 7.3)."""
     blocks = (
         [frame.octets for frame in probe.heard.frames if frame.direction == "in"] if probe.heard is not None else []
     )
@@ -144,7 +147,7 @@ def nfc_wtx(probe: Probe) -> str:
 
 @rule("identify-found", "Identify, Prove, List", Stage.PLAIN)
 def identify_found(probe: Probe) -> str:
-    """What the node was found by (the id record over NFC, functional Identify on CAN) says what Identify says."""
+    """Check that the id record (NFC) or functional Identify (CAN) that found the node agrees with Identify."""
     found, now = probe.contact.identity, probe.identity()
     holds(found == now, f"The node was found as {found}; Identify says {now}.")
     return "the same when it was found and when it is asked"

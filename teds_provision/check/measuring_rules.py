@@ -1,7 +1,7 @@
 """Rules of boards with channels (operation.md): claims, values, streams, Drive and trigger, in sessions.
 
 A channel can be claimed only while a Channel TEDS that fits it is stored. A board that has none is given one for this
-stage where TEDS may be written, one usual format after another; :func:`restore` commits its own TEDS again.
+stage if TEDS may be written: the usual formats are tried in turn. :func:`restore` commits the former TEDS again.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ _MOST_SAMPLES: Final = 64
 
 
 def channel_teds(kind: ChannelKind, model: int, octets: int) -> bytes:
-    """Return a Channel TEDS that says no more than what a claim needs: ChanType, DatModel, ModLenth, SigBits."""
+    """Return the smallest Channel TEDS that allows a claim: ChanType, DatModel, ModLenth, SigBits."""
     block = bytes([3, 4, 0, AccessCode.CHANNEL, 1, 1, 11, 1, int(kind)])
     return frame(block + bytes([18, 9, 40, 1, model, 41, 1, octets, 42, 1, min(255, 8 * octets)]))
 
@@ -128,9 +128,9 @@ def _fits(probe: Probe, channel: int, kind: ChannelKind, digest: bytes) -> bool:
 
 
 def channels(probe: Probe) -> dict[int, tuple[ChannelKind, int]]:
-    """Kind and ModLenth of each channel that can be claimed; raises NotApplicableError if there is none.
+    """Return kind and ModLenth of each channel that can be claimed; raises NotApplicableError if there is none.
 
-    A board without Channel TEDS gets one, where TEDS may be written: :func:`restore` takes it away again.
+    A board without Channel TEDS gets one if TEDS may be written: :func:`restore` removes it again.
     """
     if probe.channels:
         return probe.channels
@@ -206,7 +206,7 @@ def restore(probe: Probe) -> None:
 
 
 def _sensor(probe: Probe) -> int:
-    """A sensor that can be claimed, one that samples by period before an event sensor."""
+    """Return a sensor that can be claimed: one that samples by period if there is one, else an event sensor."""
     sensors = [channel for channel, (kind, _) in channels(probe).items() if kind is ChannelKind.SENSOR]
     events = [channel for channel, (kind, _) in channels(probe).items() if kind is ChannelKind.EVENT_SENSOR]
     if not sensors + events:
@@ -215,7 +215,7 @@ def _sensor(probe: Probe) -> int:
 
 
 def _actuator(probe: Probe) -> tuple[int, int]:
-    """An actuator that can be claimed, and its ModLenth."""
+    """Return an actuator that can be claimed, and its ModLenth."""
     acting = [(channel, octets) for channel, (kind, octets) in channels(probe).items() if kind is ChannelKind.ACTUATOR]
     if probe.keep is None:
         raise NotApplicableError("Claims an actuator: ask for it with --factory.")
@@ -267,7 +267,7 @@ def operate_digest(probe: Probe) -> str:
 
 @rule("operate-configuration", "1. A channel is claimed or idle", Stage.MEASURING, page=OPERATION_PAGE)
 def operate_configuration(probe: Probe) -> str:
-    """The datasheet cannot change under a claim: Write, Update and Set CAN address get 2 in the session that claims."""
+    """Check that a claim locks the datasheet: Write, Update and Set CAN address get 2 in the session that claims."""
     channel = _sensor(probe)
     block = (channel, int(AccessCode.CHANNEL))
     asked = [write_teds(*block, 0, b"\0"), update_teds(*block)]
@@ -281,7 +281,10 @@ def operate_configuration(probe: Probe) -> str:
 
 @rule("operate-values", "2. One value at a time", Stage.MEASURING, page=OPERATION_PAGE)
 def operate_values(probe: Probe) -> str:
-    """A channel that this session has not claimed gives no value: 2. A list with 0 or a channel twice gets 4."""
+    """Check that a channel that this session has not claimed gives no value: 2.
+
+    A list with 0 or a channel twice gets 4.
+    """
     channel = _sensor(probe)
     for command in (sample([channel]), read_data_set(channel)):
         probe.sealed_refused(command, Reason.WRONG_STATE, f"channel {channel} not claimed")
@@ -414,7 +417,7 @@ def _clock(probe: Probe) -> ClockReply:
 
 @rule("drive-replay", "4. Streams", Stage.MEASURING, page=OPERATION_PAGE)
 def drive_replay(probe: Probe) -> str:
-    """A Drive message counts once, and none counts after a later one. The value is the one that the actuator has."""
+    """Check that a Drive message counts once, and none counts after a later one; the actuator keeps its last value."""
     channel, octets = _actuator(probe)
     with probe.framed.single_frames() as frames, _claimed(probe, channel):
         session, node = probe.session, probe.contact.address

@@ -72,7 +72,7 @@ def max_message(probe: Probe) -> str:
 
 @rule("prove", "Identify, Prove, List", Stage.PLAIN)
 def prove(probe: Probe) -> str:
-    """The signature over a fresh challenge verifies under field 101."""
+    """Check that the signature over a fresh challenge verifies under field 101."""
     challenge = os.urandom(CHALLENGE_OCTETS)
     proof = probe.good(security_command(Function.PROVE, challenge))
     holds(len(proof) == 64, f"Prove (128.8): 64 octets are due, {len(proof)} came.")
@@ -85,7 +85,7 @@ def prove(probe: Probe) -> str:
 
 @rule("prove-low-s", "Notation", Stage.PLAIN)
 def prove_low_s(probe: Probe) -> str:
-    """Whoever signs puts s into the lower half."""
+    """Check that the node signs with s in the lower half."""
     return low_s(probe, Function.PROVE, "Prove (128.8)")
 
 
@@ -100,7 +100,7 @@ def low_s(probe: Probe, function: Function, what: str) -> str:
 
 @rule("prove-length", "Command frames", Stage.PLAIN)
 def prove_length(probe: Probe) -> str:
-    """A challenge has 32 octets."""
+    """Check that a challenge has 32 octets."""
     for octets in (0, 31, 33):
         seen = probe.refused(security_command(Function.PROVE, bytes(octets)), Reason.BAD_FORM)
     return seen
@@ -116,7 +116,7 @@ def no_payload(probe: Probe) -> str:
 
 @rule("frame-length", "Which command when", Stage.PLAIN)
 def frame_length(probe: Probe) -> str:
-    """A frame too short for its header, or whose length is wrong."""
+    """Check that a frame too short for its header, or with a wrong length, gets 4 and is not run."""
     whole = query_teds(0, 128).encode()
     for octets, what in ((whole[:4], "a frame of 4 octets"), (whole[:-1], "length 1, no payload")):
         demand(probe.octets(octets, what), Reason.BAD_FORM, what)
@@ -126,7 +126,7 @@ def frame_length(probe: Probe) -> str:
 
 @rule("refusal-form", "Command frames", Stage.PLAIN)
 def refusal_form(probe: Probe) -> str:
-    """A refusal is status 0 and one octet of reason."""
+    """Check that a refusal is status 0 and one octet of reason."""
     for command in (Command(0, SECURITY, 99), security_command(Function.CLOSE), query_teds(0, 99)):
         reply = probe.plain(command)
         form = not reply.ok and len(reply.payload) == 1
@@ -138,7 +138,7 @@ def refusal_form(probe: Probe) -> str:
 
 @rule("unknown-command", "Which command when", Stage.PLAIN)
 def unknown_command(probe: Probe) -> str:
-    """Functions of class 128 that nobody knows, and class 128 elsewhere than on channel 0, get 1."""
+    """Check that unknown functions of class 128, and class 128 on another channel than 0, get 1."""
     for command in (Command(0, SECURITY, 6), Command(0, SECURITY, 99), Command(1, SECURITY, Function.IDENTIFY)):
         seen = probe.refused(command, Reason.UNKNOWN_COMMAND, f"channel {command.channel}")
     return seen
@@ -153,7 +153,7 @@ def write_needs_session(probe: Probe) -> str:
 
 @rule("close-needs-session", "Which command when", Stage.PLAIN)
 def close_needs_session(probe: Probe) -> str:
-    """A plain Close gets 3."""
+    """Check that a plain Close gets 3."""
     return probe.refused(security_command(Function.CLOSE), Reason.NOT_PERMITTED)
 
 
@@ -184,7 +184,7 @@ def _status(probe: Probe, block: BlockId) -> TedsStatus:
 
 
 def absent(probe: Probe) -> BlockId:
-    """A TEDS that could be held and is not."""
+    """Return a TEDS that the node could hold and does not."""
     listed = set(probe.listed())
     return next(block for block in product(range(255, -1, -1), range(17, 0, -1)) if block not in listed)
 
@@ -304,7 +304,7 @@ def node_key(probe: Probe) -> str:
 
 @rule("security-state", "The Security TEDS", Stage.PLAIN)
 def security_state(probe: Probe) -> str:
-    """Initial until the first commit, signed after it; sequence and epoch agree with Identify."""
+    """Check that the security state is initial until the first commit and signed after it, and agrees with Identify."""
     identity, shown = probe.identity(), probe.security()
     provisioned = identity.state == NodeState.PROVISIONED
     holds(

@@ -38,7 +38,7 @@ from teds_provision.teds.sheet import ChannelKind
 
 OVER_CAN: Final = "Connect the board's CAN, and add: --via can --can INTERFACE:CHANNEL"
 OVER_NFC: Final = "Put the board on an NFC reader, and add: --via nfc"
-"""What a person connects so that a skipped rule runs."""
+"""The connection that lets a skipped rule run, as text for the user."""
 _LARGEST_TEDS: Final = 1 << 20
 _FAR_COUNTER: Final = 1000
 """Of a session in which slips are tried: later than every counter before."""
@@ -47,9 +47,9 @@ _STATIONS: Final = range(0xF7, 0xF0, -1)
 
 
 class RuleBrokenError(Exception):
-    """The node did not keep to the rule; the text says what was sent, what was due and what came.
+    """The node broke the rule; the text gives what was sent, expected and received.
 
-    ``slip`` is the known slip that would explain it, where one does.
+    ``slip`` is the known slip that explains it, if there is one.
     """
 
     def __init__(self, text: str, slip: Slip | None = None) -> None:
@@ -58,7 +58,10 @@ class RuleBrokenError(Exception):
 
 
 class NotApplicableError(Exception):
-    """The rule cannot be tried on this node, link or state, by no fault of the node; the text says why."""
+    """The rule cannot be tried on this node, link or state, which is no fault of the node.
+
+    The text gives the reason.
+    """
 
 
 @dataclass(frozen=True)
@@ -111,11 +114,11 @@ class TraceRecorder:
 
 
 class Probe:
-    """One node under test. ``credentials`` is this station's, ``key`` the link key where one is held.
+    """One node under test. ``credentials`` is this station's, ``key`` the link key if there is one.
 
-    ``heard`` are the frames of its link, None where nobody listened. ``keep`` makes a new key durable here before its
-    Confirm leaves; None where no key may change. ``okm`` is that of the agreement that gave ``key``, where it was made
-    in this run. ``line`` is the line that is asked now, as a rule this station's own.
+    ``heard`` are the frames of its link, None if they were not recorded. ``keep`` makes a new key durable here before
+    its Confirm leaves; None if no key may change. ``okm`` is that of the agreement that gave ``key``, if this run made
+    it. ``line`` is the line of the current rule, by default this station's.
     """
 
     def __init__(self, contact: Contact, heard: TraceRecorder | None = None) -> None:
@@ -129,17 +132,17 @@ class Probe:
         self.okm = b""
         self.session: StationSession | None = None
         self.no_session = ""
-        """Why no session opened; empty where none was tried, or the last one did."""
+        """The reason why no session opened; empty if none was tried, or the last one did."""
         self.no_agreement = ""
-        """Why a good Request came to nothing; empty where none was tried, or one did."""
+        """The reason why a good Request failed; empty if none was tried, or one succeeded."""
         self._sealed_once = False
         self._shown: SecurityTeds | None = None
         self.home_address, self.moved_at = 0, 0.0
-        """The CAN address that the node had before a rule moved it, 0 where none did; when it was moved."""
+        """The CAN address of the node before a rule moved it, 0 if none did; and the time of the move."""
         self.asked = ""
         """The last command that was sent, in words."""
         self.before_rotation: tuple[Identity, dict[BlockId, bytes]] | None = None
-        """What Identify said and which TEDS there were before the node got another key; None until it did."""
+        """Identify and the TEDS of the node before it got another key; None until then."""
         self.channels: dict[int, tuple[ChannelKind, int]] = {}
         """Kind and ModLenth of the channels that can be claimed, by number; empty until that was asked."""
         self.no_channels = ""
@@ -150,9 +153,9 @@ class Probe:
     # -- frames ----------------------------------------------------------------------------------------------------
 
     def octets(self, frame: bytes, what: str, *, inside: Command | None = None) -> Reply:
-        """Send these octets as a whole command frame. Raises RuleBrokenError where no whole reply frame comes back.
+        """Send these octets as a whole command frame. Raises RuleBrokenError if no whole reply frame comes back.
 
-        ``inside`` is the command that is sealed in them. Raises NodeSilentError where not even Identify is answered.
+        ``inside`` is the command that is sealed in them. Raises NodeSilentError if not even Identify is answered.
         """
         opened = None if inside is None else inside.encode()
         self.asked = what
@@ -188,7 +191,7 @@ class Probe:
             self.pause(BUSY_PAUSE)
 
     def listen(self) -> None:
-        """Ask Identify, whatever it says; raises LinkError where nothing comes."""
+        """Ask Identify and ignore its contents; raises LinkError if no answer comes."""
         self.line.exchange(IDENTIFY.encode())
 
     def pause(self, seconds: float) -> None:
@@ -197,7 +200,7 @@ class Probe:
 
     @property
     def bus(self) -> MultiStationLink:
-        """The node's line where it is one of a bus; raises NotApplicableError elsewhere."""
+        """The node's line if it is part of a bus; raises NotApplicableError elsewhere."""
         link = self.contact.link
         if not isinstance(link, MultiStationLink):
             raise NotApplicableError(f"Needs a second base station. {OVER_CAN}")
@@ -205,28 +208,28 @@ class Probe:
 
     @property
     def resending(self) -> ResendLink:
-        """The line where a request can be sent again; raises NotApplicableError elsewhere."""
+        """The line if a request can be sent again; raises NotApplicableError elsewhere."""
         if not isinstance(self.line, ResendLink):
             raise NotApplicableError(f"This link sends no request twice. {OVER_CAN}")
         return self.line
 
     @property
     def framed(self) -> FramedLink:
-        """The node's line where its frames can be sent one by one; raises NotApplicableError elsewhere."""
+        """The node's line if its frames can be sent one by one; raises NotApplicableError elsewhere."""
         link = self.contact.link
         if not isinstance(link, FramedLink):
             raise NotApplicableError(f"Needs single CAN frames. {OVER_CAN}")
         return link
 
     def beside(self, number: int) -> Probe:
-        """The same node as another base station has it, ``number`` 1 or 2: its own line, and so its own session."""
+        """Return the same node for another base station, ``number`` 1 or 2: with a separate line and session."""
         other = Probe(self.contact, self.heard)
         other.line, other.key, other.okm = self.bus.beside(self.free_source(number)), self.key, self.okm
         other.credentials = self.credentials
         return other
 
     def free_source(self, number: int) -> int:
-        """An address of base stations under which nothing was heard, the first (1), second or third such.
+        """Return a base station address on which nothing was heard: the first (1), second or third.
 
         Raises NotApplicableError if there are not so many.
         """
@@ -272,14 +275,14 @@ class Probe:
 
     @property
     def link_key(self) -> bytes:
-        """The link key; raises NotApplicableError where none is held."""
+        """The link key; raises NotApplicableError if there is none."""
         if self.key is None:
             raise NotApplicableError("This station holds no key of the node.")
         return self.key
 
     @property
     def station(self) -> Credentials:
-        """What this station shows; raises NotApplicableError where the vault was not opened."""
+        """The credentials of this station; raises NotApplicableError if the vault was not opened."""
         if self.credentials is None:
             raise NotApplicableError("Needs this station's keys.")
         return self.credentials
@@ -325,7 +328,7 @@ class Probe:
         return counter
 
     def _slip_of_open(self, reply: Reply, one_time: SoftwareKey) -> Slip | None:
-        """What the node made otherwise of keyId (it said 16) or mac (12): each slip is tried until it takes one."""
+        """Return the slip that the node accepts in keyId (after reply 16) or mac (after 12); each is tried in turn."""
         if reply.reason not in (Reason.UNKNOWN_KEY, Reason.BAD_TAG):
             return None
         about_key, key, point = reply.reason == Reason.UNKNOWN_KEY, self.link_key, one_time.point
@@ -342,7 +345,7 @@ class Probe:
         return next((slip for slip, payload in tries if takes(payload)), None)
 
     def sealed(self, command: Command) -> Reply:
-        """Send a command in the session, which is opened where none is; the inner reply."""
+        """Send a command in the session, opening one if needed, and return the inner reply."""
         session = self.session or self.open()
         try:
             reply = self._sealed(session, command)
@@ -386,20 +389,20 @@ class Probe:
         return next((slip for counter, (slip, seal) in tries if takes(seal(session.keys, counter, frame))), None)
 
     def sealed_good(self, command: Command) -> bytes:
-        """A sealed command that must succeed; the inner payload."""
+        """Send a sealed command that must succeed, and return the inner payload."""
         reply = self.sealed(command)
         if not reply.ok:
             raise RuleBrokenError(f"{describe_command(command)}, sealed: success is due, {describe_reply(reply)} came.")
         return reply.payload
 
     def sealed_refused(self, command: Command, reason: int, why: str = "") -> str:
-        """A sealed command that must be refused inside."""
+        """Send a sealed command that must be refused inside."""
         return demand(
             self.sealed(command), reason, f"{describe_command(command)}, sealed" + (f", {why}" if why else "")
         )
 
     def close(self) -> None:
-        """Leave the session, whatever the node says."""
+        """Close the session; any answer is accepted."""
         if self.session is not None:
             self.plain(self.session.seal(security_command(Function.CLOSE)))
             self.session = None
@@ -408,12 +411,12 @@ class Probe:
 
     @property
     def noisy(self) -> bool:
-        """Whether single frames may be lost or disturbed here without anybody's fault: a bus."""
+        """True if single frames may be lost or disturbed on this link without a fault of the node: a bus."""
         return self.contact.link.capabilities.many
 
     @property
     def tapped(self) -> bool:
-        """Whether commands of this link count as tapped whatever the node's state."""
+        """True if commands of this link count as tapped in every state of the node."""
         return self.line.capabilities.tapped
 
     def identity(self) -> Identity:
@@ -456,7 +459,7 @@ class Probe:
         raise RuleBrokenError(f"Read (1.2) of {block}: no end after {len(octets)} octets.")
 
     def security(self) -> SecurityTeds:
-        """The Security TEDS as it is now, decoded; raises RuleBrokenError where it is not canonical."""
+        """Return the present Security TEDS, decoded; raises RuleBrokenError if it is not canonical."""
         try:
             shown = security.decode(self.teds(SECURITY_TEDS))
         except BadDataError as error:
@@ -484,6 +487,6 @@ def demand(reply: Reply, reason: int, what: str) -> str:
 
 
 def holds(what: bool, text: str) -> None:
-    """Raise RuleBrokenError with this text where it does not hold."""
+    """Raise RuleBrokenError with this text if the condition is false."""
     if not what:
         raise RuleBrokenError(text)

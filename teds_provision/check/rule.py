@@ -1,4 +1,4 @@
-"""What a rule is, when it can be run, the register of all rules, and how one ends."""
+"""Rules, the stages and links that they need, the register of all rules, and their results."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ class Rule:
 
 @dataclass(frozen=True)
 class RuleResult:
-    """How one rule ended; ``detail`` is what was sent and seen, or why it was skipped. Never holds a key.
+    """The result of one rule; ``detail`` gives what was sent and seen, or why it was skipped. Never holds a key.
 
-    ``slip`` is the name of the known slip that would explain it, None where none does.
+    ``slip`` is the name of the known slip that explains it, None if none does.
     """
 
     rule: str

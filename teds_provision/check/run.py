@@ -39,15 +39,15 @@ _NEEDS_KEY = "The node has no key. Ask with --factory to give it one."
 
 _GONE = "The node no longer answers."
 _TORN_TRIES = 3
-"""So often a rule is tried whose replies come torn; on a bus each try has repetitions of its own below it."""
+"""The number of tries of a rule whose replies come torn; on a bus each try has its own repetitions below."""
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """Every rule, in order, and how often each result came.
+    """Every rule, in order, and the number of each result.
 
-    ``lost`` is why the rest could not be tried: the node fell silent, or the reader went away; None where all was.
-    ``explained`` is the test agreement that was asked for, or why there is none; None where none was asked for.
+    ``lost`` is the reason why the rest could not be tried: the node fell silent, or the reader went away; None if all
+    ran. ``explained`` is the test agreement, or the reason why there is none; None if none was requested.
     """
 
     uuid: bytes
@@ -83,10 +83,10 @@ def check_node(
     """Run the rules against a node, most of which change nothing; ``heard`` has the frames of its link.
 
     Without ``factory`` no key changes: a factory node is tried in factory state, one of ours in sessions too. With it a
-    node of ours is reset, then keyed, written and reset again, so that it ends in factory state.
-    ``explained``: make a test agreement that is never confirmed, and say what it comes to.
-    A node that falls silent ends it, with what was found until then. Raises PolicyError for a node with another
-    owner, before anything but Identify was asked; LinkError before the first rule.
+    node of ours is reset, then keyed, written and reset again, so that it ends in factory state. ``explained``: make a
+    test agreement that is never confirmed, and return its values. A node that falls silent ends the run, with the
+    results so far. Raises PolicyError for a node with another owner, before any command but Identify; LinkError before
+    the first rule.
     """
     return _Run(station, node, factory, heard, explained=explained).all()
 
@@ -200,9 +200,9 @@ class _Run:
     # -- keys ------------------------------------------------------------------------------------------------------
 
     def _take_up(self) -> None:
-        """The link key of a node of ours; raises PolicyError where another owner, or nobody here, has it.
+        """Load the link key of a node of ours; raises PolicyError if another owner has it, or it is unknown.
 
-        A node that knows the key and opens no session all the same has its rules tried: they say why.
+        A node that knows the key but opens no session is tried all the same: the rules then name the reason.
         """
         node, held = self._node, None
         if self._station.keys.held(node.uuid):
@@ -216,7 +216,7 @@ class _Run:
         node.leave()
 
     def _known_there(self) -> NodeKey | None:
-        """The newest key of ours whose keyId the node knows: to a wrong mac under it, it says 12 and not 16."""
+        """Return the newest key of ours whose keyId the node knows: it answers a wrong mac with 12, not 16."""
         for held in self._station.keys.unwrapped(self._node.uuid):
             wrong = key_id(held.key) + SoftwareKey.generate().point + bytes(16)
             if self._probe.plain(security_command(Function.OPEN, wrong)).reason == Reason.BAD_TAG:
@@ -224,7 +224,10 @@ class _Run:
         return None
 
     def _reset(self) -> str:
-        """Reset a node of ours as ``reset`` does: its keys go here when the proof was good. Why not, "" where it is."""
+        """Reset a node of ours as ``reset`` does: its keys are deleted here if the proof was good.
+
+        Returns why not, else "".
+        """
         try:
             reset_node(self._station, self._node, examine(self._station, self._node))
         except (BadDataError, NotAuthenticError, PolicyError) as no:

@@ -47,7 +47,7 @@ def _open(payload: bytes) -> Command:
 
 @rule("open-beside", "Sessions", Stage.SESSION)
 def open_beside(probe: Probe) -> str:
-    """A new Open leaves the session alone until a good frame comes under it; then the old one is over."""
+    """Check that a new Open leaves the session alone until a good frame comes under it; then the old one is over."""
     old = probe.open()
     probe.sealed_good(IDENTIFY)
     new = probe.open()
@@ -61,7 +61,7 @@ def open_beside(probe: Probe) -> str:
 
 @rule("open-replaced", "Sessions", Stage.SESSION)
 def open_replaced(probe: Probe) -> str:
-    """A new Open replaces the half-open one: what is sealed under that gets 12."""
+    """Check that a new Open replaces the half-open one: a frame sealed under that one gets 12."""
     old, new = probe.open(), probe.open()
     seen = demand(probe.plain(old.seal(IDENTIFY)), Reason.BAD_TAG, "Sealed (128.4) under an Open that was replaced")
     probe.session = new
@@ -91,20 +91,20 @@ def open_checks(probe: Probe) -> str:
 
 
 def _opens(probe: Probe) -> None:
-    """Raise NotApplicableError where no good Open is taken."""
+    """Raise NotApplicableError if the node refuses every good Open."""
     if probe.no_session:
         raise NotApplicableError(f"Needs a session, and none opens: {probe.no_session}")
 
 
 def _half_open(probe: Probe) -> Command:
-    """A good Open, made; raises NotApplicableError where none is taken."""
+    """Return a good Open; raises NotApplicableError if the node refuses them."""
     _opens(probe)
     return StationSession(probe.link_key, probe.uuid).open(probe.opening_counter())
 
 
 @rule("open-once", "Sessions", Stage.SESSION)
 def open_once(probe: Probe) -> str:
-    """A mac is good once: c grows by 1, and the same Open again gets 12."""
+    """Check that a mac is good once: c grows by 1, and the same Open again gets 12."""
     counter, command = probe.opening_counter(), _half_open(probe)
     probe.good(command)
     grown = (int.from_bytes(counter, "big") + 1) % (1 << 64)
@@ -121,7 +121,7 @@ def open_once(probe: Probe) -> str:
 
 @rule("open-point", "Sessions", Stage.SESSION)
 def open_point(probe: Probe) -> str:
-    """A good mac over a point off the curve, or over a static key, gets 15, and uses c up."""
+    """Check that a good mac over a point off the curve, or over a static key, gets 15 and uses c up."""
     _opens(probe)
     points = {"Es off the curve": b"\x04" + bytes(64), "Es the node's own point": probe.node_key}
     if probe.okm and probe.credentials is not None:  # else another station may have agreed on the key
@@ -136,7 +136,7 @@ def open_point(probe: Probe) -> str:
 
 @rule("open-one-time", "Sessions", Stage.SESSION)
 def open_one_time(probe: Probe) -> str:
-    """A one-time key of the node is for one Open."""
+    """Check that the node's one-time key serves one Open."""
     seen = []
     for _ in range(2):
         seen.append(probe.good(_half_open(probe))[:POINT_OCTETS])
@@ -192,7 +192,7 @@ def sealed_tag(probe: Probe) -> str:
 
 @rule("sealed-padding", "Sessions", Stage.SESSION)
 def sealed_padding(probe: Probe) -> str:
-    """A frame whose tag is good and whose PKCS #7 padding is not gets 12; it ends nothing."""
+    """Check that a frame with a good tag and bad PKCS #7 padding gets 12 and ends nothing."""
     session, frame = probe.open(), IDENTIFY.encode()
     probe.sealed_good(IDENTIFY)
     room = 16 - len(frame)
@@ -204,7 +204,7 @@ def sealed_padding(probe: Probe) -> str:
 
 @rule("sealed-residues", "Sessions", Stage.SESSION)
 def sealed_residues(probe: Probe) -> str:
-    """A sealed reply is padded right whatever its length: inner replies of all 16 residues of the block."""
+    """Check that a sealed reply is padded right for every length: inner replies of all 16 residues of the block."""
     whole = probe.teds(SECURITY_TEDS)
     for octets in range(BLOCK_OCTETS):
         came = probe.sealed_good(read_teds(*SECURITY_TEDS, len(whole) - octets))
@@ -218,7 +218,7 @@ def sealed_residues(probe: Probe) -> str:
 
 @rule("sealed-command-residues", "Sessions", Stage.SESSION)
 def sealed_command_residues(probe: Probe) -> str:
-    """A sealed command is taken whatever its length: inner commands of all 16 residues of the block."""
+    """Check that a sealed command is accepted for every length: inner commands of all 16 residues of the block."""
     block = absent(probe)
     for octets in range(BLOCK_OCTETS):
         probe.sealed_good(write_teds(*block, 0, bytes(octets)))
@@ -240,7 +240,7 @@ def sealed_only_sealed(probe: Probe) -> str:
 
 @rule("two-sessions", "Sessions", Stage.SESSION)
 def two_sessions(probe: Probe) -> str:
-    """A node has room for two sessions, a link each, with counters of their own."""
+    """Check that a node has room for two sessions, one for each link, with separate counters."""
     other = probe.beside(1)
     for _ in range(2):
         probe.sealed_good(IDENTIFY)
@@ -253,7 +253,7 @@ def two_sessions(probe: Probe) -> str:
 
 @rule("stranger-ends-nothing", "Repetition", Stage.SESSION)
 def stranger_ends_nothing(probe: Probe) -> str:
-    """What a third station asks plainly ends no session of the two before: stored replies have places of their own."""
+    """Check that plain requests of a third station end no session of the two others: it has a separate stored reply."""
     other, stranger = probe.beside(1), probe.beside(2)
     probe.sealed_good(IDENTIFY)
     other.sealed_good(IDENTIFY)
@@ -276,7 +276,7 @@ def stranger_ends_nothing(probe: Probe) -> str:
 
 @rule("session-bound", "Sessions", Stage.SESSION)
 def session_bound(probe: Probe) -> str:
-    """A session, and a half-open Open, belong to one pair of addresses: from another one Sealed gets 2."""
+    """Check that a session, and a half-open Open, belong to one pair of addresses: from another one Sealed gets 2."""
     other = probe.beside(1)
     for what in ("of a half-open Open", "of a session"):
         if what == "of a half-open Open":
@@ -318,7 +318,7 @@ class _RepeatedIdentify:
 
 @rule("repetition", "Repetition", Stage.SESSION)
 def repetition(probe: Probe) -> str:
-    """A request that is equal octet for octet, transaction and body, gets the stored reply and is not run again."""
+    """Check that a request with the same octets and transaction gets the stored reply and is not run again."""
     sent = _RepeatedIdentify(probe)
     sent.again()
     sent.again()
@@ -327,7 +327,7 @@ def repetition(probe: Probe) -> str:
 
 @rule("repetition-open", "Repetition", Stage.SESSION)
 def repetition_open(probe: Probe) -> str:
-    """A repeated Open gets the stored reply: it is run once, so c grows by 1 and the session opens all the same."""
+    """Check that a repeated Open gets the stored reply: it runs once, c grows by 1, and the session opens."""
     _opens(probe)
     line, counter = probe.resending, probe.opening_counter()
     session = StationSession(probe.link_key, probe.uuid)
@@ -344,7 +344,7 @@ def repetition_open(probe: Probe) -> str:
 
 @rule("repetition-everyone", "Repetition", Stage.SESSION)
 def repetition_everyone(probe: Probe) -> str:
-    """A functional Identify neither uses nor replaces the stored reply, and ends no session."""
+    """Check that a functional Identify neither uses nor replaces the stored reply, and ends no session."""
     bus, sent = probe.bus, _RepeatedIdentify(probe)
     holds(bool(bus.everyone()), "Identify (128.7), functional: no reply.")
     sent.again(" after a functional Identify")
@@ -374,9 +374,9 @@ def _set_address(address: int) -> Command:
 
 @rule("address-moves", "Command frames", Stage.SESSION)
 def address_moves(probe: Probe) -> str:
-    """A good Set CAN address is answered from the old address and holds at once; a second write within 10 s gets 17.
+    """Check that Set CAN address is answered from the old address and applies at once; a second within 10 s gets 17.
 
-    Setting the present address writes nothing, so it may come as often as one likes; 4 goes before 17.
+    Setting the present address writes nothing and is not limited; 4 is checked before 17.
     """
     home = probe.identity().can_address
     if not home:

@@ -1,8 +1,8 @@
-"""Slips that firmware authors make, tried one after the other: which of them would explain what a node sent.
+"""Common slips of firmware authors, tried in turn to find the one that explains what a node sent.
 
-``node check`` knows the secrets of its own test agreements and sessions, so where a tag or a signature is wrong it can
-make it as a node with a known slip does, and name the slip that gives the same octets. A tag has 16 octets: none fits
-by chance. Up to two slips at once are found in the key agreement and in Open.
+``node check`` knows the secrets of its own test agreements and sessions. If a tag or a signature is wrong, it computes
+it as a node with a known slip does, and names the slip that gives the same octets. A tag has 16 octets: none fits by
+chance. Up to two slips at once are found in the key agreement and in Open.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ TAG_OCTETS: Final = 16
 
 
 class Slip(NamedTuple):
-    """A known slip: its name as in ``slip`` of ``--json``, and what it is, to stand after "It fits if"."""
+    """A known slip: its name as in ``slip`` of ``--json``, and its description, which follows "It fits if"."""
 
     name: str
     words: str
@@ -275,7 +275,7 @@ class Agreement:
                 yield _together((named, slip)), tag
 
     def slip_of_tag(self) -> Slip | None:
-        """What would explain a wrong tagN: one slip, or two."""
+        """Return the slip, or the pair of slips, that explains a wrong tagN; None if none does."""
         # Of about 70,000 ways together 2,000 have two slips at most: 0.1 s instead of seconds.
         for most in (1, 2):
             for (candidate, script), (two, shared) in product(self.transcripts(), self.secrets()):
@@ -291,7 +291,7 @@ class Agreement:
         return None
 
     def slip_of_signature(self) -> Slip | None:
-        """What would explain a wrong sigN where tagN is right."""
+        """Return the slip that explains a wrong sigN if tagN is right."""
         label, right = b"TEDS1 agree\0", self.transcripts()[0][1]
         for slip, script in self.transcripts():
             messages = [(slip, label + script)]
@@ -318,7 +318,7 @@ class Agreement:
 
 
 def _confirmations(key: bytes, own: bytes, other: bytes, script: bytes) -> list[Way]:
-    """A confirmation tag under M, of the side ``own``."""
+    """Return confirmation tags under M, of the side ``own``."""
     whole = _hmac(key, own + script)
     return _ways(
         whole[:16],
@@ -344,7 +344,7 @@ def confirmations(confirmation: bytes, script: bytes) -> list[tuple[Slip, bytes]
 
 
 def _is_of_digest(point: bytes, digest: bytes, signature: bytes) -> bool:
-    """Whether these 32 octets were signed as the hash."""
+    """Return True if these 32 octets were signed as the hash."""
     r, s = int.from_bytes(signature[:32], "big"), int.from_bytes(signature[32:], "big")
     try:
         public_key(point).verify(encode_dss_signature(r, s), digest, ec.ECDSA(Prehashed(hashes.SHA256())))
@@ -354,9 +354,9 @@ def _is_of_digest(point: bytes, digest: bytes, signature: bytes) -> bool:
 
 
 def of_signature(point: bytes, signature: bytes, messages: Iterable[Way], *, digest: bytes = b"") -> Slip | None:
-    """The slip by which ``signature`` is one of ``messages`` under ``point``, in one of the forms that chips give.
+    """Return the slip by which ``signature`` is one of ``messages`` under ``point``, in one of the forms of chips.
 
-    ``digest``: 32 octets that may have been signed as if they were the hash. None where nothing fits.
+    ``digest``: 32 octets that may have been signed as if they were the hash. None if nothing fits.
     """
     forms = list(_forms(signature))
     for slip, message in messages:
@@ -376,7 +376,7 @@ def of_signature(point: bytes, signature: bytes, messages: Iterable[Way], *, dig
 
 
 def _forms(signature: bytes) -> Iterator[tuple[Slip | None, bytes]]:
-    """The signature as r ‖ s, whatever it came as."""
+    """Yield the signature as r ‖ s, converted from each form that chips give."""
     if len(signature) != SIGNATURE_OCTETS:
         return
     r, s = signature[:32], signature[32:]
@@ -386,7 +386,7 @@ def _forms(signature: bytes) -> Iterator[tuple[Slip | None, bytes]]:
 
 
 def of_node_key(uuid: bytes, node: bytes, signature: bytes) -> Slip | None:
-    """What would explain a wrong field 102."""
+    """Return the slip that explains a wrong field 102."""
     label = b"TEDS1 node key\0"
     ways = _ways(
         label + uuid + node,
@@ -401,7 +401,7 @@ def of_node_key(uuid: bytes, node: bytes, signature: bytes) -> Slip | None:
 
 
 def of_prove(uuid: bytes, node: bytes, challenge: bytes, proof: bytes) -> Slip | None:
-    """What would explain a wrong reply to Prove."""
+    """Return the slip that explains a wrong reply to Prove."""
     label = b"TEDS1 prove\0"
     ways = _ways(
         label + uuid + challenge,
@@ -415,7 +415,7 @@ def of_prove(uuid: bytes, node: bytes, challenge: bytes, proof: bytes) -> Slip |
 
 
 def of_reset(uuid: bytes, node: bytes, epoch: int, challenge: bytes, proof: bytes) -> Slip | None:
-    """What would explain a wrong reply to Reset."""
+    """Return the slip that explains a wrong reply to Reset."""
     label, number = b"TEDS1 reset\0", epoch.to_bytes(4, "big")
     ways = _ways(
         reset_message(uuid, epoch, challenge),
@@ -431,7 +431,7 @@ def of_reset(uuid: bytes, node: bytes, epoch: int, challenge: bytes, proof: byte
 
 
 def station_keys(station: bytes) -> list[tuple[Slip, bytes]]:
-    """What a node may hold SIG104 against in place of the right message."""
+    """Return the messages over which a node with a slip verifies SIG104."""
     label = b"TEDS1 station key\0"
     ways = _ways(
         b"",
@@ -447,7 +447,7 @@ def station_keys(station: bytes) -> list[tuple[Slip, bytes]]:
 
 
 def datasheets(uuid: bytes, block: bytes) -> list[tuple[Slip, bytes]]:
-    """What a node may hold field 100 against; ``block`` is the data block without field 100."""
+    """Return the messages over which a node with a slip verifies field 100; ``block`` is the data block without it."""
     label = b"TEDS1 datasheet\0"
     ways = _ways(
         b"",
@@ -465,9 +465,9 @@ def datasheets(uuid: bytes, block: bytes) -> list[tuple[Slip, bytes]]:
 def opens(
     key: bytes, okm: bytes, uuid: bytes, point: bytes, *, about_key: bool
 ) -> list[tuple[Slip, Callable[[bytes], bytes]]]:
-    """Payloads of Open, by c, as nodes with a slip in keyId (``about_key``) or in mac wait for them.
+    """Return payloads of Open, by c, as nodes with a slip in keyId (``about_key``) or in mac expect them.
 
-    ``okm`` is that of the agreement that gave the key, empty where it is not known; ``point`` is Es.
+    ``okm`` is that of the agreement that gave the key, empty if it is not known; ``point`` is Es.
     """
     tries: list[tuple[Slip, Callable[[bytes], bytes]]] = []
 
@@ -521,7 +521,7 @@ def _next(counter: bytes) -> bytes:
 
 
 def of_session(key: bytes, uuid: bytes, one_time: PrivateKey, reply: bytes) -> Slip | None:
-    """What would explain a wrong tag in the reply to Open; ``one_time`` is the key of Es."""
+    """Return the slip that explains a wrong tag in the reply to Open; ``one_time`` is the key of Es."""
     node, station, got = reply[:POINT_OCTETS], one_time.point, reply[POINT_OCTETS:]
     if len(got) != TAG_OCTETS or not is_point(node):
         return None
@@ -605,7 +605,7 @@ SEALED: Final[list[tuple[Slip, Seal]]] = [
 
 
 def of_sealed_reply(keys: SessionKeys, payload: bytes, counter: int) -> Slip | None:
-    """What would explain a sealed reply whose tag or padding is wrong, or that has another counter than ``counter``."""
+    """Return the slip that explains a sealed reply with a wrong tag or padding, or another counter than ``counter``."""
     if len(payload) < 4 + TAG_OCTETS:
         return None
     head, rest = payload[:4], payload[4:]
@@ -677,7 +677,7 @@ def _opens(key: bytes, nonce: bytes, sealed: bytes, aad: bytes | None) -> bool:
 
 
 def _of_padding(inner: bytes) -> Slip | None:
-    """What was done in place of PKCS #7; ``inner`` is what the good tag covers."""
+    """Return the slip that replaced PKCS #7 padding; ``inner`` is what the good tag covers."""
     length = 3 + int.from_bytes(inner[1:3], "big")
     if length == len(inner) and not length % 16:
         return Slip("padding-no-full-block", "a reply that is a multiple of 16 octets gets no block of padding")
@@ -694,5 +694,5 @@ def _of_padding(inner: bytes) -> Slip | None:
 
 
 def high_s(signature: bytes) -> bool:
-    """Whether s of r ‖ s is in the upper half of the group order."""
+    """Return True if s of r ‖ s is in the upper half of the group order."""
     return int.from_bytes(signature[32:], "big") > GROUP_ORDER // 2

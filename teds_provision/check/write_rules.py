@@ -52,7 +52,7 @@ _HEAD = 53
 
 
 def _example(block: BlockId) -> bytes:
-    """A TEDS that passes its own check: TEDSID of this access code, and one tuple."""
+    """Return a TEDS that passes its own check: TEDSID of this access code, and one tuple."""
     return frame(bytes([3, 4, 0, block[1], 1, 1, 0x80, 2, 0xCA, 0xFE]))
 
 
@@ -69,7 +69,10 @@ def write_checks(probe: Probe) -> str:
 
 @rule("write-keeps", "Writing to flash", Stage.SESSION)
 def write_keeps(probe: Probe) -> str:
-    """A refused Write changes no staging; an empty one at 0 stages an empty image, which fails its own check."""
+    """Check that a refused Write changes no staging.
+
+    An empty one at 0 stages an empty image, which fails its own check.
+    """
     block = absent(probe)
     good = _example(block)
     probe.sealed_good(write_teds(*block, 0, good))
@@ -84,7 +87,10 @@ def write_keeps(probe: Probe) -> str:
 
 @rule("update-checks", "Writing to flash", Stage.SESSION)
 def update_checks(probe: Probe) -> str:
-    """A staged image with wrong checksum, or another class in its TEDSID, gets 4; 128 while others are staged 2."""
+    """Check that a staged image with wrong checksum, or another class in its TEDSID, gets 4.
+
+    128 while others are staged 2.
+    """
     block = absent(probe)
     good = _example(block)
     for wrong, why in ((good[:-1] + bytes([good[-1] ^ 1]), "checksum"), (_example((0, 130)), "class of the TEDSID")):
@@ -98,7 +104,7 @@ def update_checks(probe: Probe) -> str:
 
 @rule("update-codes", "Writing to flash", Stage.SESSION)
 def update_codes(probe: Probe) -> str:
-    """The checksum of a staged TEDS is looked at whatever its access code is, Calibration as well as text: else 4."""
+    """Check that a staged TEDS with a wrong checksum gets 4, for every access code: Calibration and text alike."""
     listed = set(probe.listed())
     for code in _CODES:
         channel = next(channel for channel in range(255, 0, -1) if (channel, code) not in listed)
@@ -111,7 +117,7 @@ def update_codes(probe: Probe) -> str:
 
 @rule("staged-unseen", "Writing to flash", Stage.SESSION)
 def staged_unseen(probe: Probe) -> str:
-    """What is staged is not there yet: neither Read nor Query gives it, and Update of it alone commits nothing."""
+    """Check that staging is invisible: neither Read nor Query gives it, and Update of it alone commits nothing."""
     block = absent(probe)
     before = probe.sealed_good(query_teds(*block))
     probe.sealed_good(write_teds(*block, 0, _example(block)))
@@ -130,7 +136,7 @@ def staged_unseen(probe: Probe) -> str:
 
 @rule("write-read-only", "Writing to flash", Stage.SESSION)
 def write_read_only(probe: Probe) -> str:
-    """A TEDS that Query calls read-only is not written: 3."""
+    """Check that a TEDS that Query calls read-only cannot be written: 3."""
     for block in probe.listed():
         if TedsStatus.decode(probe.good(query_teds(*block))).attributes & Attribute.READ_ONLY:
             seen = probe.sealed_refused(write_teds(*block, 0, b"\0"), Reason.NOT_PERMITTED, f"{block} is read-only")
@@ -141,7 +147,7 @@ def write_read_only(probe: Probe) -> str:
 
 @rule("write-drops", "Writing to flash", Stage.SESSION)
 def write_drops(probe: Probe) -> str:
-    """What lay behind the written octets is dropped; more than MaxTEDSSize gets 10."""
+    """Check that Write drops the octets after those written; more than MaxTEDSSize gets 10."""
     block = absent(probe)
     good = _example(block)
     probe.sealed_good(write_teds(*block, 0, good))
@@ -205,7 +211,7 @@ def stored_blocks(probe: Probe) -> dict[BlockId, bytes]:
 
 
 def _sheet(probe: Probe, listed: dict[BlockId, bytes]) -> SecurityTeds:
-    """What the next good Security TEDS over these blocks says, unsigned."""
+    """Return the next good Security TEDS over these blocks, unsigned."""
     identity, station = probe.identity(), probe.station
     return unsigned_datasheet(
         probe.node_keys,
@@ -230,7 +236,7 @@ def _signed(probe: Probe, sheet: SecurityTeds) -> bytes:
 
 
 def commit_blocks(probe: Probe, blocks: dict[BlockId, bytes], *, write: dict[BlockId, bytes]) -> None:
-    """Commit a datasheet over these TEDS, of which ``write`` are new; raises RuleBrokenError where it is refused."""
+    """Commit a datasheet over these TEDS, of which ``write`` are new; raises RuleBrokenError if it is refused."""
     octets = _signed(probe, _sheet(probe, blocks))
     for block, teds in write.items():
         _write(probe, block, teds)
@@ -282,7 +288,7 @@ def commit_signatures(probe: Probe) -> str:
 
 @rule("commit-high-s", "Notation", Stage.COMMIT)
 def commit_high_s(probe: Probe) -> str:
-    """A field 100 whose s is in the upper half gets 5."""
+    """Check that a field 100 whose s is in the upper half gets 5."""
     sheet = _sheet(probe, stored_blocks(probe))
     good = security.decode(_signed(probe, sheet)).signature
     assert good is not None
@@ -293,7 +299,7 @@ def commit_high_s(probe: Probe) -> str:
 
 @rule("commit-form", "Writing to flash", Stage.COMMIT)
 def commit_form(probe: Probe) -> str:
-    """A Security TEDS that is not canonical, or not signed, gets 4."""
+    """Check that a Security TEDS that is not canonical, or not signed, gets 4."""
     octets = _signed(probe, _sheet(probe, stored_blocks(probe)))
     twice = frame(octets[4:-2] + b"\x6e\x01\x01")  # field 110 a second time
     for wrong, why in ((twice, "110 twice"), (security_of_the_node(probe), "not signed")):
@@ -305,7 +311,7 @@ def commit_form(probe: Probe) -> str:
 
 @rule("commit-utf8", "The Security TEDS", Stage.COMMIT)
 def commit_utf8(probe: Probe) -> str:
-    """A field 5 that is not UTF-8 gets 4, signed as it may be: a lone octet, a surrogate, more octets than needed."""
+    """Check that a field 5 that is not UTF-8 gets 4 even if signed: a lone octet, a surrogate, an overlong form."""
     for wrong in (b"bench\xff:", b"\xed\xa0\x80:", b"\xc0\xaf:"):
         block = _unsigned_block(probe)
         at = _place(block, 5)
@@ -350,12 +356,12 @@ def commit_extra(probe: Probe) -> str:
 
 
 def _unsigned_block(probe: Probe) -> bytes:
-    """The data block of the next good Security TEDS, without field 100."""
+    """Return the data block of the next good Security TEDS, without field 100."""
     return _sheet(probe, stored_blocks(probe)).block()
 
 
 def _signed_block(probe: Probe, block: bytes, message: bytes = b"") -> bytes:
-    """The framed TEDS of a data block whose field 100 signs it as it is, or signs ``message``."""
+    """Return the framed TEDS of a data block whose field 100 signs it unchanged, or signs ``message``."""
     message = message or b"TEDS1 datasheet\0" + probe.uuid + block
     signature = base64.b64encode(probe.station.key.sign(message))
     at = _place(block, 101) - 2
@@ -363,7 +369,7 @@ def _signed_block(probe: Probe, block: bytes, message: bytes = b"") -> bytes:
 
 
 def _place(block: bytes, field: int) -> int:
-    """Where the value of a field begins in a data block."""
+    """Return the offset of a field's value in a data block."""
     at = 0
     while block[at] != field or at == 0:  # the TEDSID is first by position, whatever its type
         at += 2 + block[at + 1]
@@ -371,7 +377,7 @@ def _place(block: bytes, field: int) -> int:
 
 
 def security_of_the_node(probe: Probe) -> bytes:
-    """The initial Security TEDS of the node; raises NotApplicableError where it has a signed one."""
+    """Return the initial Security TEDS of the node; raises NotApplicableError if it has a signed one."""
     if probe.security().signed:
         raise NotApplicableError("The node has a signed Security TEDS already.")
     return probe.teds(SECURITY)
@@ -379,7 +385,7 @@ def security_of_the_node(probe: Probe) -> bytes:
 
 @rule("commit-digests", "Writing to flash", Stage.COMMIT)
 def commit_digests(probe: Probe) -> str:
-    """A listed TEDS that is not there, and a staged one that is not listed, get 6."""
+    """Check that a listed TEDS that is absent, and a staged one that is not listed, get 6."""
     block = absent(probe)
     stored = stored_blocks(probe)
     _write(probe, SECURITY, _signed(probe, _sheet(probe, stored | {block: _example(block)})))
@@ -393,7 +399,7 @@ def commit_digests(probe: Probe) -> str:
 
 @rule("commit-digest", "Writing to flash", Stage.COMMIT)
 def commit_digest(probe: Probe) -> str:
-    """A staged TEDS with another digest than the one that is listed gets 6."""
+    """Check that a staged TEDS with another digest than the listed one gets 6."""
     block = absent(probe)
     listed = stored_blocks(probe) | {block: frame(bytes([3, 4, 0, block[1], 1, 1, 0x80, 2, 0xBE, 0xEF]))}
     _write(probe, block, _example(block))
@@ -403,7 +409,7 @@ def commit_digest(probe: Probe) -> str:
 
 @rule("commit-own-check", "Writing to flash", Stage.COMMIT)
 def commit_own_check(probe: Probe) -> str:
-    """A staged image that does not pass its own check gets 4, whatever is signed."""
+    """Check that a staged image that does not pass its own check gets 4, regardless of the signature."""
     block = absent(probe)
     wrong = _example(block)[:-1] + bytes([_example(block)[-1] ^ 1])
     _write(probe, block, wrong)
@@ -425,7 +431,7 @@ def commit_values(probe: Probe) -> str:
 
 @rule("commit-uuid", "Writing to flash", Stage.COMMIT)
 def commit_uuid(probe: Probe) -> str:
-    """A Meta-TEDS of the 2007 form that names another UUID gets 9."""
+    """Check that a Meta-TEDS of the 2007 form that names another UUID gets 9."""
     meta = (0, 1)
     if TedsStatus.decode(probe.good(query_teds(*meta))).attributes & Attribute.READ_ONLY:
         raise NotApplicableError("The Meta-TEDS of this node is read-only.")
@@ -438,7 +444,7 @@ def commit_uuid(probe: Probe) -> str:
 
 @rule("commit-sequence", "Writing to flash", Stage.COMMIT)
 def commit_sequence(probe: Probe) -> str:
-    """A sequence that is not greater, or greater by more than 65536, gets 7."""
+    """Check that a sequence that is not greater, or greater by more than 65536, gets 7."""
     _refused_commit(probe, Reason.STALE_SEQUENCE, "the stored sequence", lambda s: replace(s, sequence=s.sequence - 1))
     return _refused_commit(
         probe, Reason.STALE_SEQUENCE, "65537 ahead", lambda s: replace(s, sequence=s.sequence + 65536)
@@ -447,7 +453,7 @@ def commit_sequence(probe: Probe) -> str:
 
 @rule("commit-epoch", "Writing to flash", Stage.COMMIT)
 def commit_epoch(probe: Probe) -> str:
-    """A KeyEpoch other than the node's, a later or an earlier one, gets 8, after the sequence."""
+    """Check that a KeyEpoch other than the node's, later or earlier, gets 8, after the sequence."""
     _refused_commit(probe, Reason.WRONG_EPOCH, "an epoch ahead", lambda s: replace(s, key_epoch=s.key_epoch + 1))
     return _refused_commit(
         probe, Reason.WRONG_EPOCH, "an epoch behind", lambda s: replace(s, key_epoch=max(0, s.key_epoch - 1))
@@ -456,7 +462,10 @@ def commit_epoch(probe: Probe) -> str:
 
 @rule("commit", "Writing to flash", Stage.COMMIT)
 def commit(probe: Probe) -> str:
-    """A good one is taken whole and read back; the next, without the TEDS of the test, removes it again."""
+    """Check that a good datasheet is committed whole and read back.
+
+    The next, without the TEDS of the test, removes it.
+    """
     block, stored, before = absent(probe), stored_blocks(probe), probe.identity()
     for blocks in (stored | {block: _example(block)}, stored):
         octets = _signed(probe, _sheet(probe, blocks))
@@ -484,9 +493,9 @@ def commit(probe: Probe) -> str:
 
 
 def _slip_of_commit(probe: Probe, reason: int | None, blocks: dict[BlockId, bytes]) -> Slip | None:
-    """What a node that refuses a good datasheet with 5 or 6 may be looking for: each is tried until it takes one.
+    """Return the slip by which a node that refuses a good datasheet with 5 or 6 verifies it; each is tried in turn.
 
-    None if it takes the right one now, or one that no slip explains: then none of these is what is wrong with it.
+    None if it accepts the right one now, or one that no slip explains: then none of these is the fault.
     """
     probe.close()
     stored = stored_blocks(probe)

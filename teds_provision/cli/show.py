@@ -466,7 +466,7 @@ def _described(name: str, kind: Kind, blocks: Sequence[TedsBlock], edition: Edit
 
 
 def looks_like_certificate(octets: bytes) -> bool:
-    """True if a file begins like a calibration certificate."""
+    """Return True if a file begins like a calibration certificate."""
     return octets.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<") and _CERTIFICATE in octets[:_CERTIFICATE_HEAD]
 
 

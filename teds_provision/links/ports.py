@@ -174,7 +174,7 @@ class BusFrames(Protocol):
         """Put one frame on the bus; raises LinkError."""
 
     def next(self, seconds: float) -> BusFrame | None:
-        """The next frame of a node, Announces and data too; None after ``seconds``. Raises LinkError."""
+        """Return the next frame of a node, Announces and data too; None after ``seconds``. Raises LinkError."""
 
 
 @runtime_checkable

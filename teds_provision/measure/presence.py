@@ -214,7 +214,7 @@ class Presence:
             return self._turn.wait_for(other, TWIN + ROUND)
 
     def is_shared(self, sighting: Sighting) -> bool:
-        """True if two boards were heard at the address of a sighting a short while ago."""
+        """Return True if two boards were heard at the address of a sighting a short while ago."""
         with self._turn:
             return self._is_shared((sighting.port.place, sighting.address))
 

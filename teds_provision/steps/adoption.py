@@ -186,7 +186,7 @@ def _strange_texts(block: BlockId, octets: bytes) -> Iterator[str]:
 
 
 def _is_shown(text: str, block: BlockId) -> bool:
-    """True if a text has printable letters only; the lines of TEDS 130 and 131 end in LF."""
+    """Return True if a text has printable letters only; the lines of TEDS 130 and 131 end in LF."""
     lines = block[1] in (AccessCode.ORIGIN, AccessCode.CERTIFICATE)
     return (text.replace("\n", "") if lines else text).isprintable()
 

@@ -94,7 +94,7 @@ class SingleFrames:
         self._bus.send(Frame(identifier, octets, fd))
 
     def next(self, seconds: float) -> BusFrame | None:
-        """The next frame of a node; None after ``seconds``."""
+        """Return the next frame of a node; None after ``seconds``."""
         until = time.monotonic() + seconds
         while (frame := self._heard.get(max(0.0, until - time.monotonic()))) is None:
             if time.monotonic() >= until:
@@ -190,7 +190,7 @@ class CanLink:
 
     @contextmanager
     def single_frames(self) -> Iterator[SingleFrames]:
-        """The frames of the bus, one by one; see ``links.ports.FramedLink``."""
+        """Return the frames of the bus, one by one; see ``links.ports.FramedLink``."""
         bus = self._bus()
         with bus.listen(_is_of_a_node) as heard:
             yield SingleFrames(bus, heard, self._source or bus.own)

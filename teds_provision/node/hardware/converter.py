@@ -93,7 +93,7 @@ class Converter:
         return self._writer.write(np.array([raw]))
 
     def _no_value(self) -> bytes:
-        """A sample that no reader takes for a value; raises BadDataError where every sample is one."""
+        """Return a sample that no reader takes for a value; raises BadDataError if every sample is one."""
         if self._packing is not None:
             return self._packing.pack(math.nan)
         if self._most is not None and self._most < (1 << 8 * self._octets) - 1:

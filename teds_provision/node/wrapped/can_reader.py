@@ -59,7 +59,7 @@ class MessageReader:
             part.trouble(why)
 
     def _is_ours(self, frame: SensorFrame) -> bool:
-        """True if the frame is from the first source address that sent this group, until that one is silent."""
+        """Return True if the frame is from the first source address that sent this group, until that one is silent."""
         address = frame.identifier & 0xFF
         if self._address is None or (address != self._address and frame.at - self._heard_at > self._silence):
             self._address = address

@@ -204,7 +204,7 @@ def _channel(message: Message, signal: Signal, period: float) -> WrappedChannel:
 
 
 def _is_linear(signal: Signal) -> bool:
-    """True if the conversion is value = raw × scale + offset; cantools also knows piecewise ones of other formats."""
+    """Return True if the conversion is value = raw × scale + offset; other formats also have piecewise ones."""
     conversion = signal.conversion
     return hasattr(conversion, "scale") and hasattr(conversion, "offset")
 

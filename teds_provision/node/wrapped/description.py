@@ -195,7 +195,7 @@ class WrappedChannel:
         return (unit.scale, unit.offset) == (1.0, 0.0)
 
     def _held_by_float32(self, coefficients: tuple[float, float]) -> bool:
-        """True if rounding to Float32 moves no value by half a step: of the coefficients, and of the way into SI."""
+        """Return True if rounding coefficients and SI conversion to Float32 moves no value by half a step."""
         unit = self.written
         exact = (*coefficients, unit.scale, unit.offset)
         try:

@@ -54,7 +54,7 @@ class SensorPlace:
 
 
 def is_wrapped(source: str) -> bool:
-    """True if ``--source`` names sensors that are wrapped."""
+    """Return True if ``--source`` names sensors that are wrapped."""
     return source.partition(":")[0] in KIND_OF
 
 

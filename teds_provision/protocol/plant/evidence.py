@@ -369,7 +369,7 @@ def _wrong_datasheet(checked: CheckedEvidence, signatures: Signatures, ca: bytes
 
 
 def _is_listed(origin: str, shown: SecurityTeds) -> bool:
-    """True if field 108 lists the TEDS that holds this origin."""
+    """Return True if field 108 lists the TEDS that holds this origin."""
     return shown.signed_blocks.get(ORIGIN) == hashlib.sha256(origin_from_text(origin).encode()).digest()
 
 

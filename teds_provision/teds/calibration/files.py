@@ -302,7 +302,7 @@ def load_calibrations(
 
 
 def _for_channel(found: dict[int, Calibration], choice: CertificateChoice | None, file: str) -> dict[int, Calibration]:
-    """What a file holds for the channel that the caller names, all of it if none is named."""
+    """Return the contents of a file for the channel that the caller names, all of it if none is named."""
     if choice is None or choice.channel is None:
         return found
     if choice.channel not in found:

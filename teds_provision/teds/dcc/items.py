@@ -186,14 +186,14 @@ def _misfit(item: CertificateItem, channel: ChannelProfile) -> str:
 
 
 def _is_raw(quantity: Quantity, channel: ChannelProfile) -> bool:
-    """True if indications are raw numbers; of a channel without a unit only if their reference type says so."""
+    """Return True if indications are raw numbers; of a channel without a unit only if their reference type says so."""
     if not _is_plain(quantity.unit):
         return False
     return quantity.has_role("rawvalue") or not (_is_plain(channel.unit) or channel.units.interpretation == RATIO)
 
 
 def _is_float(channel: ChannelProfile) -> bool:
-    """True if the raw number is a value in SI units itself."""
+    """Return True if the raw number is a value in SI units itself."""
     sample = channel.fields.get("Sample")
     return isinstance(sample, dict) and sample.get("DatModel") in _FLOATS
 
@@ -203,7 +203,7 @@ def _is_plain(unit: WrittenUnit) -> bool:
 
 
 def _same_kind(unit: WrittenUnit, units: Units) -> bool:
-    """True if values in a unit can be those of a channel; a plain number may be a ratio of anything."""
+    """Return True if values in a unit can be those of a channel; a plain number may be a ratio of anything."""
     if unit.units == units:
         return True
     return _is_plain(unit) and units.interpretation == RATIO

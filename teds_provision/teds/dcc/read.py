@@ -53,7 +53,7 @@ class Quantity:
     line: int = 1
 
     def has_role(self, *words: str) -> bool:
-        """True if a reference type ends in one of these words, whatever its namespace: ``basic_referenceValue``."""
+        """Return True if a reference type ends in one of these words, in any namespace: ``basic_referenceValue``."""
         return any(ref.rpartition("_")[2].lower() in words for ref in self.ref_types)
 
     @property

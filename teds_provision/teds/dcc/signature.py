@@ -196,7 +196,7 @@ def _signer(
 def _leads_to(
     leaf: x509.Certificate, others: Sequence[x509.Certificate], anchors: Sequence[x509.Certificate], moment: datetime
 ) -> bool:
-    """True if a chain of certificates, valid at a moment, leads from a signer to a trusted CA."""
+    """Return True if a chain of certificates, valid at a moment, leads from a signer to a trusted CA."""
     from cryptography import x509
     from cryptography.x509 import verification
 
@@ -212,7 +212,7 @@ def _leads_to(
 
 
 def _may_sign(certificate: x509.Certificate) -> bool:
-    """True if a certificate's key usage, where it states one, allows signatures."""
+    """Return True if a certificate's key usage, where it states one, allows signatures."""
     from cryptography import x509
 
     try:
