@@ -62,8 +62,8 @@ def check(app: App, factory: bool, explain: bool, yes: bool, dry_run: bool, link
         return
     if factory:
         app.confirm(
-            "Key, write and reset the node found, and claim an actuator that it has? If the node is one of yours, it loses"
-            " its key and datasheet.",
+            "Key, write and reset the node found, and claim an actuator that it has? If the node is one of yours, it"
+            " loses its key and datasheet.",
             yes=yes,
         )
     report = check_room.run.check_at(station, links, reporter_for(app), factory=factory, explained=explain)

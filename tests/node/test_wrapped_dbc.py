@@ -374,5 +374,5 @@ def test_another_message_that_overlaps_itself_does_not_hinder_and_its_own_does(t
     signal = ' SG_ x : 0|16@1+ (1,0) [0|0] "" A\n'
     path.write_text(f"{HEAD}BO_ 100 Good: 8 A\n{signal}\nBO_ 101 Bad: 8 A\n{signal}{signal.replace(' x ', ' y ')}\n")
     assert [channel.name for channel in dbc_message.read(path, "Good").sensor.channels] == ["x"]
-    with pytest.raises(BadDataError, match="message Bad cannot be decoded: The signals"):
+    with pytest.raises(BadDataError, match=r"message Bad cannot be decoded: The signals"):
         dbc_message.read(path, "Bad")
