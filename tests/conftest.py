@@ -134,7 +134,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         for report in terminalreporter.stats.get("skipped", [])
         if isinstance(report, pytest.TestReport) and "system" in report.keywords  # a module may be skipped, too
     ]
-    if skipped:
+    if skipped and "PYTEST_XDIST_WORKER" not in os.environ:
         line = f"Not tested: {len(skipped)} tests that need Debian packages. As root: sh scripts/install-test-packages"
         terminalreporter.write_line(line)
         with suppress(OSError), (ROOT / "build" / "not-tested").open("a", encoding="utf-8") as file:
