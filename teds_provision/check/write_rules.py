@@ -111,7 +111,7 @@ def update_codes(probe: Probe) -> str:
         good = _example((channel, code))
         probe.sealed_good(write_teds(channel, code, 0, good[:-1] + bytes([good[-1] ^ 1])))
         seen = probe.sealed_refused(update_teds(channel, code), Reason.BAD_FORM, f"access code {code}, checksum wrong")
-        probe.close()
+    probe.close()
     return seen
 
 
