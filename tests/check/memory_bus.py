@@ -126,6 +126,14 @@ class MemoryServer(CanServer):
                 return None
             board.seconds += max(wait, _LEAST)
 
+    def pass_time(self, seconds: float) -> None:
+        """Let time pass while no frame is looked at: what comes meanwhile waits to be taken."""
+        until, heard = self._line.board.seconds + seconds, list[BusFrame]()
+        while (left := until - self._line.board.seconds) > 0:
+            if (frame := self.next(left)) is not None:
+                heard.append(frame)
+        self._outbox.frames[:0] = heard
+
     def _settle(self) -> None:
         """Do what is due; random waits are over."""
         seat = self._endpoints[0]

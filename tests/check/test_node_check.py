@@ -23,7 +23,8 @@ from tests.protocol.operation.bench import SAFE_VALUE
 from ..bench import Board, make_station, talk
 from . import faulty, nodes
 from .bends import agreeing_so, opening_so
-from .faulty import FaultyLink
+from .faulty import FaultyBus, FaultyLink
+from .memory_bus import MemoryServer
 from .nodes import names
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -91,6 +92,21 @@ def test_a_board_without_channel_teds_is_lent_some(station: Station, patch: pyte
     assert names(report, "passed") >= OF_CHANNELS
     assert board.state.blocks == own, "what was lent is gone"
     assert board.hardware.points == dict.fromkeys((4, 6), SAFE_VALUE), "no actuator was given another value"
+
+
+def test_data_messages_that_were_on_their_way_accuse_no_slow_board(station: Station, patch: pytest.MonkeyPatch) -> None:
+    """One that came before the reply to Stop was taken for one after it, one of run 1 for one of run 2."""
+
+    class Slow(FaultyBus):
+        def exchange(self, frame: bytes) -> bytes:
+            if isinstance(self.end, MemoryServer):
+                self.end.pass_time(0.3)
+            return super().exchange(frame)
+
+    board = nodes.made("measuring can")
+    report = nodes.checked(station, patch, board, over="measuring can", line=Slow(board))
+    streams = [check for check in report.checks if check.rule == "stream-messages"]
+    assert [(check.result, check.detail) for check in streams if check.result != "passed"] == []
 
 
 @pytest.mark.parametrize("over", ["measuring can", "measuring can blank"])
