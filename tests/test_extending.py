@@ -45,6 +45,8 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("house")
     for part in ("teds_provision", "tests", "scripts", "docs", "profiles"):
         shutil.copytree(ROOT / part, folder / part)  # what is compiled as well
+    for part in ("include", "src"):  # the rules read the C library, too
+        shutil.copytree(ROOT / "firmware" / part, folder / "firmware" / part)
     for file in ("pyproject.toml", "Makefile"):
         shutil.copy(ROOT / file, folder)
     follow((ROOT / "docs" / "extending.md").read_text(), folder)
