@@ -717,8 +717,8 @@ ON_THE_BUS: Final[dict[str, Change]] = {
     ),
     "FAULT_ADDRESS_STAYS": Change(
         "can.c",
-        "    if (own != node->can.address) {\n",
-        "    if (own != node->can.address && own != teds_default_address(node)) {\n",
+        "    if (own != node->can.address || frame->length < 2) {\n",
+        "    if ((own != node->can.address && own != teds_default_address(node)) || frame->length < 2) {\n",
         more=(("    switch (frame->data[0] >> 4) {\n", "    line->own = own;\n    switch (frame->data[0] >> 4) {\n"),),
     ),
 }
