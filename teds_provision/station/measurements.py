@@ -115,6 +115,9 @@ class Measurements:
         ``also`` are the measurements that may go with it. Raises FrozenError while it is measured, or if another one is
         kept for it.
         """
+        kept = [measurement.id for measurement in self.of_group(group)]
+        if not kept and self._groups.find(group) is None:
+            return False, ()  # a name without a group gets no lock file
         with self._groups.frozen(group):  # measured now: refused for that, whatever may go with it
             kept = [measurement.id for measurement in self.of_group(group)]
         with self._store.together():

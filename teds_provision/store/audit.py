@@ -80,7 +80,8 @@ FAILED = (
     "lost", "declined",
     "not-", "not ", "no-", "node-", "other-key", "address-conflict", "frozen", "garbled", "link", "store", "vault",
     "wrong-", "calibration-misfit", "usage", "bad-data", "bug",
-    "changed", "conflict", "fork", "newer-format", "office-refused", "registry", "roster-expired", "two-histories",
+    "changed", "conflict", "fork", "incomplete-installation", "missing-field",
+    "newer-format", "newer-store", "office-refused", "registry", "roster-expired", "two-histories", "unclear-item",
 )  # fmt: skip
 """How the outcome of an act begins that did not do what it should: words, and the codes of the errors that end one."""
 

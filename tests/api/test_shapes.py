@@ -142,7 +142,7 @@ def test_the_client_takes_what_the_body_takes(method: Any, body: type[Any], besi
 # -- the page ----------------------------------------------------------------------------------------------------------
 
 SHAPES = Path(ncap.__file__).parent / "page" / "js" / "shapes.js"
-READ_AS = {"scaleOf": "Channel", "channel": "Channel", "node": "Node", "status": "Status"}
+READ_AS = {"scaleOf": "Channel", "turnOf": "Channel", "channel": "Channel", "node": "Node", "status": "Status"}
 """Which schema the argument ``wire`` of a function has; ``link`` of status is a Link."""
 FREE = {"power", "live", "moment", "modeOf"}  # what has no schema: flags of a battery, messages of /live, one value
 
