@@ -149,7 +149,7 @@ def run(folder: Path, nodes: int, rate: int, seconds: float) -> int:
         time.sleep(1)
         file = folder / "run.csv"
         before, began = cpu_seconds(node.process.pid), time.monotonic()
-        outcome = station.run("measure", *uuids, *can, "--duration", str(seconds), "--to", file)
+        outcome = station.start("measure", *uuids, *can, "--duration", str(seconds), "--to", file).end(seconds + 60)
         used, took = cpu_seconds(node.process.pid) - before, time.monotonic() - began
         player.kill()
         player.wait()
