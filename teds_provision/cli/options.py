@@ -119,10 +119,14 @@ def file_units_option(function: Function) -> Function:
     )(function)
 
 
-class Day(click.ParamType[datetime]):
+class Day(click.DateTime):
     """A day like 2027-10-31, as its first moment in UTC."""
 
     name = "date"
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
+        """Return the name as help shows it, in place of a list of formats."""
+        return self.name.upper()
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Read a day; raises BadParameter."""
