@@ -81,7 +81,7 @@ else:
 _TOOL: Final = "teds-provision"
 REQUIRED: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
     {
-        "click": ("click", "8.2.1"),
+        "click": ("click", "8.4.2"),
         "cryptography": ("cryptography", "44.0.0"),
         "rich": ("rich", "13.7"),
         "nfcpy": ("nfc", "1.0.4"),
