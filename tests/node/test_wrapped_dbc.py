@@ -376,3 +376,15 @@ def test_another_message_that_overlaps_itself_does_not_hinder_and_its_own_does(t
     assert [channel.name for channel in dbc_message.read(path, "Good").sensor.channels] == ["x"]
     with pytest.raises(BadDataError, match=r"message Bad cannot be decoded: The signals"):
         dbc_message.read(path, "Bad")
+
+
+@pytest.mark.parametrize("text", ["a", '\\"'])
+def test_a_text_without_end_takes_no_memory(tmp_path: Path, text: str) -> None:
+    """cantools takes 220 octets for each character of it: a gigabyte for a file of 5 MB."""
+    path = tmp_path / "endless.dbc"
+    path.write_text('VERSION "' + text * (dbc_message.LONGEST_TEXT + 1))
+    with pytest.raises(BadDataError, match="quotation mark"):
+        dbc_message.read(path, "M")
+    path.write_bytes(b" " * (dbc_message.MOST_OCTETS + 1))
+    with pytest.raises(BadDataError, match="too large"):
+        dbc_message.read(path, "M")

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from cantools.database.can import Message
     from cantools.database.can.signal import Signal
 
-MOST_OCTETS: Final = 32 << 20
+MOST_OCTETS: Final = 8 << 20
+LONGEST_TEXT: Final = 1 << 20
+"""Characters between two quotation marks. cantools takes 220 octets of memory for each one of a text without end."""
 _SHOWN: Final = 12
 _NO_MESSAGE: Final = "VECTOR__INDEPENDENT_SIG_MSG"
 """Holds signals that no message carries."""
@@ -131,6 +133,11 @@ def _messages(path: Path, octets: bytes) -> list[Message]:
         text = octets.decode()
     except UnicodeDecodeError:
         text = octets.decode("cp1252", errors="replace")  # the encoding of the tools that write DBC files
+    if max(map(len, text.replace('\\"', "''").split('"'))) > LONGEST_TEXT:
+        raise BadDataError(
+            f"{path} is not a DBC file that can be read: more than {LONGEST_TEXT} characters have no quotation mark.",
+            hint="Check the file: the end of a text may be missing.",
+        )
     try:
         # another message of the file may overlap itself: the one that is wrapped is checked alone
         loaded = database.load_string(text, database_format="dbc", strict=False)
