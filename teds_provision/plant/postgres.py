@@ -102,7 +102,7 @@ union all select 'page', p.station, p.n, p.jws, null, null from registry.page p
 _LOOK: Final = f"""{_LOOK_1}
 union all select 'handed', author, pages, at::text, by, null from registry.handed"""
 
-# Every page of an author, whoever handed it in: the author itself (by null), or others.
+# Every page of an author, from any sender: the author itself (by null), or others.
 _OFFERS: Final = """\
 select n, encode(hash, 'hex'), encode(sha256(convert_to(jws, 'UTF8')), 'hex'), null::text
   from registry.page where station = %s
@@ -264,7 +264,7 @@ class Registry:
                 more = len(rows) == PAGES_AT_ONCE
 
     def offers(self, station: str) -> list[Offer]:
-        """Return every page of a station, whoever handed it in; one round trip."""
+        """Return every page of a station, from any sender; one round trip."""
         author = bytes.fromhex(station)
         return [Offer(station, n, hash, octets, by or "") for n, hash, octets, by in self._rows(_OFFERS, (author,) * 2)]
 
@@ -521,7 +521,7 @@ class ReturnedPages:
         return self._post._look.heads.get(station, (0, ""))[0]
 
     def offers(self, station: str) -> list[Offer]:
-        """Return every page of a station, whoever handed it in."""
+        """Return every page of a station, from any sender."""
         return self._post._registry.offers(station)
 
     def octets(self, offers: Sequence[Offer]) -> list[CarriedPage]:

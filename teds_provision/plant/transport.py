@@ -63,7 +63,7 @@ class Returned(Protocol):
         """Return the number of the newest page that the station appended itself."""
 
     def offers(self, station: str) -> list[Offer]:
-        """Return every page of a station, whoever handed it in."""
+        """Return every page of a station, from any sender."""
 
     def octets(self, offers: Sequence[Offer]) -> list[CarriedPage]:
         """Return the offered pages; one that is gone is left out."""

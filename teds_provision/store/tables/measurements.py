@@ -115,7 +115,7 @@ class MeasurementTables:
         return {(bytes(uuid), int(channel)): str(name) for uuid, channel, name in rows}
 
     def topic_names_of(self, uuid: bytes) -> dict[int, str]:
-        """Return the names that somebody chose for the channels of a node; channel 0 is its part of its topics."""
+        """Return the names chosen for the channels of a node; channel 0 is its part of its topics."""
         rows = self._database.execute("SELECT channel, name FROM topics WHERE uuid = ? ORDER BY channel", (uuid,))
         return {int(channel): str(name) for channel, name in rows}
 

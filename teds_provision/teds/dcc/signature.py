@@ -1,8 +1,8 @@
 """The signature of a certificate, as far as signxml checks it; what is read afterwards is the signed part alone.
 
 A signature is XMLDSig or XAdES, one, a child of the root, over the whole document. Its digests and its value are always
-checked, with the signer's certificate that it brings: a file that was changed after signing is refused, whoever signed
-it. Who signed it counts only against a certificate that the caller trusts, or a CA that the caller trusts.
+checked, with the signer's certificate that it brings: a file that was changed after signing is refused. The signer is
+judged only by a certificate, or the CA of one, that the caller trusts.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A fit of ours as a certificate: DCC 3.2.1 with D-SI 2.1, which states only what file, fit and laboratory state.
 
-What nobody stated is written as ``not stated``; the schema demands a name there. It is not signed.
+A missing fact is written as ``not stated``; the schema demands a name there. It is not signed.
 """
 
 from __future__ import annotations
