@@ -50,10 +50,14 @@ class DescribedNode:
 
     def missing(self, form: str, field: str, key: str) -> MissingFieldError:
         """Return the error for a field that ``form`` requires; ``key`` is the profile key that provides it."""
+        own = self.profile.endswith(".toml") or not self.profile
+        file = (self.profile or "NAME") if own else "my-type.toml"
+        place = f"its profile{f' {file}' if self.profile else ''}"
+        hint = f"Add {key} to {place}, then: provision {self.uuid.hex()} --profile {file}"
+        if not own:  # a built-in type cannot be changed, only extended
+            hint = f"Make a type of your own: profile new my-type --extends {self.profile} -o {file}. {hint}"
         return MissingFieldError(
-            f"{form} requires {field}, which the datasheet of node {self.uuid.hex()} lacks.",
-            hint=f"Add {key} to its profile{f' {self.profile}' if self.profile else ''}, then: provision "
-            f"{self.uuid.hex()} --profile {self.profile or 'NAME'}",
+            f"{form} requires {field}, which the datasheet of node {self.uuid.hex()} lacks.", hint=hint
         )
 
     def identification(self, form: str, field: str, element: str) -> str:

@@ -135,6 +135,8 @@ def test_a_missing_field_is_named_with_its_profile_key_and_nothing_is_written(
         asset_shell(node)
     assert "<OrderCode>" in str(caught.value.hint)
     assert "meta-identification" in str(caught.value.hint)
+    built_in = replace(node, profile="gripper").missing("The Digital Nameplate", "SerialNumber", "<SerialNo>")
+    assert "profile new my-type --extends gripper -o my-type.toml" in str(built_in.hint)
     out = tmp_path / "out"
     out.mkdir()
     done = call(station.home, "--json", "describe", board.uuid.hex(), "--as", "aas", "--output", str(out))
