@@ -388,3 +388,21 @@ def test_a_text_without_end_takes_no_memory(tmp_path: Path, text: str) -> None:
     path.write_bytes(b" " * (dbc_message.MOST_OCTETS + 1))
     with pytest.raises(BadDataError, match="too large"):
         dbc_message.read(path, "M")
+
+
+@pytest.mark.parametrize(("high", "raw"), [("0", 400), ("120", 1600)])
+def test_a_value_at_the_limit_is_valid_whatever_its_float32_is(tmp_path: Path, high: str, raw: int) -> None:
+    """0 °C and 120 °C are no Float32 in kelvin; rounded inward, the limit excluded itself."""
+    message = written(tmp_path, f' SG_ x : 0|12@1+ (0.1,-40) [-40|{high}] "degC" A')
+    sheet = sheet_of(message.sensor)
+    numbers = message.numbers(raw.to_bytes(2, "little") + bytes(6))
+    values = LatestValues(message.sensor.channels[0])
+    values.put(1.0, numbers["x"])
+    reading, why = values.at(1.0)
+    assert reading is not None
+    assert not why
+    interpreter = ChannelInterpreter(sheet, 1)
+    shown = interpreter.decode(
+        Board(sheet, source=WrappedSource([values], lambda *_: None)).converters[1].octets(reading)
+    )
+    assert shown.valid[0], interpreter.why_invalid(shown.raw)

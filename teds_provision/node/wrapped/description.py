@@ -170,6 +170,23 @@ class WrappedChannel:
         return min(ends), max(ends)
 
     @property
+    def held_limits(self) -> tuple[float, float]:
+        """The limits, moved outward if their Float32 in SI units would exclude the value at the limit itself."""
+        low, high = self.limits
+        return self._outward(low, -math.inf), self._outward(high, math.inf)
+
+    def _outward(self, limit: float, end: float) -> float:
+        unit = self.written
+        exact = unit.to_si(limit)
+        outward = end if unit.scale > 0 else -end
+        if abs(exact) >= _LARGEST or (held := _float32(exact)) == exact or (held > exact) == (outward > 0):
+            return limit
+        octets = struct.unpack(">i", struct.pack(">f", held))[0]
+        larger = (held > 0) == (outward > 0)  # the next Float32 is one unit in the last place away from or to zero
+        (next_one,) = struct.unpack(">f", struct.pack(">i", octets + (1 if larger else -1)))
+        return float((next_one - unit.offset) / unit.scale)
+
+    @property
     def unstated(self) -> tuple[str, ...]:
         """Fields of the TransducerChannel TEDS that nothing states."""
         return ("OError", "LowLimit", "HiLimit") if self.limits[1] >= _LARGEST else ("OError",)
@@ -244,10 +261,14 @@ class WrappedChannel:
             return None
         ends = self.raw_limits or (0.0, float((1 << self.bits) - 1))
         part = CalibrationInput(number, 1, ends, (0.0,))
-        low, high = self.limits
+        low, high = self.held_limits
         return Calibration(
             number, "linear", (part,), form.coefficients, self.written, low_limit=low, high_limit=high, raw_range=ends
         )
+
+
+def _float32(value: float) -> float:
+    return float(struct.unpack(">f", struct.pack(">f", value))[0])
 
 
 def facts(channel: WrappedChannel) -> dict[str, object]:
@@ -327,7 +348,7 @@ class WrappedSensor:
 
 
 def _channel_lines(number: int, channel: WrappedChannel) -> list[str]:
-    form, (low, high) = channel.sample, channel.limits
+    form, (low, high) = channel.sample, channel.held_limits
     widest = max(abs(low), abs(high))
     resolution = widest * _RESOLUTION if widest < _LARGEST else _RESOLUTION
     step = resolution if channel.is_float else abs(channel.scale)
