@@ -191,7 +191,7 @@ class CanDiscovery(Discovery):
             address = self._announcers.popleft()
             if now - self._asked_at.get(address, -math.inf) >= EACH:
                 self._asked_at[address] = now
-                self._ask_one(address, PATIENCE)
+                self._ask_one(address, PATIENCE, once=True)  # any device can announce: the limit holds for torn answers
                 return
 
     def _ask(self) -> None:
@@ -231,9 +231,9 @@ class CanDiscovery(Discovery):
         """
         self._ask_one(address, seconds, until_announced=True)
 
-    def _ask_one(self, address: int, seconds: float, *, until_announced: bool = False) -> None:
+    def _ask_one(self, address: int, seconds: float, *, until_announced: bool = False, once: bool = False) -> None:
         try:
-            identity = self.port.identify(address, seconds=seconds, until_announced=until_announced)
+            identity = self.port.identify(address, seconds=seconds, until_announced=until_announced, once=once)
         except AddressConflictError:
             self._presence.conflict(self.port.place, address)
             return

@@ -137,16 +137,18 @@ def read_identity(reply: bytes) -> Identity:
     return Identity.decode(answer.payload)
 
 
-def ask_one(ask: Callable[[bytes], bytes]) -> Identity | None:
-    """Return the Identify by ``ask`` (a command frame to its reply); None for no answer, or none that is valid."""
-    torn = 0
-    while torn < 2:
+def ask_one(ask: Callable[[bytes], bytes], *, questions: int = 2) -> Identity | None:
+    """Return the Identify by ``ask`` (a command frame to its reply); None for no answer, or none that is valid.
+
+    An answer with missing frames is asked for again, up to ``questions`` questions in all.
+    """
+    for _ in range(questions):
         try:
             return read_identity(ask(IDENTIFY.encode()))
         except (NodeSilentError, BadDataError):
             return None
         except GarbledError:
-            torn += 1
+            continue
     return None
 
 

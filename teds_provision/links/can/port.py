@@ -115,17 +115,18 @@ class CanPort:
             bus.close()
 
     def identify(
-        self, address: int, *, seconds: float = _HELLO_SECONDS, until_announced: bool = False
+        self, address: int, *, seconds: float = _HELLO_SECONDS, until_announced: bool = False, once: bool = False
     ) -> Identity | None:
         """Ask one address for Identify; None if there is no answer. Raises AddressConflictError, LinkError.
 
         ``until_announced``: stop as soon as a node announces itself there, as it has not heard the question; a caller
         that asks because of the Announce need not wait for this one.
+        ``once``: send one question, even if frames of its answer are missing.
         """
         link = self.link(address)
         if until_announced:
             link.hopeless = partial(self.bus().announced_since, address, time.monotonic())
-        return ask_one(partial(link.exchange_limited, tries=1, seconds=seconds))
+        return ask_one(partial(link.exchange_limited, tries=1, seconds=seconds), questions=1 if once else 2)
 
     # -- finding ---------------------------------------------------------------------------------------------------
 
