@@ -53,7 +53,7 @@ compiled: $(VENV)/.dev
 
 # The inner loop: the rooms without a link or a process, the rules of the house, one case of each link, one provisioning
 # by command. CONTRIBUTING.md says what that leaves out.
-QUICK := $(wildcard tests/test_[!m]*.py) tests/teds tests/protocol tests/store tests/steps tests/talk tests/trace \
+QUICK := $(wildcard tests/test_[!m]*.py) tests/teds tests/protocol tests/station tests/steps tests/talk tests/trace \
   tests/measure/test_clock.py tests/measure/test_grid.py tests/measure/test_lookout.py \
   'tests/links/nfc/test_nfc_exchange.py::test_frames_of_every_size_come_back_whole[4]' \
   tests/links/can/test_can_exchange.py::test_a_node_answers_an_fd_station_in_fd_and_a_classic_one_in_classic \
@@ -186,7 +186,7 @@ house: $(VENV)/.dev
 words: $(VENV)/.dev
 	$(BIN)/python scripts/words.py
 
-# The tests of a room and of the rooms that import it: make room ROOM=store
+# The tests of a room and of the rooms that import it: make room ROOM=station
 room: $(VENV)/.dev
 	$(BIN)/python -m pytest -n 2 --dist worksteal --hypothesis-profile gate -m '$(USUAL)' $$($(BIN)/python scripts/room.py $(ROOM))
 

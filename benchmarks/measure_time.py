@@ -37,9 +37,9 @@ from teds_provision.node.realtime_loop import RealtimeLoop
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.station.station import Station, initialise
+from teds_provision.station.store import KeptMeasurement
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import provision
-from teds_provision.store import KeptMeasurement
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import Image

@@ -37,9 +37,9 @@ from teds_provision.links.ports import free_port
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station, initialise
+from teds_provision.station.store.database import Database
 from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.provision import provision
-from teds_provision.store.database import Database
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.vault.passphrase import THROWAWAY

@@ -26,7 +26,7 @@ from typing import Any
 
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station, initialise
-from teds_provision.store import BulkRows, KeyRecord, NodeRecord, WhitelistEntry, utc_now
+from teds_provision.station.store import BulkRows, KeyRecord, NodeRecord, WhitelistEntry, utc_now
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.vault import forget_vaults, node_key_context, passphrase

@@ -1,6 +1,6 @@
 """The tests of a room and of the rooms that import it, as arguments for pytest.
 
-Usage: python scripts/room.py ROOM. ``make room ROOM=store`` runs what it prints. The arrows are read from the imports
+Usage: python scripts/room.py ROOM. ``make room ROOM=station`` runs what it prints. The arrows are read from the imports
 (scripts/house.py), so the answer cannot drift from the code. Tests that see the whole program (tests/e2e) are named
 only for the rooms that a command is made of: cli, ncap, measure, steps.
 """

@@ -18,7 +18,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # Room: the rooms that it may import. All may import errors, lazy, limits, sanitize, itself, and all but protocol also
 # files and portable.
 WITHOUT_FILES = {"errors", "sanitize", "lazy", "limits", "portable", "protocol"}
-_BELOW_TALK = {"station", "links", "vault", "store", "protocol", "teds"}
+_BELOW_TALK = {"station", "links", "vault", "protocol", "teds"}
 ARROWS = {
     "api": set(),
     "errors": set(),
@@ -31,8 +31,7 @@ ARROWS = {
     "protocol": {"teds"},
     "links": {"protocol", "teds"},
     "vault": {"protocol", "teds"},
-    "store": {"protocol", "teds"},
-    "station": {"vault", "store", "protocol", "teds"},
+    "station": {"vault", "protocol", "teds"},
     "node": {"links", "protocol", "teds"},
     "trace": {"links", "protocol", "teds"},
     "talk": _BELOW_TALK,
@@ -44,8 +43,8 @@ ARROWS = {
     "describe": _BELOW_TALK | {"talk", "steps", "handover", "measure", "api"},
     "ncap": _BELOW_TALK | {"talk", "steps", "handover", "plant", "measure", "node", "client", "api", "describe"},
     "check": _BELOW_TALK | {"talk", "steps"},
-    "backup": {"station", "vault", "store", "protocol", "teds"},
-    "doctor": {"station", "links", "vault", "store", "protocol", "teds"},
+    "backup": {"station", "vault", "protocol", "teds"},
+    "doctor": {"station", "links", "vault", "protocol", "teds"},
     "demo": _BELOW_TALK | {"talk", "steps", "handover", "plant", "measure", "client"},
     "cli": _BELOW_TALK
     | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure", "check", "ncap", "client", "api"}

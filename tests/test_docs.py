@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 import pytest
 
-from teds_provision.store.schema import SCHEMA_VERSION
+from teds_provision.station.store.schema import SCHEMA_VERSION
 from tests.cli.test_help import chain
 
 ROOT = Path(__file__).parent.parent

@@ -13,7 +13,7 @@ from teds_provision import __version__
 from teds_provision.errors import BadDataError, NotAuthenticError, VaultError
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import fingerprint, is_point
-from teds_provision.store import KeyRecord, Store
+from teds_provision.station.store import KeyRecord, Store
 from teds_provision.vault import Vault, node_key_context
 
 MAX_HEAD_OCTETS: Final = 64 * 1024

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.store import RevocationRecord, Store, Tombstone, WhitelistEntry
-from teds_provision.store.snapshot import Relation, extend_audit
+from teds_provision.station.store import RevocationRecord, Store, Tombstone, WhitelistEntry
+from teds_provision.station.store.snapshot import Relation, extend_audit
 
 
 class Merge:

@@ -25,9 +25,9 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.node_keys import RESTORED
 from teds_provision.station.plant import new_home
 from teds_provision.station.station import Station
-from teds_provision.store import Store, StoreLock
-from teds_provision.store.database import has_store
-from teds_provision.store.snapshot import Relation, is_damage, place, relation, set_aside, totals
+from teds_provision.station.store import Store, StoreLock
+from teds_provision.station.store.database import has_store
+from teds_provision.station.store.snapshot import Relation, is_damage, place, relation, set_aside, totals
 from teds_provision.vault import Ask, Vault, asked_first, create_vault, open_vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
 

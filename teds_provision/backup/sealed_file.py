@@ -4,8 +4,8 @@ One line of JSON in the clear: ``format`` ``teds-backup/2``, ``store``, ``statio
 over all of it, which distinguishes a damaged head from a wrong passphrase. ``key`` is the file's random key, sealed
 under a passphrase (Argon2id, AES-256-GCM) or as a JWE to a recovery key, which any JOSE implementation opens. Then
 chunks (:mod:`.chunks`), each bound to the SHA-256 of that line. Inside: a line of JSON (:class:`.content.BackupHead`),
-the store as rows (:mod:`teds_provision.store.dump`), and the station's signature, 64 octets: SIG(station, "TEDS1
-backup" ‖ 00 ‖ SHA-256 of the first line ‖ SHA-256 of everything before the signature).
+the store as rows (:mod:`teds_provision.station.store.dump`), and the station's signature, 64 octets: SIG(station,
+"TEDS1 backup" ‖ 00 ‖ SHA-256 of the first line ‖ SHA-256 of everything before the signature).
 
 Files of version 1, which are older than KeyAgreement 2, are refused by name.
 """
@@ -25,8 +25,8 @@ from teds_provision.files import open_to_read
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey, fingerprint, verify
-from teds_provision.store.connection import too_old
-from teds_provision.store.dump import load as load_rows
+from teds_provision.station.store.connection import too_old
+from teds_provision.station.store.dump import load as load_rows
 from teds_provision.vault import passphrase as sealing
 
 FORMAT: Final = "teds-backup/2"

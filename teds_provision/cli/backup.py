@@ -10,17 +10,17 @@ import click
 
 from teds_provision import backup as backup_room
 from teds_provision import handover, protocol
-from teds_provision import store as store_room
 from teds_provision import vault as vault_room
 from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app, read_line
 from teds_provision.cli.options import FileToRead, command, dry_run_option, yes_option
 from teds_provision.errors import NotFoundError, UsageError, VaultChangedError, VaultError, WrongPassphraseError
+from teds_provision.station import store as store_room
 
 if TYPE_CHECKING:
     from teds_provision.backup.content import Content
     from teds_provision.backup.restore import RestoreResult
-    from teds_provision.store import Store
+    from teds_provision.station.store import Store
 
 _KEY_HINT = (
     "A recovery key is an encrypted PEM file: openssl genpkey -algorithm EC -pkeyopt ec_paramgen_curve:P-256 "

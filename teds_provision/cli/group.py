@@ -12,7 +12,7 @@ from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option
 from teds_provision.station.groups import Groups
 
 if TYPE_CHECKING:
-    from teds_provision.store.records import Group
+    from teds_provision.station.store.records import Group
 
 
 @click.group(

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from teds_provision.protocol.plant.job import CalibrationRule, Job
     from teds_provision.protocol.plant.roster import Roster
     from teds_provision.station.station import Station
-    from teds_provision.store import EvidenceRow
+    from teds_provision.station.store import EvidenceRow
 
 
 # -- job ---------------------------------------------------------------------------------------------------------------

@@ -15,17 +15,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import store, talk
+from teds_provision import talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, WholeNumber, command, examples
 from teds_provision.cli.rendering import local_time, moment, print_json_list, shown
 from teds_provision.errors import StoreError, UsageError
 from teds_provision.lazy import late
 from teds_provision.sanitize import sanitize
+from teds_provision.station import store
 
 if TYPE_CHECKING:
     from teds_provision.station.station import Station
-    from teds_provision.store import AuditEntry, AuditFilter, AuditVerdict
+    from teds_provision.station.store import AuditEntry, AuditFilter, AuditVerdict
     from teds_provision.trace import recorder
     from teds_provision.trace.record import Record
 else:  # the help of this command does without

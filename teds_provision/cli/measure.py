@@ -30,8 +30,8 @@ from teds_provision.cli.sample import ending, over_the_bus, where_met
 from teds_provision.errors import BadDataError, UsageError
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings, ble, can
-from teds_provision.store import KeptMeasurement
-from teds_provision.store.records import COMMAND
+from teds_provision.station.store import KeptMeasurement
+from teds_provision.station.store.records import COMMAND
 
 if TYPE_CHECKING:
     from teds_provision.cli import measure_view

@@ -34,7 +34,7 @@ from teds_provision.cli.options import (
 from teds_provision.cli.rendering import count_of, shown
 from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.lazy import how_to_install, late
-from teds_provision.store.records import iso
+from teds_provision.station.store.records import iso
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -25,7 +25,7 @@ from teds_provision.protocol.fingerprints import same_key
 if TYPE_CHECKING:
     from teds_provision.handover.trust import Candidate, Removal
     from teds_provision.station.station import Station
-    from teds_provision.store import TrustRecord
+    from teds_provision.station.store import TrustRecord
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 

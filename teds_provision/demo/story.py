@@ -34,6 +34,7 @@ from teds_provision.links import LinkSettings, can
 from teds_provision.links.ports import free_port
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station, initialise
+from teds_provision.station.store import TrustRecord
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
@@ -41,7 +42,6 @@ from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.steps.teds_read import read_image
 from teds_provision.steps.verify import require_authentic
 from teds_provision.steps.verify_node import verify_node
-from teds_provision.store import TrustRecord
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter, StepResult, Steps
 

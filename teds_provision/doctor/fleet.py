@@ -12,8 +12,8 @@ from teds_provision.errors import BadDataError, NotFoundError, StoreChangedError
 from teds_provision.files import read_text
 from teds_provision.limits import LIMITS, load_toml
 from teds_provision.station.station import Station
-from teds_provision.store import Store
-from teds_provision.store.database import has_store
+from teds_provision.station.store import Store
+from teds_provision.station.store.database import has_store
 
 _SHOWN: Final = 5
 

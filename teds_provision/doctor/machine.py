@@ -11,12 +11,12 @@ from datetime import UTC, datetime
 from importlib import metadata
 from typing import Final
 
-from teds_provision import store as store_room
 from teds_provision import vault
 from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import StoreError
 from teds_provision.lazy import REQUIRED, install_command
-from teds_provision.store.database import has_store
+from teds_provision.station import store as store_room
+from teds_provision.station.store.database import has_store
 
 _MIN_PYTHON: Final = (3, 11)
 _LIBRARIES: Final = {name: least for name, (_, least) in REQUIRED.items()} | {"ndeflib": "0.3.3"}  # nfcpy needs it

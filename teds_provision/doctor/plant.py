@@ -9,8 +9,8 @@ from importlib.util import find_spec
 from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Roster, open_roster
-from teds_provision.store import Store
-from teds_provision.store.database import has_store
+from teds_provision.station.store import Store
+from teds_provision.station.store.database import has_store
 
 _SYNC = "teds-provision registry sync"
 _LATE = timedelta(days=7)

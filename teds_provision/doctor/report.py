@@ -19,8 +19,8 @@ from typing import Any, Final
 from teds_provision import __version__
 from teds_provision.doctor.checks import Finding, System
 from teds_provision.errors import TedsProvisionError
-from teds_provision.store import AuditFilter, Store
-from teds_provision.store.database import has_store
+from teds_provision.station.store import AuditFilter, Store
+from teds_provision.station.store.database import has_store
 
 FORMAT: Final = "teds-report/1"
 _LAST_ERRORS: Final = 20

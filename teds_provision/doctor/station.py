@@ -15,9 +15,9 @@ from teds_provision import vault as vault_room
 from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import KeyringUnavailableError, NotFoundError, StoreError, VaultError
 from teds_provision.files import open_to_read
-from teds_provision.store import AuditFilter, Store
-from teds_provision.store.database import has_store
-from teds_provision.store.lock import holder_of
+from teds_provision.station.store import AuditFilter, Store
+from teds_provision.station.store.database import has_store
+from teds_provision.station.store.lock import holder_of
 from teds_provision.vault import agent
 
 _MIN_FREE: Final = 64 * 1024 * 1024

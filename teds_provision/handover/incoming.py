@@ -29,9 +29,18 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.groups import valid_name
 from teds_provision.station.node_keys import MAX_PENDING
 from teds_provision.station.station import Station
+from teds_provision.station.store import (
+    BulkRows,
+    Handover,
+    Holder,
+    KeyRecord,
+    NodeRecord,
+    WhitelistEntry,
+    chunks,
+    utc_now,
+)
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.identify import identify
-from teds_provision.store import BulkRows, Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, chunks, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Reporter
 

@@ -26,7 +26,7 @@ from teds_provision.protocol.handover.envelope import EnvelopeWriter
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
-from teds_provision.store import (
+from teds_provision.station.store import (
     BulkRows,
     ExportEligibility,
     Handover,

@@ -19,7 +19,7 @@ from teds_provision.protocol.handover.bundle import Bundle
 from teds_provision.protocol.handover.receipt import Receipt, open_receipt
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object
 from teds_provision.station.station import Station
-from teds_provision.store import Handover, Holder, chunks
+from teds_provision.station.store import Handover, Holder, chunks
 
 OPEN, CLOSED, UNDONE, IMPORTED = "open", "closed", "undone", "imported"
 

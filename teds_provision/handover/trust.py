@@ -16,9 +16,9 @@ from teds_provision.protocol.handover.jose import point_of, public_jwk
 from teds_provision.protocol.handover.strict_json import decode_base64url, dump, encode_base64url, load_object
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, from_pem, station_key_message, verify
 from teds_provision.station.station import Station
-from teds_provision.store import Store, StoreLock, TrustRecord
-from teds_provision.store.database import has_store
-from teds_provision.store.records import TrustRole
+from teds_provision.station.store import Store, StoreLock, TrustRecord
+from teds_provision.station.store.database import has_store
+from teds_provision.station.store.records import TrustRole
 
 if TYPE_CHECKING:
     from teds_provision.vault import Ask, Vault

@@ -18,7 +18,7 @@ from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import CanSpec, parse_spec
 from teds_provision.protocol.operation.can_frames import DATA
 from teds_provision.station.station import Station
-from teds_provision.store.lock import UsageLock, UsageLockTakenError
+from teds_provision.station.store.lock import UsageLock, UsageLockTakenError
 
 LISTENING = 0.25  # seconds in which the data of another station's streams to our address is heard
 SIGN_OF_LIFE = 4.0  # seconds in which whoever reads it sends something: lease / 3 is 3.3 s unless he says otherwise

@@ -43,7 +43,7 @@ from teds_provision.ncap.nodes.node_jobs import NodeLocks
 from teds_provision.ncap.sinks import DaemonSinks, sink_json
 from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.station.station import Station
-from teds_provision.store import KeptMeasurement
+from teds_provision.station.store import KeptMeasurement
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
 

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 from teds_provision.errors import UsageError
 from teds_provision.measure.display_units import FileUnits
 from teds_provision.measure.sinks import FILES, CommandTaker, Sink, in_units, open_sink
-from teds_provision.store import KeptMeasurement
+from teds_provision.station.store import KeptMeasurement
 
 RECORDINGS: Final = "recordings"
 STARTED: Final = "mqtt"

@@ -27,8 +27,8 @@ from teds_provision.protocol.plant.fold import BY_CONTACT, BanStatement, LocalSt
 from teds_provision.protocol.plant.page import Page
 from teds_provision.protocol.plant.roster import MOST_AHEAD, Roster, Taking, open_roster, taking
 from teds_provision.station.station import Station
-from teds_provision.store import KeyRecord, NodeRecord, WhitelistEntry, utc_now
-from teds_provision.store.tables.plant import Alarm, Chain, PageRow, RosterRow
+from teds_provision.station.store import KeyRecord, NodeRecord, WhitelistEntry, utc_now
+from teds_provision.station.store.tables.plant import Alarm, Chain, PageRow, RosterRow
 
 AT_ONCE: Final = 500
 """Nodes that are judged in one transaction: others write in between."""

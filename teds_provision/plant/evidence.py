@@ -14,7 +14,7 @@ from teds_provision.protocol.keys import prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.plant.evidence import NONCE_OCTETS, EvidenceClaim, seal
 from teds_provision.protocol.wire_agreement import Credentials
-from teds_provision.store import EvidenceRow, LineTables, utc_now
+from teds_provision.station.store import EvidenceRow, LineTables, utc_now
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.teds.codec import security
 

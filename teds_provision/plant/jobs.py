@@ -15,7 +15,7 @@ from teds_provision.protocol.plant.document import JOB, is_form
 from teds_provision.protocol.plant.job import Job, open_job
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.station import Station
-from teds_provision.store import JobRow
+from teds_provision.station.store import JobRow
 from teds_provision.teds.profile.load import default_folders, files_digest, find_profile
 
 CLOSED: Final = "closed"

@@ -23,6 +23,7 @@ from teds_provision.protocol.plant.evidence import FAILED, PASSED, BoardFacts, E
 from teds_provision.protocol.plant.job import WORTH, Job
 from teds_provision.station.label import label_of, read_label, write_label
 from teds_provision.station.station import Station
+from teds_provision.station.store import EvidenceRow, UnitRow, WhitelistEntry, utc_now
 from teds_provision.steps.batch_sheet import BoardResult
 from teds_provision.steps.board_type import WrongBoardError
 from teds_provision.steps.build import BuildOrder, PreparedOrder, Proposal, prepare, profile_files_digest
@@ -30,7 +31,6 @@ from teds_provision.steps.identify import IdentifiedNode
 from teds_provision.steps.provision import ProvisionResult
 from teds_provision.steps.sign import SignResult
 from teds_provision.steps.teds_read import NodeSnapshot
-from teds_provision.store import EvidenceRow, UnitRow, WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import StepResult
 from teds_provision.teds.certificate import certificate_reference_of

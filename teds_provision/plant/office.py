@@ -34,9 +34,9 @@ from teds_provision.protocol.plant.job import Job
 from teds_provision.protocol.plant.roster import MOST_AHEAD
 from teds_provision.protocol.plant.signing import Answer, SignRequest, open_answer, open_request, seal_answer
 from teds_provision.station.station import Station
+from teds_provision.station.store import SignRequestRow, UnitRow, WhitelistEntry, utc_now
 from teds_provision.steps.build import check_name, guard
 from teds_provision.steps.sign import sign
-from teds_provision.store import SignRequestRow, UnitRow, WhitelistEntry, utc_now
 from teds_provision.teds.calibration.files import read_calibrations
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.image import SECURITY, Image

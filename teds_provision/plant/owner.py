@@ -35,7 +35,7 @@ from teds_provision.protocol.plant.roster import (
     seal_roster,
 )
 from teds_provision.station.station import Station
-from teds_provision.store.tables.plant import PlantRecord
+from teds_provision.station.store.tables.plant import PlantRecord
 
 FIRST_ROLES: frozenset[Role] = frozenset({"keeper", "sign", "line", "base"})
 

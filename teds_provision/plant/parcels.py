@@ -30,9 +30,9 @@ from teds_provision.protocol.plant.document import JOB, SIGN_REQUEST, SIGNED, op
 from teds_provision.protocol.plant.fold import MergedClaims
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.station import Station
-from teds_provision.store import TrustRecord, chunks
-from teds_provision.store.tables.parcels import ParcelKind, ParcelRow
-from teds_provision.store.tables.plant import Alarm
+from teds_provision.station.store import TrustRecord, chunks
+from teds_provision.station.store.tables.parcels import ParcelKind, ParcelRow
+from teds_provision.station.store.tables.plant import Alarm
 
 NODES: Final = 10_000
 """So many nodes go into one copy."""

@@ -20,7 +20,7 @@ from teds_provision.plant.transport import CarriedPage, Offer, Returned
 from teds_provision.protocol.plant.page import Page
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.station import Station
-from teds_provision.store.tables.plant import Chain
+from teds_provision.station.store.tables.plant import Chain
 
 FORGED: Final = "forged"
 """Alarm: a member handed in a page that its author did not sign."""

@@ -51,11 +51,11 @@ from teds_provision.protocol.plant.signing import (
     seal_request,
 )
 from teds_provision.station.station import Station
+from teds_provision.station.store import Draft, SignRequestRow
 from teds_provision.steps.build import own_name
 from teds_provision.steps.commands import at_node
 from teds_provision.steps.sign import SignResult
 from teds_provision.steps.teds_read import read_identity
-from teds_provision.store import Draft, SignRequestRow
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Reporter
 from teds_provision.teds.codec import security

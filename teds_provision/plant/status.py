@@ -13,7 +13,7 @@ from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Member, Roster
 from teds_provision.station.station import Station
-from teds_provision.store.tables.plant import Alarm, Chain, PlantRecord
+from teds_provision.station.store.tables.plant import Alarm, Chain, PlantRecord
 
 SILENT: Final = timedelta(days=7)
 """A station whose newest page that counts is older than this is silent."""

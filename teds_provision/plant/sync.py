@@ -37,8 +37,8 @@ from teds_provision.protocol.plant.page import MOST_EVENTS, MOST_PAYLOAD, Page, 
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.plant import new_home
 from teds_provision.station.station import Station
-from teds_provision.store import StoreLock, UnitRow, WhitelistEntry, utc_now
-from teds_provision.store.tables.plant import Chain
+from teds_provision.station.store import StoreLock, UnitRow, WhitelistEntry, utc_now
+from teds_provision.station.store.tables.plant import Chain
 
 LOCK_FILE: Final = "registry.lock"
 _ROOM: Final = 20_000

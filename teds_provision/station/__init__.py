@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         policy,
         row_macs,
         station,
+        store,
         summary,
     )
 else:

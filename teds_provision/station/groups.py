@@ -15,8 +15,8 @@ from teds_provision.errors import FrozenError, NotFoundError, UsageError
 from teds_provision.files import open_lock
 from teds_provision.portable import lock
 from teds_provision.station.plant import Plant
-from teds_provision.store import Store
-from teds_provision.store.records import Group
+from teds_provision.station.store import Store
+from teds_provision.station.store.records import Group
 
 _LIKE_A_UUID = re.compile(r"(0x)?[0-9a-fA-F]{4,}\Z")
 LONGEST = 64

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import NotAuthenticError, NotFoundError, PolicyError
 from teds_provision.lazy import late
 from teds_provision.station.row_macs import RowMacs
-from teds_provision.store import StationRecord, Store
+from teds_provision.station.store import StationRecord, Store
 
 if TYPE_CHECKING:
     from teds_provision.protocol import keys, wire_agreement

@@ -20,9 +20,9 @@ from shlex import quote
 
 from teds_provision.errors import FrozenError, NotFoundError, PolicyError, StoreError, UsageError
 from teds_provision.station.groups import Groups
-from teds_provision.store import Store
-from teds_provision.store.lock import OwnerLock, UsageLock, UsageLockTakenError
-from teds_provision.store.records import COMMAND, DetectionMode, KeptMeasurement
+from teds_provision.station.store import Store
+from teds_provision.station.store.lock import OwnerLock, UsageLock, UsageLockTakenError
+from teds_provision.station.store.records import COMMAND, DetectionMode, KeptMeasurement
 
 FOLDER = "measuring"  # of the home: who measures what now
 

@@ -18,8 +18,8 @@ from teds_provision.errors import (
 from teds_provision.station.identity import StationIdentity
 from teds_provision.station.plant import Plant
 from teds_provision.station.row_macs import RowMacs
-from teds_provision.store import Holder, KeyFlags, KeyRecord, Store, chunks, utc_now
-from teds_provision.store.records import KeySource
+from teds_provision.station.store import Holder, KeyFlags, KeyRecord, Store, chunks, utc_now
+from teds_provision.station.store.records import KeySource
 from teds_provision.vault.base import node_key_context
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from teds_provision.errors import BadDataError, StoreError
 from teds_provision.lazy import late
 from teds_provision.station.plant import Plant
 from teds_provision.station.row_macs import RowMacs
-from teds_provision.store import (
+from teds_provision.station.store import (
     DatasheetRecord,
     Draft,
     ExportedNode,

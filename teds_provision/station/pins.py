@@ -11,7 +11,7 @@ from teds_provision.protocol.fingerprints import is_whole, same_key
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.plant import Plant
 from teds_provision.station.row_macs import RowMacs
-from teds_provision.store import ExportEligibility, NodeRecord, Store, WhitelistEntry
+from teds_provision.station.store import ExportEligibility, NodeRecord, Store, WhitelistEntry
 
 if TYPE_CHECKING:
     from teds_provision.protocol import keys, wire_agreement

@@ -18,9 +18,9 @@ from teds_provision.files import read_limited, write_whole
 from teds_provision.lazy import late
 from teds_provision.station.identity import StationIdentity
 from teds_provision.station.row_macs import RowMacs
-from teds_provision.store import LineTables, Store, utc_now
-from teds_provision.store.tables.parcels import ParcelTables
-from teds_provision.store.tables.plant import PlantRecord
+from teds_provision.station.store import LineTables, Store, utc_now
+from teds_provision.station.store.tables.parcels import ParcelTables
+from teds_provision.station.store.tables.plant import PlantRecord
 
 if TYPE_CHECKING:
     from teds_provision.protocol import keys

@@ -14,8 +14,8 @@ from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.pins import Pins
 from teds_provision.station.plant import Plant, SignerRules
 from teds_provision.station.row_macs import RowMacs
-from teds_provision.store import RevocationRecord, Store, Tombstone, TrustRecord, WhitelistEntry
-from teds_provision.store.records import TrustRole
+from teds_provision.station.store import RevocationRecord, Store, Tombstone, TrustRecord, WhitelistEntry
+from teds_provision.station.store.records import TrustRole
 
 if TYPE_CHECKING:
     from teds_provision.protocol import keys

@@ -17,7 +17,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from teds_provision.errors import StoreChangedError, VaultError
-from teds_provision.store import ExportEligibility, NodeRecord, StationRecord, Store, TrustRecord, WhitelistEntry
+from teds_provision.station.store import (
+    ExportEligibility,
+    NodeRecord,
+    StationRecord,
+    Store,
+    TrustRecord,
+    WhitelistEntry,
+)
 
 if TYPE_CHECKING:
     from teds_provision.vault import Vault

@@ -46,11 +46,11 @@ from teds_provision.station.pins import Pins
 from teds_provision.station.plant import Plant
 from teds_provision.station.policy import Policy
 from teds_provision.station.row_macs import RowMacs
-from teds_provision.store import AuditLog, BulkRows, Handover, KeyRecord, NodeLock, Store, StoreLock
-from teds_provision.store.background_writer import BackgroundWriter
-from teds_provision.store.database import has_store
-from teds_provision.store.dump import dump
-from teds_provision.store.records import Direction
+from teds_provision.station.store import AuditLog, BulkRows, Handover, KeyRecord, NodeLock, Store, StoreLock
+from teds_provision.station.store.background_writer import BackgroundWriter
+from teds_provision.station.store.database import has_store
+from teds_provision.station.store.dump import dump
+from teds_provision.station.store.records import Direction
 from teds_provision.vault.base import node_key_context
 
 if TYPE_CHECKING:
@@ -302,7 +302,7 @@ class Station:
         return self._store.changes()
 
     def rows(self) -> Iterator[bytes]:
-        """Yield the whole store as it is at one moment (see :mod:`teds_provision.store.dump`)."""
+        """Yield the whole store as it is at one moment (see :mod:`teds_provision.station.store.dump`)."""
         return dump(self._store)
 
     # -- one command at a time, all or nothing, and who did it -----------------------------------------------------

@@ -25,9 +25,9 @@ from teds_provision.protocol.messages.frames import Function, Reason, security_c
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.wire_agreement import AgreedKey, StationAgreement, TranscriptMismatchError, fit_to_agree
 from teds_provision.station.station import NodeKey, Station
+from teds_provision.station.store import KeyRecord, WhitelistEntry, utc_now
 from teds_provision.steps.identify import IdentifiedNode
 from teds_provision.steps.teds_read import read_block, read_identity
-from teds_provision.store import KeyRecord, WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY

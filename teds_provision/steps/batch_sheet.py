@@ -39,10 +39,10 @@ from teds_provision.files import SHARED, open_lock, private_folder, read_limited
 from teds_provision.portable import lock
 from teds_provision.station.label import read_label
 from teds_provision.station.station import Station
+from teds_provision.station.store import utc_now
 from teds_provision.steps.build import BuildOrder, PreparedOrder, content_digests, prepare
 from teds_provision.steps.provision import ProvisionResult
 from teds_provision.steps.verify import require_authentic
-from teds_provision.store import utc_now
 from teds_provision.teds.certificate import split_channel
 
 Result = Literal["passed", "failed", "skipped"]

@@ -30,12 +30,12 @@ from teds_provision.lazy import late
 from teds_provision.protocol import datasheet
 from teds_provision.sanitize import printable
 from teds_provision.station.station import Station
+from teds_provision.station.store import Draft, NodeRecord
 from teds_provision.steps.adoption import read_factory_datasheet
 from teds_provision.steps.board_type import Retype, differences, is_remembered, require_board_type, topic_warnings
 from teds_provision.steps.sign import known_image, known_node_keys, unsigned_security
 from teds_provision.steps.teds_read import NodeSnapshot
 from teds_provision.steps.verify import FreshnessFloor, Verification, verify_image
-from teds_provision.store import Draft, NodeRecord
 from teds_provision.teds.certificate import CertificateChoice, CertificateReference, ChooseItem
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode

@@ -31,6 +31,7 @@ from teds_provision.protocol.datasheet import SEQUENCE_WINDOW, SignedNodeKey
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
+from teds_provision.station.store import DatasheetRecord, Draft
 from teds_provision.steps.agree import AgreeResult, ResetReceipt, agree, open_session, require_session, reset_node
 from teds_provision.steps.board_type import Retype, differences, is_remembered, require_board_type, shown_by
 from teds_provision.steps.build import guard, own_name, require_free_name
@@ -49,7 +50,6 @@ from teds_provision.steps.verify import (
 )
 from teds_provision.steps.verify_node import open_or_say_why, provenance_check, verify_at_node
 from teds_provision.steps.write import Low, WriteResult, wait_for_charge, write
-from teds_provision.store import DatasheetRecord, Draft
 from teds_provision.talk.conversation import HEARD, Conversation, SessionLostError
 from teds_provision.talk.meeting import Arrival, meet, meet_everyone, watch_nodes
 from teds_provision.talk.progress import Reporter

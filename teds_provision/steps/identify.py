@@ -16,9 +16,9 @@ from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.sanitize import printable
 from teds_provision.station.station import Station
+from teds_provision.station.store import WhitelistEntry, utc_now
 from teds_provision.steps.readings import keep_shown
 from teds_provision.steps.teds_read import read_block
-from teds_provision.store import WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode

@@ -15,7 +15,7 @@ from teds_provision.errors import NotFoundError, PolicyError
 from teds_provision.lazy import late
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
-from teds_provision.store import NodeOverview, Search
+from teds_provision.station.store import NodeOverview, Search
 
 if TYPE_CHECKING:
     from teds_provision.steps import readings

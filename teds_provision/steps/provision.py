@@ -16,6 +16,8 @@ from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.shown_units import shown_units, units_of
 from teds_provision.station.station import Station
+from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import Assurance
 from teds_provision.steps.adoption import Adopt, read_factory_datasheet, refuse_adoption, require_a_reason
 from teds_provision.steps.agree import AgreeResult, TakeOver, agree
 from teds_provision.steps.board_type import (
@@ -47,8 +49,6 @@ from teds_provision.steps.teds_read import NodeSnapshot, take_snapshot
 from teds_provision.steps.verify import Verification
 from teds_provision.steps.verify_node import verify_at_node, verify_node
 from teds_provision.steps.write import Low, WriteResult, wait_for_charge, write
-from teds_provision.store import WhitelistEntry
-from teds_provision.store.records import Assurance
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.progress import DONE, NOTHING, SKIPPED, Reporter, StepResult, Steps
 from teds_provision.teds.calibration.formula import sentence

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 from teds_provision.errors import StoreChangedError
 from teds_provision.station.station import Station
+from teds_provision.station.store import NodeReading, utc_now
 from teds_provision.steps.verify import (
     ABOUT_THE_REST,
     MERELY_UNSIGNED,
@@ -30,7 +31,6 @@ from teds_provision.steps.verify import (
     snapshot_trust_of,
     static_checks,
 )
-from teds_provision.store import NodeReading, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.image import SECURITY, Image
 

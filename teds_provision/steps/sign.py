@@ -19,7 +19,7 @@ from teds_provision.protocol.datasheet import (
 )
 from teds_provision.protocol.keys import fingerprint, node_key_good
 from teds_provision.station.station import Station
-from teds_provision.store import Draft
+from teds_provision.station.store import Draft
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY, Image

@@ -17,8 +17,8 @@ from teds_provision.protocol.plant.signer import SignerVerdict
 from teds_provision.protocol.wire_agreement import other_key
 from teds_provision.station.plant import SignerRules
 from teds_provision.station.station import Station
+from teds_provision.station.store import RevocationRecord, WhitelistEntry
 from teds_provision.steps.sign import known_image
-from teds_provision.store import RevocationRecord, WhitelistEntry
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.codec.security import NotCanonicalError, SecurityTeds

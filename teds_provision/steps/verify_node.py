@@ -8,6 +8,7 @@ from hashlib import sha256
 from teds_provision.errors import LinkError, NodeRefusedError, NotAuthenticError
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
+from teds_provision.station.store import utc_now
 from teds_provision.steps import readings
 from teds_provision.steps.agree import agreed_elsewhere, proof_of_reset, session_if_keyed
 from teds_provision.steps.identify import IdentifiedNode, prove
@@ -21,7 +22,6 @@ from teds_provision.steps.verify import (
     session_check,
     verify_image,
 )
-from teds_provision.store import utc_now
 from teds_provision.talk.conversation import HEARD, Conversation
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import SECURITY, Image

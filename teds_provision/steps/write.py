@@ -28,12 +28,12 @@ from teds_provision.protocol.messages.frames import Reason, update_teds, write_t
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.commands import POWER, PowerFlag, PowerReply
 from teds_provision.station.station import Station
+from teds_provision.station.store import NodeRecord
 from teds_provision.steps.build import profile_files_digest
 from teds_provision.steps.readings import is_known, keep, keep_read
 from teds_provision.steps.sign import known_image, node_keys_of, sign
 from teds_provision.steps.teds_read import NodeSnapshot, read_block, read_identity, read_image
 from teds_provision.steps.verify import freshness_floor_of
-from teds_provision.store import NodeRecord
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds

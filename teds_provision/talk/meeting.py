@@ -25,7 +25,7 @@ from teds_provision.links.ports import NoticeSink, Port
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
-from teds_provision.store import utc_now
+from teds_provision.station.store import utc_now
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.progress import Reporter
 

@@ -16,9 +16,9 @@ from teds_provision.backup.chunks import CHUNK_OCTETS, ChunkReader, ChunkWriter
 from teds_provision.backup.sealed_file import SealedFile
 from teds_provision.errors import BadDataError, NotAuthenticError, StoreError
 from teds_provision.station.station import Station
-from teds_provision.store import Draft
-from teds_provision.store import dump as rows
-from teds_provision.store.schema import SCHEMA_VERSION
+from teds_provision.station.store import Draft
+from teds_provision.station.store import dump as rows
+from teds_provision.station.store.schema import SCHEMA_VERSION
 from teds_provision.teds.image import Image
 from tests.backup.backups import back_up, opened, opened_octets
 

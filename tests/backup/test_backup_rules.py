@@ -15,7 +15,7 @@ from teds_provision.backup.content import BackupHead
 from teds_provision.backup.restore import rebuild
 from teds_provision.errors import PolicyError, StoreError, StoreLockedError, UsageError
 from teds_provision.station.station import Station
-from teds_provision.store import StoreLock
+from teds_provision.station.store import StoreLock
 from teds_provision.vault.passphrase import THROWAWAY
 from tests.backup.backups import ONE, POINT, TWO, ask, back_up, copy_of, opened, restored_into
 
@@ -84,7 +84,7 @@ def test_a_backup_beside_a_writer_of_the_file_itself_says_what_it_waits_for(
     """Not one of our commands: a program that holds SQLite's own lock."""
     told: list[str] = []
     station.notice = told.append
-    monkeypatch.setattr("teds_provision.store.connection.BUSY_SECONDS", 0.5)
+    monkeypatch.setattr("teds_provision.station.store.connection.BUSY_SECONDS", 0.5)
     with closing(sqlite3.connect(station.home / "store.sqlite3", isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
         with pytest.raises(StoreLockedError):

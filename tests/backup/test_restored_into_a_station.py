@@ -14,8 +14,8 @@ from teds_provision.backup.restore import complete_vault, merge, open_present, r
 from teds_provision.errors import PolicyError, UsageError, VaultError
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station, initialise
-from teds_provision.store import Holder, NodeRecord, RevocationRecord, Store, Tombstone, WhitelistEntry
-from teds_provision.store.snapshot import Relation, place
+from teds_provision.station.store import Holder, NodeRecord, RevocationRecord, Store, Tombstone, WhitelistEntry
+from teds_provision.station.store.snapshot import Relation, place
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
 from teds_provision.vault.software import SoftwareVault

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.store import Draft, KeyRecord, NodeRecord, Store
+from teds_provision.station.store import Draft, KeyRecord, NodeRecord, Store
 from teds_provision.teds.image import Image
 from tests.bench import PASSPHRASE, make_station
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.store import Group, KeptMeasurement, Store
+from teds_provision.station.store import Group, KeptMeasurement, Store
 from tests.terminal import on_terminal
 
 from .shell import call

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.store.records import KeptMeasurement
+from teds_provision.station.store.records import KeptMeasurement
 from tests.bench import PASSPHRASE, make_station
 from tests.e2e.desk import Desk, Node
 from tests.handover.desk import trust

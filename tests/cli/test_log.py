@@ -16,7 +16,7 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
-from teds_provision.store import Store
+from teds_provision.station.store import Store
 from tests.terminal import on_terminal
 
 from .shell import call, clean_environment
@@ -134,7 +134,7 @@ def test_entries_are_found_by_time_act_outcome_and_node(home: Path) -> None:
 def test_an_entry_of_an_earlier_clock_hides_no_other_entry(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Store.open(home) as store:
         for day in ("2026-05-04", "2026-05-05", "2026-05-04", "2026-05-05"):
-            monkeypatch.setattr("teds_provision.store.audit.utc_now", lambda day=day: f"{day}T12:00:00Z")
+            monkeypatch.setattr("teds_provision.station.store.audit.utc_now", lambda day=day: f"{day}T12:00:00Z")
             store.audit.append("verify", bytes.fromhex(ONE), f"of {day}")
     since = ("--since", "2026-05-05T00:00:00+00:00", "--act", "verify")
     shown = call(home, "--json", "log", *since)

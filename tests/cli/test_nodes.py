@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.store import (
+from teds_provision.station.store import (
     Group,
     Holder,
     KeyRecord,

@@ -16,12 +16,12 @@ from teds_provision.cli.rendering import LiveReporter, tidy
 from teds_provision.errors import NotAuthenticError
 from teds_provision.links import Notice
 from teds_provision.links.nfc.message import NdefRecord
+from teds_provision.station.store import StoreLock, WhitelistEntry
 from teds_provision.steps.agree import agree
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.commands import SignOrder, sign_image
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import provision
-from teds_provision.store import StoreLock, WhitelistEntry
 from teds_provision.talk.progress import SilentReporter
 
 from ..bench import PASSPHRASE, Board, make_station, talk

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.sanitize import printable, sanitize, sanitize_json
-from teds_provision.store import NodeRecord, Store
+from teds_provision.station.store import NodeRecord, Store
 from tests.bench import PASSPHRASE
 from tests.cli.shell import call, clean_environment
 from tests.terminal import on_terminal

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.station.station import Station
-from teds_provision.store import WhitelistEntry
+from teds_provision.station.store import WhitelistEntry
 from teds_provision.vault import forget_vaults
 from tests.bench import PASSPHRASE
 

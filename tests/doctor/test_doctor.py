@@ -23,7 +23,16 @@ from teds_provision.doctor.links import READERS
 from teds_provision.doctor.station import holds_private_key
 from teds_provision.lazy import REQUIRED, install_command
 from teds_provision.protocol.keys import SoftwareKey, to_pem
-from teds_provision.store import Draft, KeyFlags, KeyRecord, NodeRecord, StationRecord, Store, StoreLock, WhitelistEntry
+from teds_provision.station.store import (
+    Draft,
+    KeyFlags,
+    KeyRecord,
+    NodeRecord,
+    StationRecord,
+    Store,
+    StoreLock,
+    WhitelistEntry,
+)
 from teds_provision.teds.image import Image
 from teds_provision.vault import forget_vaults
 from tests.bench import PASSPHRASE, make_station
@@ -262,7 +271,7 @@ def test_a_missing_an_old_and_a_shadowing_library_are_told(system: System, monke
 
 def test_a_clock_that_went_back_is_told(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:
     assert look(stationed, "clock")[0].result == "ok"
-    monkeypatch.setattr("teds_provision.store.audit.utc_now", lambda: "2099-01-01T00:00:00Z")
+    monkeypatch.setattr("teds_provision.station.store.audit.utc_now", lambda: "2099-01-01T00:00:00Z")
     with Store.open(stationed.home) as store:
         store.audit.append("test", None, "done")
     (clock,) = look(stationed, "clock")

@@ -21,7 +21,7 @@ from typing import Any, cast
 import pytest
 
 from teds_provision.node.node_template import create
-from teds_provision.store import Store
+from teds_provision.station.store import Store
 from tests.bench import PASSPHRASE
 from tests.cli.shell import PROGRAM, ROOT, Outcome, begin
 from tests.firmware.c_node import CNode

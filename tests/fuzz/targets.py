@@ -376,7 +376,7 @@ def receipt_seeds() -> Iterable[bytes]:
 def check_backup(data: bytes) -> None:
     """A backup: its sealed chunks, its head, and the dump of rows behind right seals."""
     from teds_provision.backup import chunks, content, sealed_file
-    from teds_provision.store.dump import load
+    from teds_provision.station.store.dump import load
 
     if not data:
         return
@@ -398,7 +398,7 @@ def check_backup(data: bytes) -> None:
 def backup_seeds() -> Iterable[bytes]:
     from teds_provision.backup import sealed_file
     from teds_provision.backup.content import BackupHead
-    from teds_provision.store.schema import SCHEMA_VERSION
+    from teds_provision.station.store.schema import SCHEMA_VERSION
 
     head = BackupHead("0" * 32, _key(1).point, "x", "2026-11-21T00:00:00Z", "file", "{}")
     yield b"\1" + head.line(sealed_file.FORMAT)

@@ -12,11 +12,11 @@ from teds_provision.protocol.handover.bundle import Mode
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.station.station import Station
+from teds_provision.station.store import Handover, TrustRecord, WhitelistEntry
 from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import ProvisionResult, provision
-from teds_provision.store import Handover, TrustRecord, WhitelistEntry
 from teds_provision.talk.progress import SilentReporter
 from tests.bench import Board, MemoryLink, make_station, talk
 

@@ -13,11 +13,11 @@ from teds_provision.handover.life import is_finished, plan_takeover, retire, rev
 from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
+from teds_provision.station.store import WhitelistEntry
 from teds_provision.steps.agree import ResetReceipt, agree, reset_node
 from teds_provision.steps.identify import identify
 from teds_provision.steps.inventory import inventory
 from teds_provision.steps.verify import verify_image
-from teds_provision.store import WhitelistEntry
 from teds_provision.teds.image import Image
 from tests.bench import Board, talk
 from tests.handover.desk import Pair, held, key_up, provisioned, session

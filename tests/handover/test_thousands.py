@@ -13,7 +13,7 @@ from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_imp
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station
-from teds_provision.store import BulkRows, NodeRecord
+from teds_provision.station.store import BulkRows, NodeRecord
 from tests.bench import make_station
 from tests.handover.desk import trust
 

@@ -15,7 +15,7 @@ from teds_provision import files
 from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.station.station import Station
-from teds_provision.store.database import Database
+from teds_provision.station.store.database import Database
 from tests.bench import PASSPHRASE
 
 

@@ -14,11 +14,11 @@ from typing import Any
 from teds_provision.node.node_template import create
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.station.station import Station
+from teds_provision.station.store import WhitelistEntry, utc_now
 from teds_provision.steps.agree import agree
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import provision
-from teds_provision.store import WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
 from tests.bench import make_station, on_reader

@@ -22,7 +22,7 @@ from teds_provision.measure.running.retry_policy import RetryPolicy
 from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.stream_commands import SOON, WAITS
-from teds_provision.store.lock import UsageLock, UsageLockTakenError
+from teds_provision.station.store.lock import UsageLock, UsageLockTakenError
 from teds_provision.teds.fits import parse_require
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile

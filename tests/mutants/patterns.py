@@ -318,7 +318,7 @@ PATTERNS = (
         "_LockedOctet._try_to_lock",
         "fcntl.F_OFD_SETLK",
         "fcntl.F_SETLK",
-        "tests/store/test_lock.py",
+        "tests/station/test_lock.py",
     ),
     Pattern(
         "a job's end that was seen counts",

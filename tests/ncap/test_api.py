@@ -19,7 +19,7 @@ import pytest
 
 from teds_provision.client import ApiError, Client
 from teds_provision.ncap.nodes.sheets import curves
-from teds_provision.store import Store
+from teds_provision.station.store import Store
 from teds_provision.teds.calibration import read_calibrations
 from teds_provision.teds.profile import load_profile
 from tests.e2e.desk import ANGLE
@@ -208,7 +208,7 @@ def test_an_entry_of_an_earlier_clock_hides_no_other_entry(
 ) -> None:
     with Store.open(service.station.home) as store:
         for day in ("2099-05-04", "2099-05-05", "2099-05-04", "2099-05-05"):
-            monkeypatch.setattr("teds_provision.store.audit.utc_now", lambda day=day: f"{day}T12:00:00Z")
+            monkeypatch.setattr("teds_provision.station.store.audit.utc_now", lambda day=day: f"{day}T12:00:00Z")
             store.audit.append("verify", None, f"of {day}")
     path = "/log?act=verify&since=2099-05-05T00:00:00Z"
     newest = asked.request("GET", f"{path}&limit=1")

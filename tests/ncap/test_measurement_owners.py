@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from teds_provision.client import ApiError
-from teds_provision.store import KeptMeasurement, Store
+from teds_provision.station.store import KeptMeasurement, Store
 from tests.e2e.desk import Running
 from tests.measure.hall import Hall, killed
 from tests.ncap.service import Service

@@ -22,7 +22,7 @@ WRITER = """
 import sys, time
 from pathlib import Path
 from teds_provision import client
-from teds_provision.store.lock import NodeLock
+from teds_provision.station.store.lock import NodeLock
 home, uuid = Path(sys.argv[1]), sys.argv[2]
 with NodeLock(home, bytes.fromhex(uuid)), client.connect(home=home).released(uuid, "write") as had:
     print(had, flush=True)

@@ -21,8 +21,8 @@ import pytest
 from teds_provision import client
 from teds_provision.client import ApiError
 from teds_provision.ncap.settings import own_source
-from teds_provision.store import Store
-from teds_provision.store.schema import SCHEMA_VERSION
+from teds_provision.station.store import Store
+from teds_provision.station.store.schema import SCHEMA_VERSION
 from tests.bench import make_station
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Desk, Node, Station, limited

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from teds_provision import client
-from teds_provision.store import Store
+from teds_provision.station.store import Store
 from tests.pace import until
 
 from .lab import Lab, opened

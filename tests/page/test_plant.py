@@ -11,8 +11,8 @@ from teds_provision import plant
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.station.node_keys import REMOVED
 from teds_provision.station.station import Station
-from teds_provision.store import WhitelistEntry
-from teds_provision.store.tables.plant import Alarm
+from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.tables.plant import Alarm
 from tests.plant.stations import ask, certified, request_of
 
 from .lab import Lab, opened

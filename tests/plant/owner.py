@@ -11,7 +11,7 @@ from typing import Any
 from teds_provision.protocol.plant.job import CalibrationRule, Job, seal_job
 from teds_provision.protocol.plant.roster import Member, Roster, open_roster, seal_roster
 from teds_provision.station.station import Station
-from teds_provision.store.tables.plant import PlantRecord, RosterRow
+from teds_provision.station.store.tables.plant import PlantRecord, RosterRow
 from teds_provision.teds.profile.load import default_folders, files_digest, find_profile
 from teds_provision.vault.base import Vault
 from tests.bench import make_station

@@ -36,10 +36,10 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.job import CalibrationRule, Job, open_job, require_pattern, seal_job
 from teds_provision.station.station import Station
+from teds_provision.station.store.tables.parcels import ParcelRow
 from teds_provision.steps.board_type import WrongBoardError
 from teds_provision.steps.build import BuildOrder, PreparedOrder, prepare
 from teds_provision.steps.provision import ProvisionResult, provision, verify_only
-from teds_provision.store.tables.parcels import ParcelRow
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.certificate import certificate_reference_of
 from teds_provision.teds.profile.load import files_digest, find_profile, shipped_profiles

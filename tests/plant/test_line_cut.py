@@ -25,7 +25,7 @@ from teds_provision.protocol.keys import node_key_message
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.signing import Answer, SignRequest, open_answer, seal_request
 from teds_provision.station.station import Station
-from teds_provision.store.connection import Connection
+from teds_provision.station.store.connection import Connection
 from teds_provision.teds.image import Image
 from tests.bench import Board
 

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from teds_provision.station.station import Station
+from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.connection import Connection
+from teds_provision.station.store.tables.plant import PlantRecord
 from teds_provision.steps.agree import agree
 from teds_provision.steps.identify import identify
-from teds_provision.store import WhitelistEntry
-from teds_provision.store.connection import Connection
-from teds_provision.store.tables.plant import PlantRecord
 from tests.bench import Board, make_station, talk
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")

@@ -15,8 +15,8 @@ import pytest
 
 from teds_provision import plant
 from teds_provision.station.station import Station
-from teds_provision.store import Holder, Store
-from teds_provision.store.tables.plant import PageRow
+from teds_provision.station.store import Holder, Store
+from teds_provision.station.store.tables.plant import PageRow
 from tests.bench import PASSPHRASE
 from tests.cli.shell import Outcome, call, spawn
 from tests.plant.stations import ask, certified, owner

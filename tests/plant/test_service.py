@@ -102,7 +102,7 @@ def test_a_registry_that_is_gone_is_told_once_and_stops_nothing(office: Office, 
 
 
 def test_an_alarm_is_told(office: Office) -> None:
-    from teds_provision.store.tables.plant import Alarm
+    from teds_provision.station.store.tables.plant import Alarm
 
     south = by_url(office, office.plant.stations[1])
     south.plant.tables.put_alarm(Alarm("junk", office.north.fingerprint, 1, "something is there"))

@@ -17,7 +17,7 @@ from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import Image
 from tests.bench import Board, talk
 from tests.plant.stations import Plant
-from tests.store.test_commits import Watched
+from tests.station.test_commits import Watched
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ def station(tmp_path: Path) -> Iterator[Station]:
 
 def held(station: Station, roster: Roster, monkeypatch: pytest.MonkeyPatch) -> None:
     """Have a roster of the test's CA count in a station of another one."""
-    from teds_provision.store.tables.plant import PlantRecord
+    from teds_provision.station.store.tables.plant import PlantRecord
 
     monkeypatch.setattr(type(station.identity), "ca", property(lambda self: CA.point))
     station.plant.tables.put_plant(PlantRecord(REGISTRY, mac=station.row_macs.note("plant", REGISTRY)))

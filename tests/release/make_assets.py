@@ -15,7 +15,7 @@ import zipfile
 from pathlib import Path
 from typing import Final
 
-from teds_provision.store.schema import SCHEMA_VERSION
+from teds_provision.station.store.schema import SCHEMA_VERSION
 from tests.release.test_older_homes import GRIPPER, PASSPHRASE, SENSOR
 
 ASSETS: Final = Path(__file__).parent / "assets"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.store.schema import SCHEMA_VERSION
+from teds_provision.station.store.schema import SCHEMA_VERSION
 from tests.cli.shell import Outcome, call
 
 ASSETS = sorted((Path(__file__).parent / "assets").glob("schema-*.zip"))

@@ -21,9 +21,9 @@ from teds_provision.protocol.messages.frames import Command, Reason, Reply, refu
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.station.station import Station
+from teds_provision.station.store import WhitelistEntry
 from teds_provision.steps.agree import AgreeResult, agree, open_session
 from teds_provision.steps.identify import identify
-from teds_provision.store import WhitelistEntry
 from teds_provision.teds.codec import security
 from tests.bench import Board, MemoryLink, make_station, talk
 

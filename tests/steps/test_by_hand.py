@@ -10,13 +10,13 @@ from teds_provision.errors import NodeRefusedError, NodeSilentError, UsageError
 from teds_provision.links import Contact
 from teds_provision.protocol.messages.frames import Reason, refusal
 from teds_provision.station.station import Station
+from teds_provision.station.store import WhitelistEntry
 from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.commands import SignOrder, sign_image
 from teds_provision.steps.identify import identify
 from teds_provision.steps.teds_read import NodeSnapshot
 from teds_provision.steps.write import write
-from teds_provision.store import WhitelistEntry
 from teds_provision.talk.meeting import pick_single_node
 from teds_provision.teds.image import Image
 from tests.bench import Board, MemoryLink, contact, talk

@@ -19,6 +19,7 @@ from teds_provision.errors import BadDatasheetError, NotAuthenticError
 from teds_provision.measure.background_reread import BackgroundReread
 from teds_provision.measure.verified_session import open_trusted
 from teds_provision.station.station import Station
+from teds_provision.station.store import NodeReading, RevocationRecord, utc_now
 from teds_provision.steps import readings
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.build import BuildOrder
@@ -28,7 +29,6 @@ from teds_provision.steps.sign import known_node_keys
 from teds_provision.steps.teds_read import read_image
 from teds_provision.steps.verify import possession_check
 from teds_provision.steps.verify_node import NodeVerification, verify_at_node, verify_in_session, verify_node
-from teds_provision.store import NodeReading, RevocationRecord, utc_now
 from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import SECURITY

@@ -58,8 +58,8 @@ def test_a_node_given_away_and_provisioned_elsewhere_does_not_come_back_on_a_hin
     from dataclasses import replace
 
     from teds_provision.protocol.messages.identity import NodeState
+    from teds_provision.station.store import Handover, Tombstone
     from teds_provision.steps.agree import agree as step
-    from teds_provision.store import Handover, Tombstone
 
     from .test_provision import run as provision
 

@@ -18,12 +18,12 @@ from teds_provision.links.ports import CAN, Capabilities
 from teds_provision.protocol.messages.frames import COMMON, Function, Reason, Reply, refusal, security_command
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
+from teds_provision.station.store import WhitelistEntry
 from teds_provision.steps.agree import proof_of_reset, require_session
 from teds_provision.steps.commands import NodeVisit, ReadReport, read_at, verify_at
 from teds_provision.steps.identify import identify
 from teds_provision.steps.verify import Verification, require_authentic
 from teds_provision.steps.verify_node import verify_at_node
-from teds_provision.store import WhitelistEntry
 from teds_provision.talk.conversation import Conversation, refused
 from teds_provision.talk.meeting import drop_duplicate_uuids, refuse_duplicate_uuids
 from teds_provision.teds.image import SECURITY, Image

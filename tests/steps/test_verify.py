@@ -12,6 +12,7 @@ from teds_provision.protocol.datasheet import sign_datasheet
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
+from teds_provision.station.store import TrustRecord
 from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import build
 from teds_provision.steps.commands import SignOrder, sign_image
@@ -21,7 +22,6 @@ from teds_provision.steps.teds_read import read_image
 from teds_provision.steps.verify import FreshnessFloor, Verification, freshness_floor_of, verify_image
 from teds_provision.steps.verify_node import verify_node
 from teds_provision.steps.write import write
-from teds_provision.store import TrustRecord
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY, Image

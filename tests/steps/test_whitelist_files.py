@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import BadDataError, KeyMismatchError, NotFoundError, PolicyError
 from teds_provision.station.station import Station
+from teds_provision.station.store import RevocationRecord, WhitelistEntry
 from teds_provision.steps.whitelist import FORMATS, ListedNode, add, plan_addition, read_whitelist, remove, render
-from teds_provision.store import RevocationRecord, WhitelistEntry
 from tests.pace import costs_at_most
 
 ONE, TWO = bytes.fromhex("8d4d9da65281f7000000"), bytes.fromhex("8d4d9da65281f7000001")

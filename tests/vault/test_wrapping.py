@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.errors import VaultError
-from teds_provision.store import KeyRecord, Store
+from teds_provision.station.store import KeyRecord, Store
 from teds_provision.vault import node_key_context
 from teds_provision.vault.file_vault import FileVault
 from teds_provision.vault.master import MasterKeys, Material

@@ -35,7 +35,7 @@ from teds_provision.measure.sinks.wide import WIDE
 from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.station.measurements import STATION
 from teds_provision.station.station import Station
-from teds_provision.store.records import KeptMeasurement
+from teds_provision.station.store.records import KeptMeasurement
 from teds_provision.teds.fits import parse_require
 
 AGAIN, LONGEST = 1.0, 30.0  # seconds until a measurement that failed as a whole is begun again

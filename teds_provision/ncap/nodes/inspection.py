@@ -14,13 +14,13 @@ from teds_provision.errors import BadDataError, NodeRefusedError, TedsProvisionE
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.operation.commands import POWER, PowerReply
 from teds_provision.station.station import Station
+from teds_provision.station.store import utc_now
 from teds_provision.steps.agree import session_if_keyed
 from teds_provision.steps.identify import IdentifiedNode, identify
 from teds_provision.steps.readings import NodeVerdict, is_keyed, keep
 from teds_provision.steps.teds_read import list_blocks, read_block, read_identity, read_image
 from teds_provision.steps.verify import Verification, freshness_floor_of, session_check, verify_image
 from teds_provision.steps.verify_node import verify_in_session
-from teds_provision.store import utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.sheet import Sheet

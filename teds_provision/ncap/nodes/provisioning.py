@@ -34,6 +34,7 @@ from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
+from teds_provision.station.store.audit import ACTOR
 from teds_provision.steps.agree import agree
 from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.datasheet_edit import write_sheet
@@ -41,7 +42,6 @@ from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import ProvisionResult, new_whitelist_entry, provision
 from teds_provision.steps.teds_read import list_blocks
 from teds_provision.steps.verify import Verification, require_authentic
-from teds_provision.store.audit import ACTOR
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.progress import SilentReporter, StepResult
 from teds_provision.teds.formats import placed

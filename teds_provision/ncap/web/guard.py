@@ -21,7 +21,7 @@ from urllib.parse import parse_qs
 from teds_provision.errors import StoreError
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.tokens import Tokens
-from teds_provision.store.audit import ACTOR, by_token
+from teds_provision.station.store.audit import ACTOR, by_token
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]

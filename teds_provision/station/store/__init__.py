@@ -1,0 +1,86 @@
+"""The station's memory in one SQLite file: whitelist, nodes, wrapped keys, trust and the audit log."""
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.station.store.audit import AuditEntry, AuditFilter, AuditLog, AuditVerdict, is_failure
+    from teds_provision.station.store.lock import NodeLock, StoreLock
+    from teds_provision.station.store.records import (
+        DatasheetRecord,
+        Draft,
+        ExportedNode,
+        ExportEligibility,
+        Group,
+        Handover,
+        Holder,
+        KeptMeasurement,
+        KeyFlags,
+        KeyRecord,
+        NodeReading,
+        NodeRecord,
+        RevocationRecord,
+        StationRecord,
+        Tombstone,
+        TrustRecord,
+        WhitelistEntry,
+        utc_now,
+    )
+    from teds_provision.station.store.store import Store
+    from teds_provision.station.store.tables.line import EvidenceRow, JobRow, LineTables, SignRequestRow, UnitRow
+    from teds_provision.station.store.tables.nodes import BulkRows, chunks
+    from teds_provision.station.store.tables.overview import NodeOverview, Search
+else:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "audit": "AuditEntry AuditLog AuditVerdict AuditFilter is_failure",
+            "lock": "NodeLock StoreLock",
+            "records": "DatasheetRecord Draft ExportEligibility Group ExportedNode Handover Holder KeyRecord KeyFlags"
+            " KeptMeasurement NodeReading NodeRecord RevocationRecord"
+            " StationRecord Tombstone TrustRecord WhitelistEntry utc_now",
+            "store": "Store",
+            "tables.overview": "NodeOverview Search",
+            "tables.line": "EvidenceRow JobRow LineTables SignRequestRow UnitRow",
+            "tables.nodes": "BulkRows chunks",
+        },
+    )
+
+__all__ = [
+    "AuditEntry",
+    "AuditFilter",
+    "AuditLog",
+    "AuditVerdict",
+    "BulkRows",
+    "DatasheetRecord",
+    "Draft",
+    "EvidenceRow",
+    "ExportEligibility",
+    "ExportedNode",
+    "Group",
+    "Handover",
+    "Holder",
+    "JobRow",
+    "KeptMeasurement",
+    "KeyFlags",
+    "KeyRecord",
+    "LineTables",
+    "NodeLock",
+    "NodeOverview",
+    "NodeReading",
+    "NodeRecord",
+    "RevocationRecord",
+    "Search",
+    "SignRequestRow",
+    "StationRecord",
+    "Store",
+    "StoreLock",
+    "Tombstone",
+    "TrustRecord",
+    "UnitRow",
+    "WhitelistEntry",
+    "chunks",
+    "is_failure",
+    "utc_now",
+]

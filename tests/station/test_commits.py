@@ -1,0 +1,298 @@
+"""How often a provisioning waits for the disk: the aims of issue 13 row 1 and issue 8."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import LinkError, StoreError
+from teds_provision.protocol.messages.frames import Command
+from teds_provision.station.station import Station
+from teds_provision.station.store import NodeRecord
+from teds_provision.station.store.audit import ACTOR
+from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.provision import provision
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.progress import SilentReporter
+from tests.bench import Board, MemoryLink, make_station, talk
+
+_CHANGES = ("INSERT", "UPDATE", "DELETE", "REPLACE")
+
+
+@dataclass
+class Watched:
+    """What SQLite was told to do."""
+
+    station: Station
+    statements: list[str] = field(default_factory=list)
+    waited: int = 0
+    """Commits of the last run that waited for the disk."""
+
+    def run(self, board: Board) -> tuple[int, int]:
+        """Provision once; returns rows written, and commits that wrote something."""
+        self.statements.clear()
+        with talk(board) as node:
+            order = BuildOrder("temperature-sensor")
+            provision(self.station, node, order, accept=lambda who: None, reporter=SilentReporter())
+        rows = commits = open_rows = self.waited = 0
+        last, waits = "", True
+        for statement in self.statements:
+            word = statement.split(maxsplit=1)[0]
+            if word in _CHANGES and statement != last:  # SQLite tells a statement once more for its trigger
+                rows += 1
+                open_rows += 1
+            elif word == "COMMIT":
+                commits += open_rows > 0
+                self.waited += open_rows > 0 and waits
+                open_rows = 0
+            elif statement.startswith("PRAGMA synchronous"):
+                waits = statement.endswith("FULL")
+            last = statement
+        assert open_rows == 0, "a row was written outside a transaction"
+        return rows, commits
+
+
+@pytest.fixture
+def watched(tmp_path: Path) -> Iterator[Watched]:
+    watched = Watched(make_station(tmp_path / "home"))
+    watched.station._store._database._connection.set_trace_callback(watched.statements.append)
+    yield watched
+    watched.station.close()
+
+
+@pytest.fixture
+def synced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The files that this process waited for by itself, beside what SQLite does."""
+    names: list[str] = []
+    monkeypatch.setattr(
+        "os.fdatasync", lambda descriptor: names.append(Path(os.readlink(f"/proc/self/fd/{descriptor}")).name)
+    )
+    return names
+
+
+def test_a_whole_provisioning_is_eight_commits_at_most_and_waits_for_the_disk_three_times(
+    watched: Watched, synced: list[str]
+) -> None:
+    """The pending key before Confirm, the sequence before the signature leaves, and the verdict with all before it."""
+    _, commits = watched.run(Board())
+    assert commits <= 8
+    assert watched.waited == 2
+    assert synced == ["store.sqlite3-wal"]
+
+
+def test_the_key_is_on_the_disk_before_its_confirmation_leaves_and_the_sequence_before_the_signature(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The signature is in the TEDS that is written last; the others may go while the disk is waited for."""
+    told: list[str] = []
+    plain, send = os.fdatasync, Conversation.request
+    slowly = threading.Event()
+
+    def synced(descriptor: int) -> None:
+        slowly.wait(0.2)  # nobody sets it: a slow disk
+        plain(descriptor)
+        told.append("on the disk")
+
+    def sent(node: Conversation, command: Command, doing: str, *, within: float | None = None) -> bytes:
+        told.append(doing)
+        return send(node, command, doing, within=within)
+
+    def stated(statement: str) -> None:
+        if statement == "COMMIT":
+            if threading.current_thread() is not threading.main_thread():
+                slowly.wait(0.2)
+            told.append("commit")
+
+    monkeypatch.setattr("os.fdatasync", synced)
+    monkeypatch.setattr(Conversation, "request", sent)
+    watched.station._store._database._connection.set_trace_callback(stated)
+    with talk(Board()) as node:
+        provision(
+            watched.station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=SilentReporter()
+        )
+        told.append("told")
+    of_teds = [doing for doing in told if doing.startswith(("TEDS", "on the disk", "the commit"))]
+    assert of_teds[-3:] == ["on the disk", "TEDS 128 of channel 0", "the commit"]
+    assert "TEDS 1 of channel 0" in of_teds[:-3]
+    assert told[told.index("the key confirmation") - 1] == "commit"
+    assert told[-4:-1] == ["to measure with channel 1", "commit", "told"]
+
+
+def test_a_run_that_ends_early_is_on_the_disk_all_the_same(watched: Watched, synced: list[str]) -> None:
+    """Identify is written to the log and not waited for: the next step was to do that."""
+    link = MemoryLink(Board(), lose_request=3)
+    with pytest.raises(LinkError), talk(link.board, link) as node:
+        provision(
+            watched.station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=SilentReporter()
+        )
+    assert synced == ["store.sqlite3-wal"]
+
+
+def test_what_comes_later_is_on_the_disk_with_the_next_entry_or_when_it_is_asked_for(
+    watched: Watched, synced: list[str]
+) -> None:
+    store, node = watched.station._store, NodeRecord(bytes(10))
+    with store.transaction(later=True):
+        store.put_node(node)
+    with store.transaction():
+        store.put_node(node)  # the same again: SQLite may find nothing to write
+    store.flush()
+    assert synced == ["store.sqlite3-wal"]
+    with store.transaction(later=True):
+        store.put_node(node)
+    store.audit.append("identify", node.uuid, "done")
+    store.flush()
+    assert synced == ["store.sqlite3-wal"]
+
+
+def test_a_step_by_itself_never_comes_later(watched: Watched) -> None:
+    """Only a run of steps may leave one to the next; ``identify`` alone waits."""
+    with watched.station.durable("identify", more_follows=True):
+        watched.station.audit("identify", None, "done")
+    assert "PRAGMA synchronous=NORMAL" not in watched.statements
+
+
+def test_the_stations_facts_are_never_older_than_the_store(watched: Watched) -> None:
+    """They are remembered: another process, and a change that was taken back, must be seen."""
+    here = watched.station
+    there = Station.open(here.home, ask=lambda prompt, confirm: pytest.fail("no secret is needed"))
+    try:
+        assert here.identity.master == there.identity.master == 1
+        there.identity.begin_rewrapping(2)
+        assert here.identity.master == 2
+        with here.transaction():
+            assert here.identity.master == 2
+        with suppress(InterruptedError), here.transaction():
+            here.identity.begin_rewrapping(3)
+            assert here.identity.master == 3
+            raise InterruptedError
+        assert here.identity.master == 2
+    finally:
+        there.close()
+
+
+def test_a_provisioning_with_nothing_to_do_writes_four_rows_and_waits_twice_for_the_disk(watched: Watched) -> None:
+    board = Board()
+    watched.run(board)
+    for _ in range(2):
+        rows, commits = watched.run(board)
+        assert rows <= 4
+        assert commits <= 2
+
+
+def test_a_run_does_not_wait_for_what_another_thread_has_written_since(watched: Watched, synced: list[str]) -> None:
+    """Eight readers on one store would wait for each other's steps."""
+    other_is_going, this_is_done = threading.Event(), threading.Event()
+
+    def other() -> None:
+        with watched.station.run():
+            with watched.station.durable("identify", more_follows=True):
+                watched.station.audit("identify", None, "done")
+            other_is_going.set()
+            this_is_done.wait(60)
+
+    reader = threading.Thread(target=other)
+    with watched.station.run():
+        with watched.station.durable("identify", more_follows=True):
+            watched.station.audit("identify", None, "done")
+        with watched.station.durable("sign"):
+            watched.station.audit("sign", None, "done")
+        reader.start()
+        assert other_is_going.wait(60)
+    assert synced == []
+    this_is_done.set()
+    reader.join(60)
+    assert synced == ["store.sqlite3-wal"]
+
+
+def test_what_is_not_waited_for_does_not_bring_what_came_before_onto_the_disk(
+    watched: Watched, synced: list[str]
+) -> None:
+    """Two readers: the second one's step that comes later said nothing about the first one's."""
+    with watched.station.run():
+        for act in ("identify", "whitelist"):
+            with watched.station.durable(act, more_follows=True):
+                watched.station.audit(act, None, "done")
+        watched.station._store.flush(1)
+        assert synced == ["store.sqlite3-wal"]
+
+
+def test_nothing_that_a_provisioning_or_a_look_up_asks_reads_a_whole_table(watched: Watched) -> None:
+    """They cost the same with a hundred thousand nodes; the list of trusted stations is short, and read whole."""
+    store, board = watched.station._store, Board()
+    watched.run(board)
+    store.is_known(board.uuid)
+    store.resolve(board.uuid.hex()[:8])
+    store.named("finger-1")
+    asked = {statement for statement in watched.statements if statement.startswith(("SELECT", "UPDATE", "DELETE"))}
+    assert len(asked) > 20
+    plans = {name: [row[3] for row in store._database.execute(f"EXPLAIN QUERY PLAN {name}")] for name in asked}
+    one_row = {"SCAN trust", "SCAN station", "SCAN plant", "SCAN CONSTANT ROW"}  # or as many as there are stations
+    whole = {
+        asked_for
+        for asked_for, plan in plans.items()
+        if any(step.startswith("SCAN") and step not in one_row for step in plan)
+    }
+    assert {name for name in whole if not name.endswith("FROM audit ORDER BY seq DESC LIMIT 1")} == set()
+
+
+def test_what_a_run_asks_of_the_store_comes_after_the_steps_that_it_takes_behind_its_back(watched: Watched) -> None:
+    station, free = watched.station, threading.Event()
+
+    def slow() -> None:
+        free.wait(0.2)  # nobody sets it
+        with station.durable("agree", more_follows=True):
+            station.nodes.remember(bytes(10), name="left")
+
+    with station.run():
+        station.run_in_background(slow)
+        assert station.nodes.get(bytes(10)) == NodeRecord(bytes(10), name="left")
+        station.run_in_background(slow)
+        with station.durable("sign"):  # takes the locks that the step takes too
+            station.nodes.remember(bytes(10), name="right")
+    record = station.nodes.get(bytes(10))
+    assert record is not None
+    assert record.name == "right"
+    assert "durable steps" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_a_step_that_fails_behind_a_run_fails_the_run(watched: Watched) -> None:
+    """At what it asks of the store next, or at its end; never in silence."""
+    station, went_on = watched.station, []
+
+    def full() -> None:
+        raise StoreError("The disk is full.")
+
+    def ask() -> None:
+        with station.run():
+            station.run_in_background(full)
+            station.nodes.get(bytes(10))
+            went_on.append("after a question")
+
+    def end() -> None:
+        with station.run():
+            station.run_in_background(full)
+            went_on.append("at the end")
+
+    for run in (ask, end):
+        with pytest.raises(StoreError, match="full"):
+            run()
+    with pytest.raises(StoreError, match="full"):
+        station.run_in_background(full)
+    assert went_on == ["at the end"]
+
+
+def test_what_is_done_behind_a_run_is_done_by_the_same_person(watched: Watched) -> None:
+    before = ACTOR.set("token lab")
+    try:
+        with watched.station.run():
+            watched.station.run_in_background(lambda: watched.station.audit("agree", None, "done"))
+    finally:
+        ACTOR.reset(before)
+    assert [entry.who for entry in watched.station.audit_log.entries()][-1] == "token lab"

@@ -1,0 +1,31 @@
+"""Which key a UUID has to show, and what is recorded of those who show another."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import KeyMismatchError
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.station import pins
+from teds_provision.station.store import WhitelistEntry
+from tests.bench import make_station
+
+UUID = bytes.fromhex("8d4d9da65281f7000000")
+
+
+def test_a_flood_of_wrong_keys_does_not_fill_the_audit_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody needs a key to show a wrong one on a bus, and the service looks at whoever announces itself."""
+    now = [0.0]
+    monkeypatch.setattr(pins.time, "monotonic", lambda: now[0])
+    with closing(make_station(tmp_path / "home")) as station:
+        pinned = fingerprint(SoftwareKey.generate().point)
+        station.pins.put(WhitelistEntry(UUID, pinned))
+        for at in (0.0, 1.0, 599.0, 600.0, 601.0):
+            now[0] = at
+            with pytest.raises(KeyMismatchError):
+                station.pins.check(UUID, SoftwareKey.generate().point)
+        entries = [entry.detail for entry in station.audit_log.entries() if entry.outcome == "other key"]
+    assert [entry.get("unrecorded", 0) for entry in entries] == [0, 2]
