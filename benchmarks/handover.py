@@ -100,7 +100,7 @@ _TABLES = {"nodes": 1, "whitelist": 1, "keys": 0, "key_slots": 0, "holders": 0, 
 
 def rest(south: Station, empty: Station, count: int) -> tuple[float, float]:
     """Seconds of the processor for the other parts of an export and an import: AES-GCM, HMAC, SQLite."""
-    rows = {table: south._store._database.execute(f"SELECT * FROM {table}") for table in _TABLES}
+    rows = {table: south._store.execute(f"SELECT * FROM {table}") for table in _TABLES}
     cipher, context, key = AESGCM(bytes(32)), bytes(60), bytes(16)
     sealed = cipher.encrypt(bytes(12), key, context)
 
@@ -110,7 +110,7 @@ def rest(south: Station, empty: Station, count: int) -> tuple[float, float]:
 
     def export() -> None:
         for table in ("nodes", "whitelist", "keys"):
-            south._store._database.execute(f"SELECT * FROM {table}")
+            south._store.execute(f"SELECT * FROM {table}")
         for _ in range(count):
             cipher.decrypt(bytes(12), sealed, context)
         seals(2 * count)
@@ -122,7 +122,7 @@ def rest(south: Station, empty: Station, count: int) -> tuple[float, float]:
         with empty.transaction():
             for table, row in rows.items():
                 marks = ", ".join("?" * len(row[0])) if row else "NULL"
-                empty._store._database.execute_many(f"INSERT OR REPLACE INTO {table} VALUES({marks})", row)
+                empty._store.execute_many(f"INSERT OR REPLACE INTO {table} VALUES({marks})", row)
 
     return min(timed(export)[0] for _ in range(ROUNDS)), min(timed(take_in)[0] for _ in range(1))
 

@@ -128,7 +128,7 @@ class Station:
         """
         self.use_agent = True
         """True if an agent's secret (``unlock``) opens the vault; False if the passphrase itself is asked for."""
-        store.when_waiting(lambda text: self.notice(text))  # noqa: PLW0108 - it is replaced later
+        store.notice = lambda text: self.notice(text)  # noqa: PLW0108 - it is replaced later
         self.row_macs = RowMacs(store, self._opened, tell)
         self.identity = StationIdentity(store, self._opened, self.row_macs)
         self.plant = Plant(store, self.current_vault, self.identity, self.row_macs)
@@ -342,7 +342,7 @@ class Station:
     @contextmanager
     def run(self) -> Iterator[None]:
         """Several steps by one thread, of which the last is durable: so are all of them when the block has ended."""
-        self._runs.now = run = _DurableRun(self._store.background_writer())
+        self._runs.now = run = _DurableRun(BackgroundWriter(self._store.background))
         try:
             try:
                 yield

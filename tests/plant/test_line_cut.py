@@ -172,7 +172,7 @@ def test_an_office_that_is_killed_at_any_step_carries_on(tmp_path: Path, monkeyp
 
 def pages_of(station: Station, most: int | None = None) -> int:
     """How many pages the store has; it may have ``most`` from now on."""
-    database = station._store._database
+    database = station._store
     if most is not None:
         database.execute(f"PRAGMA max_page_count = {most}")
     return int(database.execute("PRAGMA page_count")[0][0])

@@ -144,10 +144,10 @@ def test_who_joined_waits_for_the_disk_no_more_often(plants: Plant, tmp_path: Pa
     waited = []
     for station in (alone, plants.north):
         watched = Watched(station)
-        station._store._database._connection.set_trace_callback(watched.statements.append)
+        station._store._connection.set_trace_callback(watched.statements.append)
         _, commits = watched.run(Board(bytes([len(waited) + 1] * 10)))
         waited.append((commits, watched.waited))
-        station._store._database._connection.set_trace_callback(None)
+        station._store._connection.set_trace_callback(None)
     assert plants.north.plant.tables.unsent(plants.north.fingerprint) >= 4
     assert waited[0] == waited[1]
     alone.close()

@@ -61,7 +61,7 @@ class Watched:
 @pytest.fixture
 def watched(tmp_path: Path) -> Iterator[Watched]:
     watched = Watched(make_station(tmp_path / "home"))
-    watched.station._store._database._connection.set_trace_callback(watched.statements.append)
+    watched.station._store._connection.set_trace_callback(watched.statements.append)
     yield watched
     watched.station.close()
 
@@ -111,7 +111,7 @@ def test_the_key_is_on_the_disk_before_its_confirmation_leaves_and_the_sequence_
 
     monkeypatch.setattr("os.fdatasync", synced)
     monkeypatch.setattr(Conversation, "request", sent)
-    watched.station._store._database._connection.set_trace_callback(stated)
+    watched.station._store._connection.set_trace_callback(stated)
     with talk(Board()) as node:
         provision(
             watched.station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=SilentReporter()
@@ -232,7 +232,7 @@ def test_nothing_that_a_provisioning_or_a_look_up_asks_reads_a_whole_table(watch
     store.named("finger-1")
     asked = {statement for statement in watched.statements if statement.startswith(("SELECT", "UPDATE", "DELETE"))}
     assert len(asked) > 20
-    plans = {name: [row[3] for row in store._database.execute(f"EXPLAIN QUERY PLAN {name}")] for name in asked}
+    plans = {name: [row[3] for row in store.execute(f"EXPLAIN QUERY PLAN {name}")] for name in asked}
     one_row = {"SCAN trust", "SCAN station", "SCAN plant", "SCAN CONSTANT ROW"}  # or as many as there are stations
     whole = {
         asked_for

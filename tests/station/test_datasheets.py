@@ -76,7 +76,7 @@ def test_a_node_costs_little_in_the_file(store: Store) -> None:
     nodes = 40
 
     def pages() -> int:
-        return int(store._database.execute("PRAGMA page_count")[0][0]) * 4096
+        return int(store.execute("PRAGMA page_count")[0][0]) * 4096
 
     def keep(version: int) -> int:
         before = pages()

@@ -195,7 +195,7 @@ def test_a_read_only_disk_gives_a_clear_error(store: Store, home: Path) -> None:
 
 
 def test_sqlite_running_out_of_pages_is_a_full_disk(store: Store) -> None:
-    store._database.execute("PRAGMA max_page_count = 30")
+    store.execute("PRAGMA max_page_count = 30")
 
     def fill() -> None:
         with store.transaction():
@@ -205,7 +205,7 @@ def test_sqlite_running_out_of_pages_is_a_full_disk(store: Store) -> None:
     with pytest.raises(StoreError, match="no space left"):
         fill()
     assert store.nodes() == []
-    store._database.execute("PRAGMA max_page_count = 100000")
+    store.execute("PRAGMA max_page_count = 100000")
     store.put_node(NodeRecord(NODE))
     assert len(store.nodes()) == 1
 
@@ -291,7 +291,7 @@ def test_a_database_of_another_program_is_refused(home: Path) -> None:
 
 
 def test_a_store_of_a_newer_version_is_refused(store: Store, home: Path) -> None:
-    store._database.execute("PRAGMA user_version = 99")
+    store.execute("PRAGMA user_version = 99")
     store.close()
     with pytest.raises(StoreError, match="schema 99"):
         Store.open(home)

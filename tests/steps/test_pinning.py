@@ -37,9 +37,9 @@ def test_one_damaged_key_does_not_hide_the_good_one(station: Station, board: Boa
     whitelist(station, board)
     agree(station, board)
     station.keys.add_pending(board.uuid, key=bytes(16), key_id=bytes(8), epoch=9)
-    station._store._database.execute("UPDATE keys SET wrapped = x'00' WHERE state = 'pending'")
+    station._store.execute("UPDATE keys SET wrapped = x'00' WHERE state = 'pending'")
     assert agree(station, board).epoch == 1
-    station._store._database.execute("UPDATE keys SET wrapped = x'00'")
+    station._store.execute("UPDATE keys SET wrapped = x'00'")
     with pytest.raises(VaultError):
         agree(station, board)
 

@@ -273,7 +273,7 @@ def test_a_run_writes_as_little_as_its_promises_need(station: Station, board: Bo
                 made, dirty = made + dirty, False
         return made
 
-    station._store._database._connection.set_trace_callback(told)
+    station._store._connection.set_trace_callback(told)
     run(station, board)
     assert 0 < commits() <= 8
     said.clear()

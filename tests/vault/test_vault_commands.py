@@ -122,7 +122,7 @@ def test_a_run_that_was_cut_is_carried_on_and_not_begun_anew(home: Path) -> None
 
 def test_a_key_that_was_lost_before_does_not_keep_the_old_master_key(home: Path) -> None:
     station = opened(home)
-    station._store._database.execute("UPDATE keys SET wrapped = zeroblob(60) WHERE uuid = ?", (NODES[3],))
+    station._store.execute("UPDATE keys SET wrapped = zeroblob(60) WHERE uuid = ?", (NODES[3],))
     done = rewrap(station)
     assert (done.keys, done.damaged) == (4, 1)
     assert station.vault.masters() == (2,)

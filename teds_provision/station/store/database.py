@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence, Sized
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 from teds_provision.errors import StoreError, StoreLockedError
 from teds_provision.lazy import late
@@ -114,7 +114,7 @@ class Database(Connection):
         self._remembered_at: object = None
 
     @classmethod
-    def open(cls, home: Path, *, create: bool) -> Database:
+    def open(cls, home: Path, *, create: bool = False) -> Self:
         """Open ``home``/store.sqlite3, making it (0600, in a directory of 0700) if ``create``.
 
         Raises StoreError: missing, damaged, of a newer version, foreign, no permission, no space.
@@ -133,7 +133,7 @@ class Database(Connection):
             return cls._read_only(path, failure)
 
     @classmethod
-    def _opened(cls, path: Path, *, create: bool) -> Database:
+    def _opened(cls, path: Path, *, create: bool) -> Self:
         try:
             connection = sqlite3.connect(path, timeout=QUIET_SECONDS, isolation_level=None, check_same_thread=False)
         except sqlite3.Error as error:
@@ -147,7 +147,7 @@ class Database(Connection):
         return database
 
     @classmethod
-    def _read_only(cls, path: Path, failure: StoreError) -> Database:
+    def _read_only(cls, path: Path, failure: StoreError) -> Self:
         """Open a private copy to be read; whatever would change it raises why the store itself cannot be written."""
         try:
             connection = open_copy(path)

@@ -53,9 +53,8 @@ def dump(store: Store) -> Iterator[bytes]:
 
     Raises StoreError.
     """
-    database = store._database
-    with database._lock, database._translated():
-        connection = database._connection
+    with store._lock, store._translated():
+        connection = store._connection
         connection.execute("BEGIN")  # the first SELECT takes the moment, and blocks no other process
         try:
             version = int(connection.execute("PRAGMA user_version").fetchone()[0])

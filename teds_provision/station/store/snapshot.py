@@ -44,9 +44,9 @@ def place(copy: Store, home: Path) -> None:
         raise StoreError(f"There is a store in {home} already.", hint="Restore into another --home.")
     try:
         with whole_draft(path, replace=False) as (draft, _):
-            with closing(sqlite3.connect(draft)) as target, copy._database._lock, copy._database._translated():
+            with closing(sqlite3.connect(draft)) as target, copy._lock, copy._translated():
                 target.execute("PRAGMA journal_mode=OFF")  # a draft that fails goes whole
-                copy._database._connection.backup(target)
+                copy._connection.backup(target)
             for left in ("-wal", "-shm"):  # of a store that is gone: they would be replayed into this one
                 path.with_name(FILE_NAME + left).unlink(missing_ok=True)
     except (OSError, sqlite3.Error) as error:
@@ -55,7 +55,7 @@ def place(copy: Store, home: Path) -> None:
 
 def totals(store: Store) -> dict[str, int]:
     """Count whitelist, nodes, keys and trusted keys of a store."""
-    count = store._database.one
+    count = store.one
     return {table: int((count(f"SELECT count(*) FROM {table}") or (0,))[0]) for table in _COUNTED}
 
 
@@ -92,8 +92,8 @@ def relation(copy: Store, live: Store) -> Relation:
 
 def extend_audit(live: Store, copy: Store) -> int:
     """Append what a newer copy's audit log goes on with; returns how many entries. Call it inside a transaction."""
-    database, after = live._database, live.audit.check().count
-    rows = copy._database.execute("SELECT * FROM audit WHERE seq > ? ORDER BY seq", (after,))
+    database, after = live, live.audit.check().count
+    rows = copy.execute("SELECT * FROM audit WHERE seq > ? ORDER BY seq", (after,))
     for row in rows:
         database.execute("INSERT INTO audit VALUES(?, ?, ?, ?, ?, ?, ?, ?)", row)
     if rows:
