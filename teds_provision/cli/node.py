@@ -256,10 +256,10 @@ def run(
     node_ids: Sequence[int],
     **links: Any,
 ) -> None:
-    """Run the nodes in DIR … until SIGTERM or Ctrl-C; SIGUSR1 resets them by hand.
+    """Run the nodes in DIR … until SIGTERM or Ctrl-C; SIGUSR1 resets them by hand, SIGUSR2 presses their button.
 
-    Prints one line when the links are up, then one line per actuator change, and for a wrapped node one line when a
-    channel becomes invalid, with the reason, or valid again.
+    Prints one line when the links are up, then one line per actuator change, one when a node blinks to be found, and
+    for a wrapped node one line when a channel becomes invalid, with the reason, or valid again.
     """
     place = node_room.wrapped.running.SensorPlace(source, bus, tuple(node_ids), links["can"])
     _check_options(len(folders), place, **links)
@@ -267,16 +267,24 @@ def run(
     lines, pulse = ActuatorLines(app), node_room.realtime_loop.RealtimeLoop()
     wrapped = _wrapped(app, lines, folders, place)
     make = _boards(app, lines, source, battery, wrapped)
+    uuids = [node_room.flash_file.FlashFile(folder).load().uuid.hex() for folder in folders]
     nodes = [
         node_room.virtual.VirtualNode(
-            folder, delays=delays, exclusive=True, board=make, pulse=pulse, has_can=bool(links["can"])
+            folder,
+            delays=delays,
+            exclusive=True,
+            board=make,
+            pulse=pulse,
+            has_can=bool(links["can"]),
+            located=lines.locate_of(uuid),
         )
-        for folder in folders
+        for folder, uuid in zip(folders, uuids, strict=True)
     ]
     stop = talk.meeting.IdleStop(None)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.request_stop())
     signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=_reset_all, args=(nodes,)).start())
+    signal.signal(signal.SIGUSR2, lambda *_: threading.Thread(target=_press_all, args=(nodes,)).start())
     running: list[Any] = []
     try:
         boards = [node.board for node in nodes if node.board is not None]
@@ -376,6 +384,11 @@ def _reset_all(nodes: Sequence[VirtualNode]) -> None:
         node.reset_by_hand()
 
 
+def _press_all(nodes: Sequence[VirtualNode]) -> None:
+    for node in nodes:
+        node.press_button()
+
+
 def _say_ready(app: App, nodes: Sequence[VirtualNode], up: list[str], source: str) -> None:
     flashes = [node.tim.flash for node in nodes]
     named = [{"uuid": flash.uuid.hex(), "fingerprint": protocol.keys.fingerprint(flash.node_key)} for flash in flashes]
@@ -412,6 +425,7 @@ def _servers(
         for node in nodes:
             tapped = node.in_factory_state if nfc is None else lambda: False
             bus.add(node, counts_as_tapped=tapped, measuring=node)
+            node.announces_presses_over(functools.partial(bus.announce_press, node))
             node.streams_over(functools.partial(_send, bus, node))
         servers.append(bus)
     return servers
@@ -465,7 +479,7 @@ class ActuatorLines:
         self._app = app
         self._news: dict[tuple[str, int], ActuatorReading] = {}
         self._told: dict[tuple[str, int], ActuatorReading] = {}
-        self._validity: list[dict[str, object]] = []
+        self._events: list[dict[str, object]] = []
         self._condition = threading.Condition()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="actuators", daemon=True)
@@ -485,13 +499,19 @@ class ActuatorLines:
 
         def report(channel: int, name: str, reason: str) -> None:
             line: dict[str, object] = {"event": "valid", "uuid": uuid, "channel": channel, "name": name}
-            line |= {"event": "invalid", "reason": reason} if reason else {}
-            with self._condition:
-                self._validity.append(line | {"time": _iso(time.time())})
-                del self._validity[:-_MOST_LINES]
-                self._condition.notify()
+            self._note(line | ({"event": "invalid", "reason": reason} if reason else {}))
 
         return report
+
+    def locate_of(self, uuid: str) -> Callable[[int], None]:
+        """Return what a node calls to be found by a person."""
+        return lambda seconds: self._note({"event": "locate", "uuid": uuid, "seconds": seconds})
+
+    def _note(self, line: dict[str, object]) -> None:
+        with self._condition:
+            self._events.append(line | {"time": _iso(time.time())})
+            del self._events[:-_MOST_LINES]
+            self._condition.notify()
 
     def start(self) -> None:
         """Begin to print."""
@@ -508,7 +528,7 @@ class ActuatorLines:
     def _run(self) -> None:
         while not self._stop.is_set():
             with self._condition:
-                while not self._news and not self._validity and not self._stop.is_set():
+                while not self._news and not self._events and not self._stop.is_set():
                     self._condition.wait()
             self._tell_news()
             self._stop.wait(_EVERY_SECONDS)
@@ -517,10 +537,10 @@ class ActuatorLines:
     def _tell_news(self) -> None:
         with self._condition:
             news, self._news = self._news, {}
-            validity, self._validity = self._validity, []
+            events, self._events = self._events, []
         try:
-            for line in validity:
-                self._print_validity(line)
+            for line in events:
+                self._print_event(line)
         except OSError:
             self._stop.set()
             return
@@ -533,7 +553,12 @@ class ActuatorLines:
                     self._stop.set()
                     return
 
-    def _print_validity(self, line: dict[str, object]) -> None:
+    def _print_event(self, line: dict[str, object]) -> None:
+        if line["event"] == "locate":
+            self._app.emit(
+                line, f"{line['uuid']}: " + (f"blinks for {line['seconds']} s" if line["seconds"] else "stops")
+            )
+            return
         state = f"invalid: {line['reason']}" if line["event"] == "invalid" else "valid again"
         self._app.emit(line, f"{line['uuid']} {line['name']}: {state}")
 

@@ -16,9 +16,11 @@ from typing import Any
 from teds_provision.errors import BadDataError, NotFoundError, StoreError, StoreLockedError, UsageError
 from teds_provision.files import read_limited, whole_file
 from teds_provision.limits import load_json
+from teds_provision.node.reported_firmware import own_report, report_from_json, report_to_json
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.flash import Flash, FlashError, in_factory_state
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
+from teds_provision.protocol.messages.firmware import FirmwareReport
 from teds_provision.protocol.messages.frames import LIST_OVERHEAD
 from teds_provision.teds.image import BlockId
 
@@ -53,11 +55,12 @@ class FlashFile:
         max_message: int = 2048,
         blocks: Mapping[BlockId, bytes] | None = None,
         read_only: frozenset[BlockId] = frozenset(),
+        firmware: FirmwareReport | None = None,
     ) -> FlashFile:
         """Make a node in factory state with its own key; an existing one of that UUID is opened instead.
 
         ``blocks`` are TEDS that it is made with: stored unsigned, and kept aside as what its hardware is; those of
-        ``read_only`` cannot be written.
+        ``read_only`` cannot be written. ``firmware`` is what it reports as running, by default this package.
         """
         if (folder / FILE).exists():
             existing = cls(folder)
@@ -87,6 +90,8 @@ class FlashFile:
         head = {"format": FORMAT, "name": name, "max_message": max_message, "key": key.secret().hex()}
         if blocks:
             head["hardware"] = _blocks_to_json(blocks)
+        if firmware is not None:
+            head["firmware"] = report_to_json(firmware)
         try:
             _replace(folder / FILE, head | {"flash": _flash_to_json(flash)})
         except OSError as error:
@@ -112,6 +117,11 @@ class FlashFile:
     def hardware(self) -> dict[BlockId, bytes]:
         """The TEDS that it was made with: what its channels are, whatever datasheet is written later."""
         return _blocks_from_json(self._document.get("hardware", []))
+
+    @property
+    def firmware(self) -> FirmwareReport | None:
+        """The firmware that it reports; None (``"firmware": null`` in the file) makes it a node from before 128.21."""
+        return _report(self._document)
 
     def load(self) -> Flash:
         """Return the committed state."""
@@ -165,11 +175,19 @@ class FlashFile:
             SoftwareKey.from_secret(bytes.fromhex(document["key"]))
             _flash_from_json(document["flash"])
             _blocks_from_json(document.get("hardware", []))
+            _report(document)
         except (KeyError, TypeError, ValueError, AttributeError, BadDataError):
             whole = False
         if not whole:
             raise BadDataError(f"{self.path} is not a virtual node's flash, or it is damaged.", hint="Make a new node.")
         return dict(document)
+
+
+def _report(document: Mapping[str, Any]) -> FirmwareReport | None:
+    if "firmware" not in document:
+        return own_report()
+    described = document["firmware"]
+    return None if described is None else report_from_json(described)
 
 
 def _migrated(document: dict[str, Any]) -> dict[str, Any]:

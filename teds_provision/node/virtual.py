@@ -15,6 +15,7 @@ from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import Board
 from teds_provision.node.hardware.clock import NANOSECONDS
 from teds_provision.node.realtime_loop import RealtimeLoop
+from teds_provision.node.reported_firmware import ReportedFirmware
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, verify
 from teds_provision.protocol.messages.identity import NodeState
@@ -135,7 +136,7 @@ class VirtualNode:
 
     ``exclusive`` takes the node for this process; see FlashFile. ``board`` makes the hardware from the flash file,
     None: a node that does not measure. With a ``pulse`` it runs in real time: samples, leases, dead-men, data frames.
-    ``has_can`` is False for a board that no bus reaches.
+    ``has_can`` is False for a board that no bus reaches. ``located`` is called with the seconds for which it blinks.
     """
 
     def __init__(
@@ -148,15 +149,18 @@ class VirtualNode:
         board: Callable[[FlashFile], Board | None] = lambda file: None,
         pulse: RealtimeLoop | None = None,
         has_can: bool = True,
+        located: Callable[[int], None] = lambda seconds: None,
     ) -> None:
         self._delays = delays or Delays()
         self.flash_file = FlashFile(folder, delay=self._delays.flash, exclusive=exclusive)
         self.board = board(self.flash_file)
         self._core, self._realtime_loop = _Core(), pulse
+        report = self.flash_file.firmware
         self._wire = threading.Lock()
         self._sampled = 0
         self._told_missed, self._tell_at = 0, 0.0
         self._buses: dict[str, SendData] = {}
+        self._press_announcers: list[Callable[[], None]] = []
         self._one_time_at = time.monotonic() + self._delays.crypto
         self.tim = Tim(
             _SlowKey(self.flash_file.key, self._work),
@@ -168,6 +172,7 @@ class VirtualNode:
             hardware=self.board,
             quick_points=self._delays.crypto <= _QUICK,
             has_can=has_can,
+            firmware=ReportedFirmware(report, located) if report is not None else None,
         )
         if self.board is not None:
             self.board.clock.due, self.board.clock.guard = self._simulated, self._core.interrupt
@@ -266,6 +271,15 @@ class VirtualNode:
         """Hold the button 5 s."""
         with self._core.command():
             self.tim.reset_by_hand()
+
+    def announces_presses_over(self, announce: Callable[[], None]) -> None:
+        """Have a bus announce that the button was pressed."""
+        self._press_announcers.append(announce)
+
+    def press_button(self) -> None:
+        """Press the button and release it within 2 s: the board shows which one it is."""
+        for announce in self._press_announcers:
+            announce()
 
     def streams_over(self, send: SendData, bus: str = BUS) -> None:
         """Give the data frames of a bus to its server."""

@@ -29,7 +29,9 @@ QUIET: Final = 600.0
 """After so many seconds without a conflict moves are immediate again."""
 A_MINUTE: Final = 60.0
 MOST_A_MINUTE: Final = 20
-_LAYOUT: Final = struct.Struct(">BBI2s")
+PRESSES_APART: Final = 1.0
+"""Seconds between two Announces of a pressed button; more presses are left out, as those beyond 20 a minute."""
+_LAYOUT: Final = struct.Struct(">BBIBB")
 _VERSION: Final = 1
 
 
@@ -45,11 +47,15 @@ def default_can_address(uuid: bytes) -> int:
 
 @dataclass(frozen=True)
 class Announce:
-    """An Announce: ``address`` 1 to 239, ``crc`` = CRC-32 of the UUID. A hint, proves nothing."""
+    """An Announce: ``address`` 1 to 239, ``crc`` = CRC-32 of the UUID. A hint, proves nothing.
+
+    ``pressed``: sent because the node's button was pressed, which shows a person the board and moves no address.
+    """
 
     address: int
     state: int
     crc: int
+    pressed: bool = False
 
     @property
     def identifier(self) -> int:
@@ -57,8 +63,8 @@ class Announce:
         return ANNOUNCE | self.address
 
     def encode(self) -> bytes:
-        """Return the 8 octets: 1 ‖ state ‖ CRC ‖ 00 00."""
-        return _LAYOUT.pack(_VERSION, self.state, self.crc, b"\0\0")
+        """Return the 8 octets: 1 ‖ state ‖ CRC ‖ pressed ‖ 00."""
+        return _LAYOUT.pack(_VERSION, self.state, self.crc, self.pressed, 0)
 
     @classmethod
     def decode(cls, identifier: int, data: bytes) -> Announce | None:
@@ -66,13 +72,31 @@ class Announce:
         address = identifier & 0xFF
         if identifier & 0x1FFFFF00 != ANNOUNCE or not 1 <= address <= LAST_ADDRESS or len(data) != _LAYOUT.size:
             return None
-        version, state, crc, _ = _LAYOUT.unpack(data)
-        return cls(address, state, crc) if version == _VERSION and state <= NodeState.PROVISIONED else None
+        version, state, crc, pressed, _ = _LAYOUT.unpack(data)
+        if version != _VERSION or state > NodeState.PROVISIONED:
+            return None
+        return cls(address, state, crc, pressed == 1)  # any other value counts as 0
 
 
 def is_announce(identifier: int) -> bool:
     """Return True if a frame's identifier is that of an Announce."""
     return identifier & 0x1FFFFF00 == ANNOUNCE
+
+
+@dataclass
+class ButtonPresses:
+    """How often a node may announce that its button was pressed: once a second, 20 a minute; monotonic seconds."""
+
+    _sent: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_A_MINUTE))
+
+    def may_announce(self, now: float) -> bool:
+        """Return True, and count it, if the press at ``now`` is announced."""
+        if self._sent and now - self._sent[-1] < PRESSES_APART:
+            return False
+        if len(self._sent) == MOST_A_MINUTE and now - self._sent[0] < A_MINUTE:
+            return False
+        self._sent.append(now)
+        return True
 
 
 @dataclass
@@ -106,10 +130,11 @@ class AddressClaim:
         """Handle a received Announce; return the address that the node has from now on, ``own`` if it stays.
 
         ``pinned``: an actuator of the node is claimed, so it stays and goes on announcing. An Announce proves nothing,
-        and a move ends the sessions: after a few, the next waits until :meth:`move_due`.
+        and a move ends the sessions: after a few, the next waits until :meth:`move_due`. One of a pressed button claims
+        nothing.
         """
         self._heard.add(announce.address)
-        if announce.address != own:
+        if announce.address != own or announce.pressed:
             return own
         if announce.crc == self.crc:
             self.conflict = True

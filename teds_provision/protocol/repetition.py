@@ -1,7 +1,7 @@
 """Repetition on a link: an octet-equal request gets its stored reply, nothing is run twice (profile.md, "Repetition").
 
 The node keeps, for each link, the last request and its reply for 20 s from the reply's end. Commands that change
-nothing (Identify, Prove, List, Query, Read, outside Sealed) always run again.
+nothing (Identify, Prove, About, List, Query, Read, outside Sealed) always run again.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ REPLY_SECONDS, REPEAT_SECONDS, TRIES = 5.0, 15.0, 3
 """A station waits 5 s for a reply, and repeats its request at most twice, within 15 s."""
 KEEP_SECONDS = 20.0
 """Longer than the 15 s in which a station repeats, so that no repetition finds its reply gone and is run again."""
-_IDEMPOTENT = {(128, 7), (128, 8), (128, 11), (1, 1), (1, 2)}
-"""Identify, Prove, List, Query, Read change nothing: they always run again, and answer the present state."""
+_IDEMPOTENT = {(128, 7), (128, 8), (128, 11), (128, 21), (1, 1), (1, 2)}
+"""Identify, Prove, List, About, Query, Read change nothing: they always run again, and answer the present state."""
 
 
 class Repetition:

@@ -25,8 +25,8 @@ def can_words(identifier: int, data: bytes) -> str:
         return f"{driven.station:02x} to {driven.node:02x}: Drive, part {data[0] if data else 0}"
     if (stream := data_address(identifier)) is not None:
         return f"{stream.node:02x} to {stream.station:02x}: data of stream {stream.stream}, part {stream.segment}"
-    if Announce.decode(identifier, data) is not None:
-        return f"{source:02x}: Announce"
+    if (announce := Announce.decode(identifier, data)) is not None:
+        return f"{source:02x}: Announce" + (", button pressed" if announce.pressed else "")
     if identifier & 0x1FFFFF00 == TRIGGER:
         return f"{source:02x} to all: trigger {data.hex()}"
     return "not of the profile"

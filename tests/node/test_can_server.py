@@ -448,3 +448,15 @@ def test_a_repetition_that_meets_the_reply_costs_neither(station: Stranger, serv
         if (message := pair.received()) is not None:
             messages.append(message)
     assert messages == [b"\x05" + bytes(30)]
+
+
+def test_a_pressed_button_is_announced_at_once_and_claims_nothing(
+    station: Stranger, server: CanServer, node: EchoNode, hub: Hub
+) -> None:
+    assert wait_for(lambda: len(announces(hub)) == 1)
+    for _ in range(3):
+        server.announce_press(node)
+    station.bus.send(Frame(0x1CFF0021, Announce(0x21, 0, zlib.crc32(node.uuid) - 1, pressed=True).encode()))
+    assert len(station.ask(0x21, b"\x0c" + COUNT)) == 1, "it is where it was, and has answered after all of these"
+    pressed = [announce for announce in announces(hub) if announce.crc == zlib.crc32(node.uuid)]
+    assert [announce.pressed for announce in pressed] == [False, True], "one a second"

@@ -21,9 +21,9 @@ def test_an_announce_has_the_octets_of_the_page() -> None:
     assert announce.encode().hex() == "0102cbf439260000"  # the check value of CRC-32 of IEEE 802.3
 
 
-@given(st.integers(1, 239), st.integers(0, 2), st.integers(0, 2**32 - 1))
-def test_what_is_encoded_is_decoded(address: int, state: int, crc: int) -> None:
-    announce = Announce(address, state, crc)
+@given(st.integers(1, 239), st.integers(0, 2), st.integers(0, 2**32 - 1), st.booleans())
+def test_what_is_encoded_is_decoded(address: int, state: int, crc: int, pressed: bool) -> None:
+    announce = Announce(address, state, crc, pressed)
     assert Announce.decode(announce.identifier, announce.encode()) == announce
 
 
@@ -89,6 +89,13 @@ def test_an_address_from_which_an_announce_came_is_taken() -> None:
     claim = AddressClaim(6, uniform=soon)
     claim.handle_announce(Announce(34, 0, 5), 33, 1.0)
     assert claim.handle_announce(Announce(33, 0, 5), 33, 1.0) == 35
+
+
+def test_a_pressed_button_claims_no_address() -> None:
+    claim = AddressClaim(6, uniform=soon)
+    for crc in (5, 6, 7):
+        assert claim.handle_announce(Announce(33, 0, crc, pressed=True), 33, 1.0) == 33
+    assert (claim.due(1.0), claim.conflict) == (None, False)
 
 
 def test_at_most_twenty_announces_a_minute() -> None:

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.isotp import Pair
 from teds_provision.node.handler import JobQueue, MeasuringHandler, NodeHandler, WorkerPool
-from teds_provision.protocol.announce import AddressClaim, Announce, uuid_crc
+from teds_provision.protocol.announce import AddressClaim, Announce, ButtonPresses, uuid_crc
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import Repetition
 
@@ -103,15 +103,24 @@ class CanEndpoint:
         identity = Identity.decode(handler.identify())
         self.uuid, self.max_message = identity.uuid, identity.max_message
         self.claim = AddressClaim(uuid_crc(identity.uuid))
+        self._presses = ButtonPresses()
         self.lines: dict[int, StationState] = {}
         self.spoken_from: set[int] = set()
 
     def announce(self) -> None:
         """Announce the present address."""
-        state = Identity.decode(self.handler.identify()).state
-        announce = Announce(self.address, state, self.claim.crc)
-        self._send(self, Frame(announce.identifier, announce.encode()))
+        self._send_announce(pressed=False)
         self.claim.announced(time.monotonic())
+
+    def announce_press(self) -> None:
+        """Announce that the button was pressed, unless that was done a moment ago."""
+        if self._presses.may_announce(time.monotonic()):
+            self._send_announce(pressed=True)
+
+    def _send_announce(self, *, pressed: bool) -> None:
+        state = Identity.decode(self.handler.identify()).state
+        announce = Announce(self.address, state, self.claim.crc, pressed)
+        self._send(self, Frame(announce.identifier, announce.encode()))
 
     def pair(self, station: int, own: int) -> tuple[StationState, Pair]:
         """Return the pair of ``own`` and ``station``, made if there is none yet."""

@@ -250,6 +250,12 @@ class CanServer:
         with self._sending:
             bus.send(Frame(identifier, data, fd))
 
+    def announce_press(self, handler: NodeHandler) -> None:
+        """Announce at once that a node's button was pressed."""
+        with self._lock:
+            if (seat := self._seat_of.get(id(handler))) is not None:
+                self._at_time(time.monotonic(), seat.announce_press)
+
     # -- the loop --------------------------------------------------------------------------------------------------
 
     def _serve(self, woken: socket.socket) -> None:

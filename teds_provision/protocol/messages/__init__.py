@@ -5,6 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.protocol.messages import arguments, ble, frames, identity, message, tables
+    from teds_provision.protocol.messages import arguments, ble, firmware, frames, identity, message, tables
 else:
     __getattr__ = lazy(__name__)

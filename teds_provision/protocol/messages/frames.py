@@ -16,7 +16,7 @@ COMMON, OPERATE, EITHER, SECURITY = 1, 3, 4, 128
 
 
 class Function(IntEnum):
-    """Functions of class 128 (profile.md, "Command frames"; 12 to 20: operation.md)."""
+    """Functions of class 128 (profile.md, "Command frames"; 12 to 20: operation.md; 21 to 23: the firmware)."""
 
     REQUEST = 1
     CONFIRM = 2
@@ -37,6 +37,9 @@ class Function(IntEnum):
     POWER = 18
     OPERATION = 19
     DRIVE = 20
+    ABOUT = 21
+    LOCATE = 22
+    MANAGE = 23
 
 
 class TedsFunction(IntEnum):

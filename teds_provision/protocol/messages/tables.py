@@ -141,6 +141,11 @@ _PROFILE: Final[dict[int, Spec]] = {
     Function.POWER: Spec("Power", "", "power_flags:u8 level:u8 millivolts:u16 milliamperes:o2 celsius:o1"),
     Function.OPERATION: Spec("Operation", "", "mode:u8 channel_states:octets"),
     Function.DRIVE: Spec("Drive", "channels:octets", "run:u16 message_octets:u16"),
+    Function.ABOUT: Spec(
+        "About", "", "form:u8 firmware_flags:u8 major:u8 minor:u8 patch:u16 build:u32 image:o32 firmware:octets"
+    ),
+    Function.LOCATE: Spec("Locate", "seconds:u8", ""),
+    Function.MANAGE: Spec("Manage", "packet:octets", "packet:octets"),
 }
 
 COMMANDS: Final[dict[tuple[int, int], Spec]] = {

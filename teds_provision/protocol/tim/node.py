@@ -18,6 +18,7 @@ from teds_provision.protocol.keys import (
     reset_message,
     verify,
 )
+from teds_provision.protocol.messages.firmware import LOCATE_SECONDS, Firmware, FirmwareFlag, FirmwareReport
 from teds_provision.protocol.messages.frames import (
     COMMAND_HEADER,
     SECURITY,
@@ -52,6 +53,7 @@ class Tim:
     from the first moment after a start; ``one_time`` makes the key pair of one Open or one Request (a board may have
     one ready), ``verify`` checks a signature.
     ``sessions`` and ``streams`` are its room for them; ``hardware`` is what it measures and acts with, None: nothing.
+    ``firmware`` reports what runs on it and makes it blink, None: it reports nothing, as nodes before 128.21.
     ``quick_points``: its point arithmetic holds no Sealed frame up by more than 5 ms. Without CAN (``has_can``) it
     reports the address 0 and does not know 128.10.
     """
@@ -69,6 +71,7 @@ class Tim:
     streams: int = 8
     quick_points: bool = True
     has_can: bool = True
+    firmware: Firmware | None = None
 
     def __post_init__(self) -> None:
         self._flash = self.memory.load()
@@ -103,6 +106,7 @@ class Tim:
             self._role,
             self.quick_points,
             self.has_can,
+            self.firmware is not None,
         )
         self._security: dict[int, Callable[[bytes, Origin], bytes]] = {
             Function.REQUEST: self._request,
@@ -115,6 +119,8 @@ class Tim:
             Function.RESET: self._reset,
             Function.SET_CAN_ADDRESS: self._set_can_address,
             Function.LIST: self._list,
+            Function.ABOUT: self._about,
+            Function.LOCATE: self._locate,
         }
 
     # -- what links call -------------------------------------------------------------------------------------------
@@ -302,6 +308,26 @@ class Tim:
         _length(payload, 0)
         entries = [channel.to_bytes(2, "big") + bytes([code]) for channel, code in self._flash.present()]
         return b"".join(entries)
+
+    def _reported_firmware(self) -> FirmwareReport:
+        report = self.firmware.about() if self.firmware is not None else None
+        if report is None:
+            raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
+        return report
+
+    def _about(self, payload: bytes, origin: Origin) -> bytes:
+        report = self._reported_firmware()
+        _length(payload, 0)
+        return report.encode()
+
+    def _locate(self, payload: bytes, origin: Origin) -> bytes:
+        if self.firmware is None or FirmwareFlag.LOCATE not in self._reported_firmware().flags:
+            raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
+        _length(payload, 1)
+        if payload[0] > LOCATE_SECONDS:
+            raise CommandRefusedError(Reason.BAD_FORM)
+        self.firmware.locate(payload[0])
+        return b""
 
     # -- sessions --------------------------------------------------------------------------------------------------
 

@@ -41,6 +41,10 @@ _FUNCTIONS: Final = frozenset(Function)
 _TEDS_FUNCTIONS: Final = frozenset(TedsFunction)
 _TAPPED: Final = frozenset({Function.REQUEST, Function.CONFIRM, Function.SET_CAN_ADDRESS})
 _MEASURING: Final = frozenset(range(Function.SAMPLE, Function.DRIVE + 1))
+_FIRMWARE: Final = frozenset({Function.ABOUT, Function.LOCATE, Function.MANAGE})
+_SESSION_ALONE: Final = frozenset({Function.CLOSE, Function.MANAGE})
+_IN_FACTORY: Final = frozenset({Function.RESET, Function.LOCATE})
+"""Plain commands that only a node without a key runs."""
 _PLAIN_ALONE: Final = frozenset({Function.OPEN, Function.SEALED})
 _CHANGES: Final = frozenset(
     {(COMMON, TedsFunction.WRITE), (COMMON, TedsFunction.UPDATE), (SECURITY, Function.SET_CAN_ADDRESS)}
@@ -53,7 +57,8 @@ _STRANGER_SECONDS: Final = 1.0
 class Permission:
     """Refuses what the table forbids. ``in_factory`` and ``open_on`` (a link) return the node's state.
 
-    ``quick_points``: the node's point arithmetic delays no Sealed frame by more than 5 ms.
+    ``quick_points``: the node's point arithmetic delays no Sealed frame by more than 5 ms. Without ``has_firmware`` it
+    is a node from before 128.21 to 128.23.
     """
 
     in_factory: Callable[[], bool]
@@ -62,14 +67,17 @@ class Permission:
     role: OperationRole | None
     quick_points: bool
     has_can: bool = True
+    has_firmware: bool = True
     _stranger_at: float | None = None
 
     def check(self, command: Command, origin: Origin) -> None:
         """Raise CommandRefusedError if the command may not be run now, or is not known."""
         if command.command_class == SECURITY:
             # class 128 goes to channel 0; an unknown function gets 1 in every state
-            unknown = command.function not in _FUNCTIONS or (
-                command.function == Function.SET_CAN_ADDRESS and not self.has_can
+            unknown = (
+                command.function not in _FUNCTIONS
+                or (command.function == Function.SET_CAN_ADDRESS and not self.has_can)
+                or (command.function in _FIRMWARE and not self.has_firmware)
             )
             if command.channel != 0 or unknown:
                 raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
@@ -106,10 +114,12 @@ class Permission:
     def _permitted_plain(self, function: Function, origin: Origin) -> None:
         if function in _TAPPED and not origin.tapped:
             raise CommandRefusedError(Reason.NOT_PERMITTED)
-        if function == Function.CLOSE or function in _MEASURING:
+        if function in _SESSION_ALONE or function in _MEASURING:
             raise CommandRefusedError(Reason.NOT_PERMITTED)
-        if function == Function.RESET and not self.in_factory():
+        if function in _IN_FACTORY and not self.in_factory():
             raise CommandRefusedError(Reason.NOT_PERMITTED)
+        if function == Function.ABOUT and origin.port.kind != "can" and not self.in_factory():
+            raise CommandRefusedError(Reason.NOT_PERMITTED)  # no stranger in radio range learns what runs on a robot
 
     def _measures(self, command: Command) -> bool:
         return self.role is not None and self.role.knows(command)
