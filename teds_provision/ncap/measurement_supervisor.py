@@ -19,6 +19,7 @@ from teds_provision.errors import (
     NodeBusyError,
     NotFoundError,
     PolicyError,
+    StoreError,
     TedsProvisionError,
     UsageError,
 )
@@ -49,6 +50,9 @@ from teds_provision.teds.sheet import Sheet
 
 _ADOPTED: Final = "adopted"
 NCAP: Final = "ncap"
+_RUN: Final = "run"
+_OF_THIS_PROCESS: Final = frozenset({_RUN, _ADOPTED, UnsignedNodes.text})
+"""IDs of measurements that options of ``ncap run`` began: they end with it."""
 LETTING_GO: Final = 4.0  # seconds for a node's session to end in order; the caller waits 5
 ANSWERING: Final = 1.0  # seconds for a node that has another address now
 LONGEST_LOAN: Final = 900.0  # seconds after which a node is measured again, whatever its writer does
@@ -71,6 +75,13 @@ class RunningMeasurement:
     stop: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
     asked: KeptMeasurement | None = None  # as it was asked for; ``kept`` has the nodes of a frozen expression
+    logged: set[str] = field(default_factory=set)  # nodes whose first value is in the audit log
+
+    def log_facts(self) -> dict[str, Any]:
+        """Return its members of an audit entry: what is measured, and who requested it."""
+        kept = self.asked or self.kept
+        meant = {"group": kept.group, "match": kept.match, "rate": kept.rate, "owner": kept.owner}
+        return {"id": kept.id, **{name: value for name, value in meant.items() if value is not None}}
 
 
 @dataclass(eq=False)
@@ -117,7 +128,7 @@ class MeasurementSupervisor:
     def start(self) -> None:
         """Carry on what is kept."""
         for kept in self._station.measurements.due():
-            self._begin(kept)
+            self._log(self._begin(kept), "continued")
 
     def match(self, expression: str, *, rate: float | None = None, frozen: bool = False) -> None:
         """Measure selected nodes as they come, for the life of this process (``ncap run --measure``).
@@ -131,7 +142,8 @@ class MeasurementSupervisor:
             for measurement in self._station.measurements.due()
         ):
             return  # it is kept already
-        self._begin(KeptMeasurement("run", match=expression, rate=rate, frozen=frozen, dead_man=self._dead_man))
+        kept = KeptMeasurement(_RUN, match=expression, rate=rate, frozen=frozen, dead_man=self._dead_man)
+        self._log(self._begin(kept), "begun")
 
     def unverified(self, *, rate: float | None = None) -> None:
         """Measure every self-describing node by its unsigned datasheet, marked so (``--adopt --unverified``).
@@ -140,7 +152,7 @@ class MeasurementSupervisor:
         """
         self._unverified = UnsignedNodes()
         for name in (self._unverified.text, _ADOPTED):
-            self._begin(KeptMeasurement(name, match=name, rate=rate, dead_man=self._dead_man))
+            self._log(self._begin(KeptMeasurement(name, match=name, rate=rate, dead_man=self._dead_man)), "begun")
 
     @contextmanager
     def unmeasured(self, uuid: str, why: str) -> Iterator[None]:
@@ -191,6 +203,7 @@ class MeasurementSupervisor:
             running.stop.set()
         for running in every:
             self._end(running)
+            self._log(running, "ended" if running.kept.id in _OF_THIS_PROCESS else "paused")
 
     # -- what the API asks -------------------------------------------------------------------------------------------
 
@@ -257,9 +270,8 @@ class MeasurementSupervisor:
                 self._require_plan(uuid, kept)  # it may have been removed meanwhile
             with self._station.durable("measure"):
                 kept = self._station.measurements.keep(kept)
-                self._station.audit(
-                    "measure", None, "begun", id=kept.id, group=group or match, nodes=[node.hex() for node in nodes]
-                )
+                facts = RunningMeasurement(kept, ()).log_facts()
+                self._station.audit("measure", None, "begun", **facts, nodes=[node.hex() for node in nodes])
             return self._json(self._begin(kept))
 
     def _require_unmeasured(self, uuid: bytes) -> None:
@@ -304,7 +316,8 @@ class MeasurementSupervisor:
         with self._station.durable("measure"):
             if not self._station.measurements.forget(measurement_id) and one is None:
                 raise NotFoundError(f"No measurement has the ID {measurement_id!r}.")
-            self._station.audit("measure", None, "ended", id=measurement_id)
+            facts = {"id": measurement_id} if one is None else one.log_facts() | _counts(one)
+            self._station.audit("measure", None, "ended", **facts)
         self._live.event("measurement", state="deleted", id=measurement_id)
 
     def all(self) -> list[dict[str, Any]]:
@@ -478,6 +491,13 @@ class MeasurementSupervisor:
             ],
         }
 
+    def _log(self, running: RunningMeasurement, outcome: str, uuid: str | None = None) -> None:
+        """Add an entry to the audit log; a store that cannot be written ends no measurement."""
+        node = None if uuid is None else bytes.fromhex(uuid)
+        counts = _counts(running) if uuid is None else {}
+        with suppress(StoreError):
+            self._station.audit("measure", node, outcome, **running.log_facts(), **counts)
+
     # -- running -----------------------------------------------------------------------------------------------------
 
     def _begin(self, kept: KeptMeasurement) -> RunningMeasurement:
@@ -496,6 +516,11 @@ class MeasurementSupervisor:
         while self._run_with_members(running):
             if not self._take_new_members(running):
                 return
+        if running.state == "ended" and not running.stop.is_set():  # its time is over, and its row is gone
+            self._log(running, "ended")
+            with self._guard:
+                self._running.pop(running.kept.id, None)
+            self._live.event("measurement", state="deleted", id=running.kept.id)
 
     def _take_new_members(self, running: RunningMeasurement) -> bool:
         """Read again which nodes a measurement has; False if it is not kept any more, because none is left."""
@@ -756,6 +781,9 @@ class MeasurementSupervisor:
             state = "waiting"
         else:
             return
+        if state == "joined" and said.uuid not in running.logged:  # not each time that it comes back
+            running.logged.add(said.uuid)
+            self._log(running, "joined", said.uuid)
         ended = state == "left" and running.stop.is_set()
         why = said.why or ("the measurement ended" if ended else "")
         self._live.event("measurement", state=state, id=running.kept.id, uuid=said.uuid, why=why)
@@ -776,10 +804,23 @@ def _state_of(running: RunningMeasurement, job: MeasurementJob) -> tuple[str, st
     states = {report["state"] for report in running.reports.values()}
     if "running" in states:
         lacking = [uuid for uuid in running.uuids if running.reports.get(uuid, {}).get("state") != "running"]
-        return "running", f"{len(lacking)} of {len(running.uuids)} nodes are missing" if lacking else ""
+        return "running", _of_all(len(lacking), running, "missing") if lacking else ""
     if job.error is not None:
         return "waiting", job.error.message
     refused = sum(report["state"] == "refused" for report in running.reports.values())
     if refused:
-        return "waiting", f"{refused} of {len(running.uuids)} nodes are refused"
+        return "waiting", _of_all(refused, running, "refused")
     return ("waiting", "no node has answered yet") if states else ("starting", "")
+
+
+def _of_all(some: int, running: RunningMeasurement, what: str) -> str:
+    """Return ``1 of 3 nodes is missing``."""
+    every = len(running.uuids)
+    return f"{some} of {every} node{'s' if every > 1 else ''} {'is' if some == 1 else 'are'} {what}"
+
+
+def _counts(running: RunningMeasurement) -> dict[str, int]:
+    """Return samples and lost ones of all its nodes, for the audit log; nothing if it never had a node."""
+    reports = list(running.reports.values())
+    found = {name: sum(int(report.get(name) or 0) for report in reports) for name in ("samples", "lost")}
+    return found if reports else {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -131,3 +132,47 @@ def test_ncap_waits_for_the_group_that_a_command_measures_and_gets_it_afterwards
     killed(command)
     until(lambda: [entry["state"] for entry in listed(service)] == ["running"], "its own measurement begins")
     assert [row.owner for row in rows(hall)] == ["ncap"]
+
+
+def test_the_log_has_what_is_measured_and_who_requested_it(hall: Hall) -> None:
+    service = ncap(hall)
+    uuid, token = hall.nodes["g"].uuid, service.token("plotter")
+    with service.client(token) as asked:
+        made = asked.request("POST", "/measurements", {"uuids": [uuid], "rate": 20})["id"]
+
+    def entries(asked: Any, node: str = "") -> list[dict[str, Any]]:
+        found = asked.request("GET", f"/log?act=measure&limit=50{f'&uuid={node}' if node else ''}")["entries"]
+        return [entry for entry in found if entry["facts"].get("id") == made]
+
+    with service.client() as asked:
+        until(lambda: entries(asked, uuid), "its first value is in the history of the node")
+        [joined] = entries(asked, uuid)
+    assert (joined["outcome"], joined["facts"]["owner"]) == ("joined", "api:plotter")
+    service.end()
+    service = ncap(hall)
+    with service.client() as asked:
+        until(lambda: len(entries(asked, uuid)) == 2, "and that of the next run")
+        until(lambda: asked.measurements()[0]["nodes"][0]["samples"])
+        asked.request("DELETE", f"/measurements/{made}")
+        told = [(entry["outcome"], entry["actor"]) for entry in entries(asked) if entry["uuid"] is None]
+        last = entries(asked)[-1]
+    assert [outcome for outcome, _ in told] == ["begun", "paused", "continued", "ended"]
+    assert told[0][1] == "plotter"
+    assert told[-1][1] != "plotter", "whoever ended it is another one"
+    assert {entry["facts"]["owner"] for entry in [last]} == {"api:plotter"}
+    assert last["facts"]["samples"] > 0
+    assert last["facts"]["rate"] == 20
+
+
+def test_a_measurement_whose_time_is_over_holds_its_nodes_no_longer(hall: Hall) -> None:
+    """It was listed as ended, and its nodes as measured, until somebody deleted it."""
+    with closing(Store.open(hall.station.home)) as store:
+        store.put_measurement(KeptMeasurement("brief", "arm", rate=20.0, ends=time.time() + 6))
+    service = ncap(hall)
+    [shown] = listed(service)
+    assert (shown["id"], shown["group"]) == ("brief", "arm")
+    until(lambda: not listed(service), "its time is over")
+    with service.client() as asked:
+        again = asked.request("POST", "/measurements", {"group": "arm", "rate": 20})
+        until(lambda: [entry["state"] for entry in listed(service)] == ["running"], "the group is free")
+        asked.request("DELETE", f"/measurements/{again['id']}")

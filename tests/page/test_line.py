@@ -85,7 +85,7 @@ def test_a_job_shows_its_yield_its_seconds_and_its_failures(browser: Browser, li
         assert "No attempts yet." in panel.get_by_role("region", name=f"{EAST}, three angles").inner_text()
         assert panel.get_by_text("<b>later</b>").count() == 1
         assert own.locator(".share").first.evaluate("one => one.clientHeight") == 10
-        assert page.get_by_text("No links.").is_hidden()
+        assert page.get_by_text("No link is configured").is_hidden()
         page.screenshot(path=tmp_path / "line.png", full_page=True)
         page.set_viewport_size({"width": 360, "height": 800})
         assert page.evaluate("document.documentElement.scrollWidth <= 360")

@@ -91,7 +91,7 @@ def test_published_names_are_in_order_and_links_that_are_there_are_not_missed(br
         # names come with the nodes, which may come after the rows
         until(lambda: (nodes := shown()) and nodes == expected[: len(nodes)], lambda: f"2 comes before 10: {shown()}")
         page.get_by_label("Links").get_by_text("CAN", exact=True).wait_for()
-        assert page.get_by_text("No links.").is_hidden()
+        assert page.get_by_text("No link is configured").is_hidden()
 
 
 def test_an_act_on_many_nodes_names_who_was_refused_and_does_the_rest(browser: Browser, crowd: Lab) -> None:
@@ -115,3 +115,23 @@ def test_an_act_on_many_nodes_names_who_was_refused_and_does_the_rest(browser: B
         assert sorted(crowd.measurements()[0]["uuids"]) == sorted(crowd.nodes[name].uuid for name in ("hand", "slew"))
         page.get_by_label("Search nodes").fill("joint")
         page.get_by_text("2 nodes selected, 2 of them not listed").wait_for()
+
+
+@pytest.mark.parametrize("width", [360, 1600])
+def test_a_group_of_a_hundred_nodes_has_a_card_of_a_windows_size_in_order(
+    browser: Browser, crowd: Lab, width: int
+) -> None:
+    with crowd.visited(), opened(browser, crowd, width=width, route="measure") as page:
+        with client.connect(home=crowd.station.home) as station:
+            uuids = [f"{0xBEEF:04x}{number:016x}" for number in (10, 2, *range(20, 120))]
+            station.request("POST", "/groups", {"name": "joints", "uuids": uuids})
+        card = page.locator("li.group", has=page.get_by_role("heading", name="joints"))
+        members = card.locator(".member-list a")
+        until(lambda: members.all_inner_texts()[:3] == ["joint 2", "joint 10", "joint 20"], "2 comes before 10")
+        assert members.count() == 102
+        box = card.bounding_box()
+        assert box is not None
+        assert box["height"] < 900, "the next group is in sight"
+        members.last.focus()  # by keyboard, too
+        assert members.last.is_visible()
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")

@@ -17,10 +17,16 @@ export function number(value, uncertainty = null, turn = null) {
   return sign(turn && Number(text) >= Number((turn.low + turn.size).toFixed(digits)) ? turn.low.toFixed(digits) : text);
 }
 
+/** A value of a channel in its unit: what the rounding of a conversion leaves of 0 is 0. */
+export function reading(value, channel, uncertainty = channel.uncertainty) {
+  const size = Math.max(...[channel.low, channel.high, channel.scale?.offset].map((end) => Math.abs(end) || 0));
+  return number(Math.abs(value) < 1e-9 * size ? 0 : value, uncertainty, channel.turn);
+}
+
 /** The last value of a channel in words where there is no number: never measured, raw values alone, not valid. */
 export function figure(last, channel) {
   if (!last) return "no value yet";
-  if (typeof last.value === "number") return number(last.value, channel.uncertainty, channel.turn);
+  if (typeof last.value === "number") return reading(last.value, channel);
   return channel.problem ? "raw value only" : "not valid";
 }
 
@@ -82,6 +88,12 @@ export function nameOf(node) {
 
 const { compare } = new Intl.Collator(undefined, { numeric: true, sensitivity: "base" });
 
+/** Names of nodes in their order, the first of them if there are many: "arm, hand and 98 more". */
+export function namesOf(nodes, most = 8) {
+  const names = [...nodes].sort(byName).map(nameOf);
+  return names.length > most + 1 ? `${names.slice(0, most).join(", ")} and ${names.length - most} more` : names.join(", ");
+}
+
 /** Order of nodes as people look for them: by name, "finger 2" before "finger 10"; namesakes by UUID. */
 export const byName = (one, other) => compare(nameOf(one), nameOf(other)) || compare(one.uuid, other.uuid);
 
@@ -108,8 +120,21 @@ const VERDICTS = {
   "not authentic": ["bad", "bad", "Not authentic", "A security check failed. Do not trust its values."],
 };
 
-/** Tone, sign, word and meaning of the verdict on a node or a datasheet. */
+/** "at 14:03:07" if that was today, else "on 2026-11-25"; empty for no time. */
+function dated(time) {
+  if (typeof time !== "number") return "";
+  const words = clock(time);
+  return words.length > 8 ? ` on ${words.slice(0, 10)}` : ` at ${words}`;
+}
+
+/** Tone, sign, word and meaning of the verdict on a node or a datasheet; that on an absent node is grey, with its time. */
 export function verdict(of) {
+  const [tone, sign, words, why] = judged(of);
+  if (of.present !== false || tone === "plain") return [tone, sign, words, why];
+  return ["plain", sign, `${words}${dated(of.read?.at)}`, `${why} The node is not connected now.`];
+}
+
+function judged(of) {
   if (of.unverified) return ["warn", "warn", "Unverified", "Nobody signed this datasheet: name, channels and values come from the node itself."];
   const known = VERDICTS[of.verdict];
   if (known && of.from === "kept") return [...known.slice(0, 3), `${known[3]} Only the Security TEDS was read now; the rest is from the last reading.`];

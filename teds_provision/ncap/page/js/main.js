@@ -5,6 +5,7 @@ import { button, fill, h, icon, say, text, toast, trouble } from "./dom.js";
 import { count, nameOf } from "./format.js";
 import { Live } from "./live.js";
 import { changed, on, refresh, state, take } from "./state.js";
+import { isLinkless, noLink } from "./views/links.js";
 import { logView } from "./views/log.js";
 import { measureView } from "./views/measure.js";
 import { nodesView } from "./views/nodes.js";
@@ -117,7 +118,7 @@ async function find() {
     const { nodes } = await post("discover");
     await refresh("nodes", "status");
     const words = nodes?.length ? `${count(nodes.length, "node")} answered.` : "No node answered.";
-    toast("good", words, nodes?.length ? "" : "Is it powered and on the bus? A node with NFC is found when you place it on the reader.");
+    toast("good", words, nodes?.length ? "" : isLinkless() ? noLink().textContent : "Is it powered and on the bus? A node with NFC is found when you place it on the reader.");
   } catch (error) {
     toast("bad", error.message, error.hint);
   }

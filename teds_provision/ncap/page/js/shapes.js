@@ -93,6 +93,7 @@ export function status(wire) {
   const links = (wire.links ?? []).map((link) => ({
     name: link.virtual ? "virtual transducers" : (link.place ?? "").replace(/^(can|nfc|ble):/, ""),
     kind: link.virtual ? "virtual" : link.via,
+    virtual: Boolean(link.virtual),
     state: link.state,
     why: link.problem?.message ?? link.waiting ?? "",
     hint: link.problem?.hint ?? "",

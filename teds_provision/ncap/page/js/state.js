@@ -93,10 +93,21 @@ export function ringOf(uuid, channel) {
   return ring;
 }
 
-/** The measurement that takes this node in, if any. */
+/** The measurement that has this node, if any: it runs, waits or has failed. */
 export function measuring(uuid) {
-  return state.measurements.find((one) => membersOf(one).includes(uuid)) ?? null;
+  return state.measurements.find((one) => one.state !== "ended" && membersOf(one).includes(uuid)) ?? null;
 }
+
+/** Why the measurement that has this node keeps others from changing it; empty if nothing does. */
+export function frozenBy(uuid) {
+  const one = measuring(uuid);
+  if (!one || one.state === "failed") return "";
+  const where = one.group ? ` in group ${one.group}` : "";
+  return `This node is being measured${where}${isOfCommand(one) ? ` by the command measure (process ${one.process?.id})` : ""}. Stop the measurement first.`;
+}
+
+/** True if a command of this station runs the measurement: only that command can end it. */
+export const isOfCommand = (measurement) => measurement.owner === "command";
 
 /** UUIDs of a measurement. */
 export function membersOf(measurement) {
@@ -104,17 +115,25 @@ export function membersOf(measurement) {
   return state.groups.find((group) => group.name === measurement.group)?.uuids ?? [];
 }
 
+let listed = 0; // requests for measurements, as a list or with the status; an earlier one's answer replaces no later one's
+let newest = 0; // the latest of them that was answered
+
+function takeMeasurements(measurements, request) {
+  if (request < newest) return;
+  newest = request;
+  state.measurements = measurements ?? [];
+  changed("measurements");
+}
+
 let asked = 0; // requests for nodes, all of them or one; an answer to an earlier one replaces none to a later
 const single = new Map(); // UUID → the last request for that node alone which was answered
 
 const LISTS = {
   status: async () => {
+    const mine = ++listed;
     state.status = shapes.status(await get("status"));
     if (state.status.now !== null) state.offset = state.status.now - Date.now() / 1000;
-    if (state.status.measurements) {
-      state.measurements = state.status.measurements;
-      changed("measurements");
-    }
+    if (state.status.measurements) takeMeasurements(state.status.measurements, mine);
   },
   nodes: async () => {
     const mine = ++asked;
@@ -131,7 +150,10 @@ const LISTS = {
     state.loaded = true;
   },
   groups: async () => (state.groups = (await get("groups")).groups ?? []),
-  measurements: async () => (state.measurements = (await get("measurements")).measurements ?? []),
+  measurements: async () => {
+    const mine = ++listed;
+    takeMeasurements((await get("measurements")).measurements, mine);
+  },
   virtual: async () => (state.virtual = (await get("virtual")).virtual ?? []),
   profiles: async () => (state.profiles = (await get("profiles")).profiles ?? []),
   names: async () => (state.names = (await get("names")).names ?? []),

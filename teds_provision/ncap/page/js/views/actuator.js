@@ -2,7 +2,7 @@
 
 import { change, paths } from "../api.js";
 import { chip, field, fill, h, icon, say, text, trouble } from "../dom.js";
-import { channelName, clock, nameOf, number, range, short } from "../format.js";
+import { channelName, clock, nameOf, range, reading, short } from "../format.js";
 import { toShown, toSi } from "../shapes.js";
 import { now, on, state } from "../state.js";
 
@@ -177,7 +177,7 @@ export class ActuatorPanel {
     if (!may && this.holding) this.letGo();
     this.button.disabled = !may;
     text(this.limits, `Limits ${range(channel)}. It moves only while you hold the button (or Space). Release it, and the node returns to its safe state. This is not a safety function: keep an emergency stop within reach.`);
-    const figure = (value) => `${number(value)}${channel.unit ? ` ${channel.unit}` : ""}`;
+    const figure = (value) => `${reading(value, channel, null)}${channel.unit ? ` ${channel.unit}` : ""}`;
     let shown;
     if (this.holding) shown = chip("busy", "play", `Moving: ${figure(this.applied ?? Number(this.entry.value))}`);
     else if (this.stopping) shown = chip("warn", "clock", "Stopping …");

@@ -56,7 +56,7 @@ export class DatasheetTab {
     const api = paths.teds(this.uuid);
     fill(this.files, "Save as ", ["json", "xml", "hex"].map((form) => [h("a", { href: `api/v1/${api}?format=${form}`, download: `${this.uuid}.${form}` }, form.toUpperCase()), " "]));
     const teds = sheet.teds ?? [];
-    const [tone, sign, words, why] = verdict(sheet);
+    const [tone, sign, words, why] = verdict(sheet.read_now === false ? { ...sheet, present: false, read: state.nodes.get(this.uuid)?.read } : sheet);
     const found = teds.flatMap((one) => (one.findings ?? []).map((finding) => ({ ...finding, where: title(one) })));
     const findings = [...(sheet.guard ?? []).map((one) => ({ ...one, where: "Plausibility" })), ...found];
     fill(

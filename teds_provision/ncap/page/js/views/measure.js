@@ -2,9 +2,9 @@
 
 import { change, paths, post, remove } from "../api.js";
 import { button, chip, empty, field, fill, h, icon, keyed, say, text, toast, trouble } from "../dom.js";
-import { byName, channelName, count, nameOf, verdict } from "../format.js";
+import { byName, channelName, count, nameOf, namesOf, verdict } from "../format.js";
 import { LivePlot } from "../plot.js";
-import { measuring, membersOf, on, refresh, state } from "../state.js";
+import { isOfCommand, measuring, membersOf, on, refresh, state } from "../state.js";
 import { SetPoints } from "./setpoints.js";
 import { plotHead, requireRate, told } from "./values.js";
 
@@ -110,7 +110,8 @@ class GroupCard {
     this.drop.addEventListener("click", () => this.drop.busy(() => this.away()));
     this.more = h("details", { class: "more" }, h("summary", {}, "More"), h("div", { class: "row" }, field("Kind", this.kind), h("label", { class: "tick" }, this.trigger, h("span", {}, "Start all nodes together (trigger)")), field("Record to", this.record, "A file name in the station's recording folder, ending in .csv, .txt, .mcap or .jsonl.")), this.setPoints.element, this.others, h("div", { class: "row" }, this.keep, this.drop));
     this.error = h("div", {});
-    this.element = h("li", { class: "panel group" }, h("div", { class: "panel-head" }, h("h4", {}, name), this.state), this.members, h("div", { class: "row" }, field("Rate, Hz", this.rate), this.start, this.stop), this.more, this.error);
+    this.whose = h("p", { class: "hint" });
+    this.element = h("li", { class: "panel group" }, h("div", { class: "panel-head" }, h("h4", {}, name), this.state), this.whose, this.members, h("div", { class: "row" }, field("Rate, Hz", this.rate), this.start, this.stop), this.more, this.error);
     this.element.card = this;
     this.start.setAttribute("aria-label", `Start ${name}`);
     this.stop.setAttribute("aria-label", `Stop ${name}`);
@@ -125,7 +126,8 @@ class GroupCard {
     const words = one ? (one.state ?? "running") : "idle";
     const tone = !one ? ["plain", "stop"] : { running: ["busy", "wave"], failed: ["bad", "warn"], refused: ["bad", "warn"], lost: ["warn", "warn"] }[words] ?? ["plain", "clock"];
     if (this.state.textContent !== words) fill(this.state, chip(...tone, words));
-    keyed(this.members, group.uuids ?? [], (uuid) => uuid, (uuid) => h("li", {}, h("a", { href: `#/nodes/${uuid}` }), h("span", { class: "hint" })), (element, uuid) => {
+    const members = (group.uuids ?? []).map((uuid) => state.nodes.get(uuid) ?? { uuid }).sort(byName);
+    keyed(this.members, members.map((node) => node.uuid), (uuid) => uuid, (uuid) => h("li", {}, h("a", { href: `#/nodes/${uuid}` }), h("span", { class: "hint" })), (element, uuid) => {
       text(element.firstChild, nameOf(state.nodes.get(uuid) ?? { uuid }));
       const line = one ? told(one, uuid) : [state.nodes.get(uuid)?.present === false ? "away" : ""];
       const now = line.map((part) => (typeof part === "string" ? part : "")).join("");
@@ -134,7 +136,8 @@ class GroupCard {
     this.start.hidden = Boolean(one);
     this.stop.hidden = !one;
     if (this.start.getAttribute("aria-busy") !== "true") this.start.disabled = !may || !(group.uuids ?? []).length;
-    if (this.stop.getAttribute("aria-busy") !== "true") this.stop.disabled = !may;
+    if (this.stop.getAttribute("aria-busy") !== "true") this.stop.disabled = !may || (one !== null && isOfCommand(one));
+    text(this.whose, one && isOfCommand(one) ? `Run by the command measure (process ${one.process?.id}). End it there with Ctrl-C.` : "");
     this.paintMembers(group, !may || Boolean(one));
     this.drop.disabled = !may || Boolean(one);
     this.rate.disabled = this.kind.disabled = this.trigger.disabled = this.record.disabled = Boolean(one);
@@ -219,7 +222,7 @@ function loneCard(one) {
   );
   element.paint = (now, may) => {
     const members = membersOf(now).map((uuid) => state.nodes.get(uuid) ?? { uuid }).sort(byName);
-    const names = members.map(nameOf).join(", ");
+    const names = namesOf(members);
     if (now.match) {
       const waiting = now.nodes.filter((node) => node.state === "waiting" && node.why);
       text(name, now.match === "all" ? "All trusted nodes" : now.match);

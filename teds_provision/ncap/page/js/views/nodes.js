@@ -6,6 +6,7 @@ import { isStale, lastOf, now, on, state } from "../state.js";
 import { Bulk } from "./bulk.js";
 import { facts } from "./facts.js";
 import { Filters } from "./filters.js";
+import { isLinkless, noLink } from "./links.js";
 import { NodePanel } from "./node.js";
 import { ProvisionTab } from "./provision.js";
 
@@ -23,7 +24,8 @@ export function nodesView(main, rest) {
   const more = button("", { class: "quiet", hidden: true, onclick: () => ((drawn += DRAWN), paint()) });
   const none = h("div", {});
   const detail = h("div", { class: "detail" });
-  const side = h("section", { class: "side", "aria-label": "Nodes" }, h("div", { class: "side-head" }, h("h2", {}, "Nodes"), total), filters.element, h("div", { class: "row tools-row" }, bulk.toggle), bulk.bar, list, more, h("p", { class: "side-foot" }, h("a", { href: "#/nodes/next/provision" }, icon("nfc"), " Provision the next tapped node")));
+  const linkless = noLink();
+  const side = h("section", { class: "side", "aria-label": "Nodes" }, h("div", { class: "side-head" }, h("h2", {}, "Nodes"), total), linkless, filters.element, h("div", { class: "row tools-row" }, bulk.toggle), bulk.bar, list, more, h("p", { class: "side-foot" }, h("a", { href: "#/nodes/next/provision" }, icon("nfc"), " Provision the next tapped node")));
   main.append(side, none, detail);
   let drawn = DRAWN;
   let listed = []; // the nodes that fit the filters, in their order
@@ -42,6 +44,8 @@ export function nodesView(main, rest) {
     bulk.toggle.hidden = state.nodes.size < 2;
     bulk.paint();
     const strangers = state.status?.strangers ?? 0;
+    const lacking = isLinkless();
+    linkless.hidden = !lacking;
     const shown = state.total > state.nodes.size ? `${state.nodes.size} of ${count(state.total, "node")}` : count(state.nodes.size, "node");
     text(total, `${filters.on ? `${nodes.length} of ` : ""}${shown}${strangers ? `, ${strangers} more not on the whitelist` : ""}`);
     keyed(list, nodes.slice(0, drawn), (node) => node.uuid, (node) => card(node, bulk), update);
@@ -55,6 +59,7 @@ export function nodesView(main, rest) {
       fill(none, state.loaded ? firstSteps() : h("p", { class: "empty" }, "Loading …"));
     }
     if (!any && state.loaded) {
+      none.querySelector("[data-linkless]").hidden = !lacking;
       const hidden = none.querySelector("[data-strangers]");
       if (hidden) hidden.hidden = !strangers;
       if (hidden && strangers) text(hidden, strangersWords(strangers));
@@ -99,7 +104,7 @@ export function nodesView(main, rest) {
     element.tick.hidden = !bulk.on;
     element.tick.firstChild.checked = bulk.chosen.has(node.uuid);
     element.tick.firstChild.setAttribute("aria-label", `Select ${nameOf(node)}`);
-    const told = JSON.stringify([node.name, node.verdict, node.unverified, node.from, node.busy, node.virtual, node.wrapped?.name, node.link, node.present, node.state, node.mode, node.power, node.groups, node.whitelisted, node.channels?.map((one) => one.name)]);
+    const told = JSON.stringify([node.name, node.verdict, node.read?.at, node.unverified, node.from, node.busy, node.virtual, node.wrapped?.name, node.link, node.present, node.state, node.mode, node.power, node.groups, node.whitelisted, node.channels?.map((one) => one.name)]);
     if (element.told === told) return;
     element.told = told;
     const [tone, sign, words, why] = verdict(node);
@@ -155,7 +160,7 @@ function card(node, bulk) {
   return element;
 }
 
-const strangersWords = (many) => `${count(many, "node")} answered but not on the whitelist. Place a node on the reader to add it, or switch detection to Transparent to see them all.`;
+const strangersWords = (many) => `${count(many, "node")} answered but ${many === 1 ? "is" : "are"} not on the whitelist. Place a node on the reader to add it, or switch detection to Transparent to see them all.`;
 
 function firstSteps() {
   return h(
@@ -163,6 +168,7 @@ function firstSteps() {
     { class: "first" },
     h("h2", {}, "No nodes yet"),
     h("p", { class: "warn-line", "data-strangers": true, hidden: true }),
+    noLink(),
     h(
       "ol",
       {},

@@ -3,7 +3,7 @@
 import { get, paths, post } from "../api.js";
 import { button, chip, field, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
 import { clock, short } from "../format.js";
-import { measuring, now, on, state } from "../state.js";
+import { frozenBy, now, on, state } from "../state.js";
 
 const STEPS = {
   identify: "Identify",
@@ -77,7 +77,7 @@ export class ProvisionTab {
     this.choice.hidden = !this.certified();
     const run = this.run;
     const busy = run?.state === "waiting" || run?.state === "running";
-    const blocked = measuring(this.uuid) ? "This node is being measured. Stop the measurement first." : state.status?.write === false ? "This browser has read-only access." : "";
+    const blocked = frozenBy(this.uuid) || (state.status?.write === false ? "This browser has read-only access." : "");
     text(this.why, blocked);
     if (this.go.getAttribute("aria-busy") !== "true") this.go.disabled = busy || Boolean(blocked) || state.connection !== "live";
     this.follow(run);

@@ -6,12 +6,13 @@ import { byName, channelName, clock, count, grouped, nameOf, short } from "../fo
 import { on, refresh, state } from "../state.js";
 import { linkName } from "./facts.js";
 import { linePanel } from "./line.js";
+import { isLinkless, noLink } from "./links.js";
 
 const NAMES = 40; // rows of published names; a press shows as many more
 
 export function stationView(main) {
   const links = h("ul", { class: "lines" });
-  const noLink = h("p", { class: "hint", hidden: true }, "No links. Start ncap run with --can, --nfc or --ble.");
+  const linkless = noLink();
   const sinks = h("ul", { class: "lines" });
   const noSink = h("div", {});
   const plantFacts = h("dl", { class: "facts-list" });
@@ -32,7 +33,7 @@ export function stationView(main) {
     h(
       "div",
       { class: "grid" },
-      h("section", { class: "panel", "aria-label": "Links" }, h("h3", {}, "Links"), noLink, links),
+      h("section", { class: "panel", "aria-label": "Links" }, h("h3", {}, "Links"), linkless, links),
       h("section", { class: "panel", "aria-label": "About" }, h("h3", {}, "About"), facts),
       plantPanel,
       line.panel,
@@ -47,7 +48,7 @@ export function stationView(main) {
       const up = one.state === "up" || one.state === "running";
       again(element, [one.state, one.why], () => [icon(one.kind ?? "can"), h("span", { class: "grow" }, h("strong", {}, linkName(one.kind)), " ", one.name), chip(up ? "good" : "warn", up ? "good" : "warn", one.state), one.why ? h("p", { class: "hint full" }, one.why, one.hint ? ` ${one.hint}` : "") : null]);
     });
-    noLink.hidden = !state.status || (status.links ?? []).length > 0;
+    linkless.hidden = !isLinkless();
     keyed(sinks, status.sinks ?? [], (one) => one.name, () => h("li", {}), (element, one) => {
       const bad = one.state === "failed";
       again(element, one, () => [h("span", { class: "grow" }, h("strong", {}, one.name), h("span", { class: "hint" }, ` ${count(one.written ?? 0, "value")} written, ${one.dropped ?? 0} dropped`)), chip(bad ? "bad" : one.dropped ? "warn" : "good", bad || one.dropped ? "warn" : "good", one.state), one.error || ((one.recorder || one.state === "waiting") && one.detail) ? h("p", { class: "hint full" }, one.error || one.detail, one.hint ? ` ${one.hint}` : "") : null]);

@@ -2,9 +2,9 @@
 
 import { paths, post, Refusal, remove } from "../api.js";
 import { button, chip, empty, field, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
-import { age, channelName, count, figure as words, hertz, nameOf, number, range, short, whyNoNumber } from "../format.js";
+import { age, channelName, count, figure as words, hertz, nameOf, range, reading, short, whyNoNumber } from "../format.js";
 import { LivePlot, WINDOWS } from "../plot.js";
-import { isStale, lastOf, measuring, now, on, refresh, state } from "../state.js";
+import { isOfCommand, isStale, lastOf, measuring, now, on, refresh, state } from "../state.js";
 import { ActuatorPanel } from "./actuator.js";
 import { SetPoints } from "./setpoints.js";
 
@@ -97,7 +97,7 @@ export class LiveTab {
       if (channel.kind === "actuator") {
         const told = channel.actuator;
         const set = told?.safe === false;
-        text(figure, set ? number(told.value, channel.uncertainty) : told?.safe === true ? "safe state" : "not set");
+        text(figure, set ? reading(told.value, channel) : told?.safe === true ? "safe state" : "not set");
         if (unit) unit.hidden = !set;
         element.classList.toggle("actuator-row", true);
         if (bar) bar.value = told?.safe === false ? told.value : channel.low;
@@ -216,7 +216,8 @@ class ModePanel {
     this.setPoints.paint([this.uuid], one);
     if (!one && stranger) fill(this.state, "Not on the whitelist: ", h("a", { href: `#/nodes/${this.uuid}/provision` }, "provision it first"), ".");
     else if (!one) fill(this.state, sensors ? "Idle." : "This node has no sensors to measure.");
-    else if (one.group) fill(this.state, "Measured as part of group ", h("a", { href: "#/measure" }, one.group), ". Stop it there.");
+    else if (isOfCommand(one)) fill(this.state, "Measured as part of group ", h("a", { href: "#/measure" }, one.group), ` by the command measure (process ${one.process?.id}). End it there with Ctrl-C.`);
+    else if (one.group) fill(this.state, "Measured as part of group ", h("a", { href: "#/measure" }, one.group), ". Stop it there.", one.state === "failed" ? h("span", { class: "warn" }, ` It has failed: ${one.why}`) : null);
     else fill(this.state, told(one, this.uuid));
   }
 
@@ -260,10 +261,13 @@ export function requireRate(uuids, rate) {
   }
 }
 
-/** Why values are not valid, the most frequent reasons first. */
-function invalid(node) {
-  const most = [...(node.invalid_why ?? [])].sort((one, other) => other.count - one.count).slice(0, 3);
-  return most.map((one) => `channel ${one.channel}: ${one.why}`).join("; ") || "no reason given";
+/** How many values are not valid and why, the most frequent reasons first; those that `why` gives already are left out. */
+function invalid(node, why) {
+  const reasons = [...(node.invalid_why ?? [])].sort((one, other) => other.count - one.count);
+  const most = reasons.filter((one) => !why.includes(one.why)).slice(0, 3);
+  const nameOfChannel = (number) => channelName(state.nodes.get(node.uuid)?.channels?.find((one) => one.number === number) ?? { number });
+  const words = most.map((one) => `${nameOfChannel(one.channel)}: ${one.why}`).join("; ") || (reasons.length ? "" : "no reason given");
+  return `${node.invalid} invalid${words ? ` (${words})` : ""}`;
 }
 
 /** How a node of a measurement fares, in words. */
@@ -274,8 +278,8 @@ export function told(measurement, uuid) {
   if (typeof node?.samples === "number") parts.push(count(node.samples, "sample"), node.lost ? `${node.lost} lost` : "none lost");
   if (node?.late) parts.push(`${node.late} late`);
   if (node?.bad) parts.push(`${node.bad} bad`);
-  if (node?.invalid) parts.push(`${node.invalid} invalid (${invalid(node)})`);
-  const why = node?.why ?? measurement.why;
+  const why = node?.why ?? measurement.why ?? "";
+  if (node?.invalid) parts.push(invalid(node, why));
   return [icon(word === "running" ? "wave" : word === "refused" || word === "lost" ? "warn" : "clock"), ` ${parts.join(", ")}.`, why ? ` ${why}` : ""];
 }
 

@@ -3,7 +3,7 @@
 import { change, paths } from "../api.js";
 import { button, chip, field, fill, h, icon, say, trouble } from "../dom.js";
 import { channelName, count, nameOf } from "../format.js";
-import { measuring, on, state } from "../state.js";
+import { frozenBy, on, state } from "../state.js";
 
 const LARGEST = 900000; // octets: the station takes bodies of at most 1 MiB
 
@@ -48,8 +48,8 @@ export class WritePanel {
   }
 
   paint() {
-    const one = measuring(this.uuid);
-    const blocked = one ? `This node is being measured${one.group ? ` in group ${one.group}` : ""}. Stop the measurement first: until then its datasheet is frozen.` : state.status?.write === false ? "This browser has read-only access." : "";
+    const frozen = frozenBy(this.uuid);
+    const blocked = frozen ? `${frozen} Until then its datasheet is frozen.` : state.status?.write === false ? "This browser has read-only access." : "";
     this.frozen.textContent = blocked;
     this.file.disabled = Boolean(blocked) || state.connection !== "live";
     this.drop.classList.toggle("off", this.file.disabled);
