@@ -29,7 +29,7 @@ from teds_provision.cli.options import (
 from teds_provision.cli.sample import ending, over_the_bus, where_met
 from teds_provision.errors import BadDataError, UsageError
 from teds_provision.lazy import late
-from teds_provision.links import LINKS, LinkSettings, ble, can
+from teds_provision.links import LINKS, LinkSettings
 from teds_provision.station.store import KeptMeasurement
 from teds_provision.station.store.records import COMMAND
 
@@ -152,7 +152,7 @@ def _require_streams(links: LinkSettings, *, trigger: bool) -> None:
             "Streaming needs CAN or Bluetooth.",
             hint="Add --can or --ble. For one reading over NFC: teds-provision sample UUID",
         )
-    if trigger and links.via == "ble":
+    if trigger and not LINKS[links.via].capabilities.triggers:
         raise UsageError("--trigger needs a CAN bus.", hint="Omit --trigger over Bluetooth.")
 
 
@@ -227,17 +227,16 @@ def _run(
     station, stop = job.station, talk.meeting.IdleStop(None)
     group = job.kept.group or ""
     nodes = [uuid.hex() for uuid in uuids]
-    kinds = (can.port.CanPort, ble.port.BlePort)
-    ports = [port for port in links_room.open_ports(links) if isinstance(port, kinds)]
-    buses_alone = [port for port in ports if isinstance(port, can.port.CanPort)]
+    ports = links_room.open_ports(links)
+    streaming = list(links_room.streaming.measuring_links(ports))
     try:
         with ExitStack() as stack:
             stack.enter_context(
-                measure_room.sources.sole_user(station, buses_alone, f"measure {group or ', '.join(nodes)}")
+                measure_room.sources.sole_user(station, streaming, f"measure {group or ', '.join(nodes)}")
             )
             watcher = stack.enter_context(measure_view.watcher_for(app, station, job.sinks, stop))
             stack.enter_context(ending(stop))
-            buses = stack.enter_context(measure_room.buses.Buses(ports, note=app.warn))
+            buses = stack.enter_context(measure_room.buses.Buses(streaming, note=app.warn))
             station.audit("measure", None, "begun", nodes=nodes, group=group)
             ended = job.run(buses, stop, watcher=watcher, duration=duration)
     finally:

@@ -29,6 +29,6 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from teds_provision.links import ble, can, nfc
+    from teds_provision.links import ble, can, nfc, streaming
 else:
     __getattr__ = lazy(__name__)

@@ -6,20 +6,21 @@ first port is opened.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Final
 
 from teds_provision.errors import UsageError
-from teds_provision.links.ports import BLE, CAN, NFC, Capabilities, LinkSettings, Port, Trace
+from teds_provision.links.ports import BLE, CAN, NFC, Capabilities, LinkSettings, LinkSpec, Port, SharedBus, Trace
 
 
 @dataclass(frozen=True)
 class LinkKind:
     """One kind of link: ``module`` has a function ``open_port(where, trace)``; ``example`` is a place of that kind.
 
-    ``needs`` is the message if the place is left out and there is no default.
+    ``needs`` is the message if the place is left out and there is no default. ``spec`` is the module whose
+    ``parse_spec(where)`` reads WHERE, or raises UsageError; "" if there is nothing to read.
     """
 
     name: str
@@ -27,6 +28,7 @@ class LinkKind:
     capabilities: Capabilities
     example: str
     needs: str = ""
+    spec: str = ""
 
 
 LINKS: Final = {
@@ -39,8 +41,9 @@ LINKS: Final = {
             CAN,
             "can:socketcan:can0",
             needs="--via can requires --can, e.g. --can socketcan:can0?bitrate=500000.",
+            spec="teds_provision.links.can.spec",
         ),
-        LinkKind("ble", "teds_provision.links.ble.port", BLE, "ble:hci0"),
+        LinkKind("ble", "teds_provision.links.ble.port", BLE, "ble:hci0", spec="teds_provision.links.ble.spec"),
     )
 }
 
@@ -60,6 +63,50 @@ def open_place(place: str, trace: Trace | None = None) -> Port:
         raise UsageError(f"{problem}.", hint=cure)
     opened: Callable[[str, Trace | None], Port] = import_module(kind.module).open_port
     return opened(where, trace)
+
+
+def capabilities_at(place: str) -> Capabilities:
+    """Return what the link at ``LINK:WHERE`` can do, without opening it; nothing for an unknown link."""
+    kind = LINKS.get(place.partition(":")[0])
+    return Capabilities() if kind is None else kind.capabilities
+
+
+def plugged_in() -> Iterator[str]:
+    """Yield the place of each NFC reader that is plugged in; none of them is opened."""
+    return (f"nfc:{path}" for path in import_module("teds_provision.links.nfc.reader").plugged_in())
+
+
+def require_known_place(place: str) -> None:
+    """Raise UsageError for a WHERE that cannot be meant: no new try helps, as it may with a link that is missing."""
+    spec = _spec_of(place)
+    if spec is not None:
+        spec.require_known()
+
+
+def shared_bus(place: str) -> SharedBus | None:
+    """Return the bus and this station's address on it, without opening it; None if no other station shares the link.
+
+    Raises UsageError.
+    """
+    spec = _spec_of(place) if capabilities_at(place).shared else None
+    return spec if isinstance(spec, SharedBus) else None
+
+
+def with_source(place: str, source: int) -> str:
+    """Return the place with this source address in it, unless it names one, or its link has none."""
+    query = place.partition("?")[2]
+    if not capabilities_at(place).shared or "source=" in query:
+        return place
+    return f"{place}{'&' if '?' in place else '?'}source=0x{source:02X}"
+
+
+def _spec_of(place: str) -> LinkSpec | None:
+    name, _, where = place.partition(":")
+    kind = LINKS.get(name)
+    if kind is None or not kind.spec:
+        return None
+    read: Callable[[str], LinkSpec] = import_module(kind.spec).parse_spec
+    return read(where)
 
 
 def open_port(settings: LinkSettings) -> Port:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Final, Literal, NamedTuple, Protocol, runtime_checkable
@@ -74,19 +74,27 @@ class Capabilities:
 
     ``tapped``: a person holds the node to this reader, so that a key that comes this way may be pinned and agreed.
     ``wired``: an answer comes over this very wire, so that a new node's first key may be accepted as its own.
-    ``streams``: data messages of measuring nodes can be heard. ``many``: several nodes are there at once, and may be
-    talked to from one thread each, ``max_parallel`` of them at a time.
+    ``streams``: data messages of measuring nodes can be heard (``links.streaming``), and ``triggers``: one message
+    starts them all. ``connectionless``: a question to one node, or to all, needs neither a tap nor a connection.
+    ``shared``: each station, and each of its processes, has a source address of its own (:class:`SharedBus`).
+    ``many``: several nodes are there at once, and may be talked to from one thread each, ``max_parallel`` of them at a
+    time.
     """
 
     tapped: bool = False
     wired: bool = False
     streams: bool = False
+    triggers: bool = False
+    connectionless: bool = False
+    shared: bool = False
     many: bool = False
     max_parallel: int = 1
 
 
 NFC = Capabilities(tapped=True)
-CAN = Capabilities(wired=True, streams=True, many=True, max_parallel=24)
+CAN = Capabilities(
+    wired=True, streams=True, triggers=True, connectionless=True, shared=True, many=True, max_parallel=24
+)
 """While most of 24 nodes calculate, a bus is never idle at 500 kbit/s."""
 BLE = Capabilities(streams=True, many=True)
 """One node after the other: an adapter holds few connections (notes in docs/hardware.md)."""
@@ -318,6 +326,38 @@ class Port(Protocol):
         """Release the reader or the bus; never raises."""
 
 
+class LinkSpec(Protocol):
+    """WHERE of a place ``LINK:WHERE``, read."""
+
+    @property
+    def text(self) -> str:
+        """Name of the bus or adapter in a message."""
+
+    def require_known(self) -> None:
+        """Raise UsageError for an option that the bus does not have."""
+
+
+@runtime_checkable
+class SharedBus(LinkSpec, Protocol):
+    """A bus on which each station, and each of its processes, has a source address."""
+
+    @property
+    def wire(self) -> str:
+        """Identity of the bus on this machine."""
+
+    @property
+    def source(self) -> int:
+        """The source address that is used."""
+
+    @property
+    def source_named(self) -> bool:
+        """True if the user named it."""
+
+    @property
+    def sources(self) -> tuple[int, ...]:
+        """The source addresses that may be used, the first choice first."""
+
+
 LISTEN_SECONDS: Final = 3.0
 
 
@@ -351,6 +391,11 @@ class LinkSettings:
         if via == "can":
             return replace(there, can=where or None)
         return replace(there, ble=where or None) if via == "ble" else replace(there, nfc=where or None)
+
+    def at_places(self, places: Sequence[str]) -> LinkSettings:
+        """Return the same settings at other places of the same link."""
+        wheres = tuple(place.partition(":")[2] for place in places)
+        return replace(self, can=wheres) if self.via == "can" else self.at(places[0])
 
     @property
     def buses(self) -> tuple[str, ...]:

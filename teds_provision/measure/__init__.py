@@ -11,7 +11,6 @@ if TYPE_CHECKING:
         buses,
         capture,
         clock,
-        discovery,
         grid,
         held_actuator,
         interpreter,

@@ -1,4 +1,4 @@
-"""The buses of this process, each read and searched by one thread for all who measure on it.
+"""The links of this process that stream, each read and searched by one thread for all who measure on it.
 
 Measurements, detection and commands share them: they are opened once, and closed when the process ends.
 """
@@ -7,27 +7,25 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from types import TracebackType
 
 from teds_provision.errors import LinkError
-from teds_provision.links.ble.port import BlePort
-from teds_provision.links.can.isotp import Frame
-from teds_provision.links.can.port import CanPort
-from teds_provision.measure.discovery import BleDiscovery, BleStreamReceiver, CanDiscovery, air_time
+from teds_provision.links.discovery import Sighting, SightingSink
+from teds_provision.links.streaming import MeasuringLink
 from teds_provision.measure.planning import BusShare, BusTime
-from teds_provision.measure.presence import Presence, Sighting
-from teds_provision.measure.stream_receiver import CanStreamReceiver, StreamReceiver
-from teds_provision.protocol.messages.ble import LEAST_MTU
-from teds_provision.protocol.operation.can_frames import DriveAddress, StreamAssembly, cut
+from teds_provision.measure.presence import Presence
+from teds_provision.measure.stream_receiver import StreamReceiver
 
 
 class MeasuredBus:
     """One link that carries data: ``port``, who hears its data messages, how much of it is taken, who is on it."""
 
-    def __init__(
-        self, port: CanPort | BlePort, hearing: StreamReceiver, share: BusShare, lookout: CanDiscovery | BleDiscovery
-    ) -> None:
-        self.port, self.receiver, self.share, self.discovery = port, hearing, share, lookout
+    def __init__(self, port: MeasuringLink, sightings: SightingSink, *, poll: float | None) -> None:
+        self.port = port
+        self.receiver = StreamReceiver(port)
+        self.share = BusShare(BusTime(port.airtime()))
+        self.discovery = port.discover(sightings, poll=poll)
         self.reading = threading.Lock()
         """Held while a datasheet is read behind a measurement: one node at a time."""
 
@@ -41,32 +39,9 @@ class MeasuredBus:
         self.discovery.close()
         self.receiver.close()
 
-    def assembly(self, length: int) -> StreamAssembly:
-        """Return the assembler of messages of so many octets."""
-        return StreamAssembly(length, fd=isinstance(self.port, CanPort) and self.port.spec.fd)
-
-    def time_for(self, time: BusTime, address: int) -> BusTime:
-        """Return the time of this link as the node at ``address`` has it: over the air its connection has an MTU."""
-        return air_time(time, self.port.mtu(address)) if isinstance(self.port, BlePort) else time
-
-    def drive(self, address: int, message: bytes) -> None:
-        """Send a Drive message to the node at ``address``; raises LinkError."""
-        if isinstance(self.port, BlePort):
-            self.port.link(address).drive(message)
-            return
-        identifier = DriveAddress(address, self.port.spec.source).identifier
-        for piece in cut(message, fd=self.port.spec.fd, drive=True):
-            self.port.send(Frame(identifier, piece.data, self.port.spec.fd))
-
-
-def bus_at(port: CanPort | BlePort, sightings: Presence, *, poll: float | None) -> MeasuredBus:
-    """Return the bus, or the adapter, behind a port."""
-    if isinstance(port, BlePort):
-        return MeasuredBus(
-            port, BleStreamReceiver(port), BusShare(BusTime(mtu=LEAST_MTU)), BleDiscovery(port, sightings, poll=poll)
-        )
-    time = BusTime(port.spec.bitrate, port.spec.data_bitrate if port.spec.fd else None)
-    return MeasuredBus(port, CanStreamReceiver(port), BusShare(time), CanDiscovery(port, sightings, poll=poll))
+    def time_for(self, time: BusTime, node: int) -> BusTime:
+        """Return the time of this link as a node has it: over the air its connection has an MTU."""
+        return replace(time, airtime=self.port.airtime(node))
 
 
 class Buses:
@@ -77,7 +52,7 @@ class Buses:
 
     def __init__(
         self,
-        ports: Iterable[CanPort | BlePort] = (),
+        ports: Iterable[MeasuringLink] = (),
         *,
         news: Callable[[Sighting], None] = lambda _sighting: None,
         note: Callable[[str], None] = lambda _text: None,
@@ -96,10 +71,10 @@ class Buses:
     ) -> None:
         self.close()
 
-    def add(self, port: CanPort | BlePort) -> MeasuredBus:
+    def add(self, port: MeasuringLink) -> MeasuredBus:
         """Hear one more bus."""
         if port.place not in self._buses:
-            self._buses[port.place] = bus_at(port, self.presence, poll=self._poll)
+            self._buses[port.place] = MeasuredBus(port, self.presence, poll=self._poll)
         return self._buses[port.place]
 
     def all(self) -> Sequence[MeasuredBus]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from teds_provision.errors import NoNodeError, TedsProvisionError
-from teds_provision.links import LinkSettings, Notice, nfc, open_place
+from teds_provision.links import LinkSettings, Notice, open_place
+from teds_provision.links.opening import capabilities_at, plugged_in
 from teds_provision.measure.sources import beside
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
@@ -32,14 +33,14 @@ class LinkSurvey:
 
 
 def readers() -> Iterator[LinkSurvey]:
-    """Yield the NFC readers that are plugged in; none of them is opened."""
-    return (LinkSurvey(f"nfc:{path}", "listed") for path in nfc.reader.plugged_in())
+    """Yield the readers that are plugged in; none of them is opened."""
+    return (LinkSurvey(place, "listed") for place in plugged_in())
 
 
 def look(station: Station, places: Sequence[str]) -> Iterator[LinkSurvey]:
     """Ask everyone on each of these places, one after the other; at most a second each."""
     for place in places:
-        if not place.startswith("can:"):
+        if not capabilities_at(place).connectionless:
             yield LinkSurvey(place, "listed")
             continue
         told: list[Notice] = []

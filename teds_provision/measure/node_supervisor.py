@@ -27,14 +27,13 @@ from teds_provision.errors import (
     TedsProvisionError,
     VaultLockedError,
 )
-from teds_provision.links.can.link import conflict
+from teds_provision.links.discovery import Sighting
 from teds_provision.links.ports import CancellableLink
 from teds_provision.measure.background_reread import BackgroundReread
 from teds_provision.measure.blocks import NodeReport, SetPointCommand, State
 from teds_provision.measure.buses import Buses, MeasuredBus
 from teds_provision.measure.clock import AT_FIRST, HostClock
 from teds_provision.measure.planning import BusTime, NodePlans, plan_node, sensors_of
-from teds_provision.measure.presence import Sighting
 from teds_provision.measure.request import Events, MeasurementRequest
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.retry_policy import RetryPolicy
@@ -301,8 +300,9 @@ class NodeSupervisor:
             # Its refusal came under its key: it is there, and another measurement may want it now.
             if not (self._proven and isinstance(error, (NotAuthenticError, PolicyError, BadDataError))):
                 self._buses.presence.wrong(sighting)
-            if not self._proven and isinstance(error, TedsProvisionError) and self._buses.presence.is_shared(sighting):
-                raise conflict(sighting.address) from error  # whichever of the two answered
+            conflict = self._buses.presence.conflict_at(sighting)
+            if not self._proven and isinstance(error, TedsProvisionError) and conflict is not None:
+                raise conflict from error  # whichever of the two answered
             raise
 
     def _in_session(self, bus: MeasuredBus, sighting: Sighting, standing: NodeStanding) -> None:
@@ -403,7 +403,7 @@ class NodeSupervisor:
     ) -> TopicActuators:
         return TopicActuators(
             trusted,
-            functools.partial(bus.drive, address),
+            functools.partial(bus.port.drive, address),
             tuple(sorted(channel.number for channel in actuators)),
             dead_man=self._request.dead_man,
             clock=self.streams.clock,

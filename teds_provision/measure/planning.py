@@ -12,8 +12,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from teds_provision.errors import BadDataError, NoRoomError, PolicyError
-from teds_provision.protocol.operation.budget import BLE_OVERHEAD, MOST_LOAD, bus_load, frames, share
-from teds_provision.protocol.operation.datagram import MOST_OCTETS
+from teds_provision.links.streaming import Airtime
+from teds_provision.protocol.operation.budget import MOST_LOAD, share
 from teds_provision.protocol.operation.stream_commands import LAST_STREAM, MOST_STREAM_CHANNELS, SOON, StreamKind
 from teds_provision.protocol.operation.subscription import StreamPlan, most_instants
 from teds_provision.teds.sheet import Channel, ChannelKind
@@ -25,35 +25,14 @@ MILLION = 10**6
 NODE_SHARE = 0.5  # of the node's own budget: room for commands between data frames
 MOST_GAP = 2_000  # µs
 SAYING = 1.0  # seconds that a node waits for the others to report their share of the bus
-AIR_MESSAGES = 160.0  # notifications a second that an adapter is trusted with, all connections together
 
 
 @dataclass(frozen=True)
 class BusTime:
-    """Capacity of a CAN bus: bit/s, and whether frames are FD; ``taken`` is the share of others' data frames.
+    """Capacity of a link: what messages take of it, and the share that the data of others take (``taken``)."""
 
-    With an ``mtu`` it is a Bluetooth adapter, and a connection with that MTU.
-    """
-
-    bitrate: int = 500_000
-    data_bitrate: int | None = None
+    airtime: Airtime
     taken: float = 0.0
-    mtu: int | None = None
-
-    @property
-    def link(self) -> str:
-        """Name of the kind of link."""
-        return "can" if self.mtu is None else "ble"
-
-    @property
-    def most_octets(self) -> int:
-        """Octets of the longest data message."""
-        return MOST_OCTETS if self.mtu is None else min(MOST_OCTETS, self.mtu - BLE_OVERHEAD)
-
-    @property
-    def fd(self) -> bool:
-        """True if data goes in frames of 64 octets."""
-        return self.data_bitrate is not None
 
 
 @dataclass
@@ -285,7 +264,7 @@ def _plan(
 ) -> StreamPlan:
     widths = tuple((channel.number, channel.sample.octets if channel.sample else 0) for channel in members)
     octets = sum(width for _, width in widths)
-    most = most_instants(kind, octets, bus.most_octets)
+    most = most_instants(kind, octets, bus.airtime.most_octets)
     if most < 1:
         raise BadDataError(
             f"One sample of channels {', '.join(str(n) for n, _ in widths)} does not fit into a message."
@@ -304,18 +283,12 @@ def _plan(
 
 
 def _load(plan: StreamPlan, bus: BusTime) -> float:
-    n, period = plan.subscribe.n, plan.subscribe.period
-    if bus.mtu is not None:
-        return 1e9 / (n * period) / AIR_MESSAGES
-    return bus_load(plan.length, n, period, bitrate=bus.bitrate, data_bitrate=bus.data_bitrate)
+    return bus.airtime.load(plan.length, plan.subscribe.n, plan.subscribe.period)
 
 
 def _gap(plans: Sequence[StreamPlan], bus: BusTime) -> int | None:
     """Microseconds between the node's data frames: what spreads them and still lets all leave in time."""
-    unit = sum(
-        share(frames(plan.length, link=bus.link, fd=bus.fd), 1, plan.subscribe.n, plan.subscribe.period)
-        for plan in plans
-    )
+    unit = sum(share(bus.airtime.frames(plan.length), 1, plan.subscribe.n, plan.subscribe.period) for plan in plans)
     if unit > MILLION:
         return None
     return max(1, min(MOST_GAP, int(MILLION * NODE_SHARE / max(unit, 1))))

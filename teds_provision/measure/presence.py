@@ -10,45 +10,15 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-from teds_provision.errors import LinkError, NoNodeError
-from teds_provision.links.ble.port import BlePort
-from teds_provision.links.can.identify_broadcast import conflict_text
-from teds_provision.links.can.link import conflict
-from teds_provision.links.can.port import CanPort
-from teds_provision.links.ports import Contact
+from teds_provision.errors import AddressConflictError, LinkError, NoNodeError
+from teds_provision.links.discovery import Sighting
 from teds_provision.protocol.announce import Announce, uuid_crc
-from teds_provision.protocol.messages.identity import Identity
 
 RECENT = 30.0  # seconds for which a conflict of addresses is the reason why a node is not found
 MOST = 1024  # UUIDs that are kept: a bus has 239 addresses, and a device at each of them can invent new ones
 REPEATED = 600.0  # seconds until the same trouble with addresses is reported again
 ROUND = 0.7  # seconds of two broadcasts, after which two boards at one address are known
 TWIN = 0.5  # seconds in which the node itself may answer as well, where one that says it is it was not
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """A node that answered: its place, its Identify, and when (time.monotonic). All of it is unproven.
-
-    ``address`` is its CAN address, over the air the number of its connection.
-    """
-
-    identity: Identity
-    address: int
-    port: CanPort | BlePort
-    at: float
-
-    @property
-    def uuid(self) -> bytes:
-        """10 octets."""
-        return self.identity.uuid
-
-    def contact(self) -> Contact:
-        """Return a link to it."""
-        link, trace, bus = self.port.link(self.address), self.port.trace, self.port.place
-        if isinstance(self.port, BlePort):
-            return Contact(self.identity, link, connection=self.address, trace=trace, bus=bus)
-        return Contact(self.identity, link, address=self.address, trace=trace, bus=bus)
 
 
 Place = tuple[str, int]
@@ -65,7 +35,7 @@ class Presence:
     note: Callable[[str], None] = lambda _text: None
     _seen: dict[bytes, dict[Place, Sighting]] = field(default_factory=dict)
     _wrong: dict[bytes, dict[Place, float]] = field(default_factory=dict)
-    _conflicts: dict[Place, float] = field(default_factory=dict)
+    _conflicts: dict[Place, tuple[float, AddressConflictError]] = field(default_factory=dict)
     _announced: dict[bytes, tuple[Place, Callable[[], None], Callable[[], None]]] = field(default_factory=dict)
     _missing: dict[bytes, int] = field(default_factory=dict)
     _unseen: set[bytes] = field(default_factory=set)  # those that a thread waited for, and that were not seen since
@@ -90,14 +60,14 @@ class Presence:
             kept[2]()
         self.news(sighting)
 
-    def conflict(self, place: str, address: int) -> None:
-        """Two nodes answer under one address: nothing is opened there."""
+    def conflict(self, place: str, address: int, error: AddressConflictError) -> None:
+        """Record that two nodes answer under one address: nothing is opened there."""
         with self._turn:
-            self._conflicts[place, address] = time.monotonic()
+            self._conflicts[place, address] = time.monotonic(), error
             for places in self._seen.values():
                 places.pop((place, address), None)
             self._turn.notify_all()
-        self.report(conflict_text(address))
+        self.report(error.message)
 
     def report(self, text: str) -> None:
         """Note what a look-out found out about addresses; the same again only after :data:`REPEATED` seconds."""
@@ -208,18 +178,22 @@ class Presence:
 
         def other() -> bool:
             places = self._seen.get(uuid, {}).keys() | self._wrong.get(uuid, {}).keys()
-            return len(places) > 1 or any(map(self._is_shared, places))
+            return len(places) > 1 or any(map(self._conflict_at, places))
 
         with self._turn:
             return self._turn.wait_for(other, TWIN + ROUND)
 
-    def is_shared(self, sighting: Sighting) -> bool:
-        """Return True if two boards were heard at the address of a sighting a short while ago."""
+    def conflict_at(self, sighting: Sighting) -> AddressConflictError | None:
+        """Return the error if two boards were heard at the address of a sighting a short while ago."""
         with self._turn:
-            return self._is_shared((sighting.port.place, sighting.address))
+            return self._conflict_at((sighting.port.place, sighting.address))
 
-    def _is_shared(self, place: Place) -> bool:
-        return time.monotonic() - self._conflicts.get(place, -RECENT) < RECENT
+    def _conflict_at(self, place: Place) -> AddressConflictError | None:
+        """Return a new error each time: several threads raise it."""
+        at, error = self._conflicts.get(place, (-RECENT, None))
+        if error is None or time.monotonic() - at >= RECENT:
+            return None
+        return AddressConflictError(error.message, hint=error.hint)
 
     def _best(self, uuid: bytes, fresh: float) -> Sighting | None:
         """Return where to search for a node. A place that was wrong is not tried while another one may still answer."""
@@ -235,9 +209,10 @@ class Presence:
         return best if time.monotonic() - best.at >= TWIN else None
 
     def _nobody(self, uuid: bytes, seconds: float) -> LinkError:
-        recent = [address for (_, address), at in self._conflicts.items() if time.monotonic() - at < RECENT]
-        if recent:
-            return conflict(min(recent))
+        for place in sorted(self._conflicts, key=lambda place: place[1]):
+            conflict = self._conflict_at(place)
+            if conflict is not None:
+                return conflict
         return NoNodeError(
             f"Node {uuid.hex()} did not answer within {seconds:g} s.",
             hint="Check its power, the bit rate and the address; teds-provision identify --via can lists the"

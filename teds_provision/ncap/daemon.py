@@ -21,9 +21,10 @@ from teds_provision.errors import (
     VaultError,
 )
 from teds_provision.links import Port
+from teds_provision.links.discovery import Sighting
+from teds_provision.links.opening import with_source
 from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.buses import Buses
-from teds_provision.measure.presence import Sighting
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor
 from teds_provision.ncap.names import Names
@@ -35,7 +36,7 @@ from teds_provision.ncap.nodes.provisioning import AutoProvisioner, Provisioning
 from teds_provision.ncap.nodes.sheets import Sheets
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.ncap.plant import PlantWatch
-from teds_provision.ncap.settings import Detection, Settings, own_source, with_source
+from teds_provision.ncap.settings import Detection, Settings, own_source
 from teds_provision.ncap.sinks import DaemonSinks
 from teds_provision.ncap.web.tokens import Tokens
 from teds_provision.station.station import Station

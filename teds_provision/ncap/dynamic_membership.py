@@ -24,12 +24,10 @@ from teds_provision.errors import (
     PolicyError,
     TedsProvisionError,
 )
-from teds_provision.links.can.port import CanPort
+from teds_provision.links.discovery import Sighting
 from teds_provision.measure.buses import Buses
-from teds_provision.measure.discovery import CanDiscovery
 from teds_provision.measure.matching import ListedNodes, NodeLoad, NodeMatch, UnsignedNodes, load_of
 from teds_provision.measure.node_supervisor import NodeSupervisor
-from teds_provision.measure.presence import Sighting
 from teds_provision.measure.runner import Measurement
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.measure.standing import why_not_measured
@@ -382,6 +380,4 @@ class DynamicMembership:
     def _ask(self, sighting: Sighting) -> None:
         """Ask a lost node at its last place; an answer is a sighting, and so it joins."""
         with suppress(LinkError, KeyError):
-            lookout = self._buses.bus_of(sighting).discovery
-            if isinstance(sighting.port, CanPort) and isinstance(lookout, CanDiscovery):
-                lookout.identify_at(sighting.address, ANSWERING)
+            self._buses.bus_of(sighting).discovery.identify_at(sighting.address, ANSWERING)

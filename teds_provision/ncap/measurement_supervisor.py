@@ -26,7 +26,6 @@ from teds_provision.errors import (
 from teds_provision.handover.life import is_retired
 from teds_provision.measure.blocks import ChannelFacts, NodeReport, SetPointCommand, StationFacts
 from teds_provision.measure.buses import Buses
-from teds_provision.measure.discovery import CanDiscovery
 from teds_provision.measure.matching import ListedNodes, NodeMatch, UnsignedNodes
 from teds_provision.measure.planning import period_of, sensors_of
 from teds_provision.measure.request import MeasurementRequest
@@ -423,10 +422,8 @@ class MeasurementSupervisor:
         seen, record = self._buses.presence.seen_at(uuid), self._station.nodes.get(uuid)
         if seen is None or record is None or record.can_address in (None, seen.address):
             return
-        lookout = self._buses.bus_of(seen).discovery
-        if isinstance(lookout, CanDiscovery):
-            with suppress(LinkError):
-                lookout.identify_at(record.can_address, ANSWERING)
+        with suppress(LinkError):
+            self._buses.bus_of(seen).discovery.identify_at(record.can_address, ANSWERING)
 
     def sheet(self, uuid: str) -> Image | None:
         """Return the datasheet of a measured node: the one that its session verified, and that cannot change."""

@@ -13,9 +13,7 @@ from typing import Final, Literal
 from teds_provision.errors import BadDataError, UsageError
 from teds_provision.files import read_limited
 from teds_provision.links import Trace
-from teds_provision.links.ble import spec as ble
-from teds_provision.links.can import spec as can
-from teds_provision.links.can.bus import require_known
+from teds_provision.links.opening import require_known_place
 from teds_provision.measure.display_units import FileUnits
 from teds_provision.measure.verified_session import DEAD_MAN
 
@@ -71,14 +69,6 @@ def own_source(station_id: str) -> int:
     return _FIRST + zlib.crc32(station_id.encode()) % _SOURCES
 
 
-def with_source(place: str, source: int) -> str:
-    """Return a CAN place with a source address, unless it names one."""
-    link, _, where = place.partition(":")
-    if link != "can" or "source=" in where.partition("?")[2]:
-        return place
-    return f"{place}{'&' if '?' in where else '?'}source=0x{source:02X}"
-
-
 def parse_http(text: str) -> tuple[str, int]:
     """``HOST:PORT``, ``[::1]:PORT`` or ``PORT`` alone (this machine); raises UsageError."""
     host, colon, port = text.rpartition(":")
@@ -122,11 +112,7 @@ def _require_pair(certificate: Path, key: Path) -> None:
 def require_places(settings: Settings) -> None:
     """Raise UsageError for a link whose words are wrong: that does not mend itself, as a missing one may."""
     for place in settings.places:
-        link, _, where = place.partition(":")
-        if link == "can":
-            require_known(can.parse_spec(where))
-        elif link == "ble":
-            ble.parse_spec(where)
+        require_known_place(place)
 
 
 def require_safe(settings: Settings) -> None:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Generic, TypeVar, cast
+from typing import Generic, TypeVar
 
 from teds_provision.errors import (
     AddressConflictError,
@@ -22,15 +22,13 @@ from teds_provision.errors import (
 )
 from teds_provision.links import Contact, LinkSettings, Notice, open_place, open_port, open_ports
 from teds_provision.links.ports import NoticeSink, Port
+from teds_provision.links.streaming import MeasuringLink
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.progress import Reporter
-
-if TYPE_CHECKING:
-    from teds_provision.links.can.port import CanPort
 
 _log = logging.getLogger(__name__)
 _SHOWN = 5
@@ -177,18 +175,18 @@ def _require_no_measurement(station: Station, port: Port, uuid: bytes) -> None:
     A session belongs to a pair of addresses: another one from here would end it. Without a named address the next free
     one is used; raises StoreLockedError if the named one is in use, or none is free.
     """
-    if port.via != "can" or not hasattr(port, "spec") or not station.measurements.is_running(uuid):
+    if not isinstance(port, MeasuringLink) or (bus := port.shared_bus) is None:
         return
-    bus = cast("CanPort", port)
-    spec = bus.spec
-    if station.measurements.source(spec.wire, spec.source).is_taken_alone:
-        for source in spec.sources:
-            if not station.measurements.source(spec.wire, source).is_taken_alone:
-                bus.use_source(source)
+    if not station.measurements.is_running(uuid):
+        return
+    if station.measurements.source(bus.wire, bus.source).is_taken_alone:
+        for source in bus.sources:
+            if not station.measurements.source(bus.wire, source).is_taken_alone:
+                port.use_source(source)
                 return
-        other = 0xF2 if spec.source == 0xF1 else 0xF1
+        other = 0xF2 if bus.source == 0xF1 else 0xF1
         raise StoreLockedError(
-            f"Node {uuid.hex()} is being measured from source address 0x{spec.source:02X}.",
+            f"Node {uuid.hex()} is being measured from source address 0x{bus.source:02X}.",
             hint=f"Add source=0x{other:02X} to --can, or end that measurement.",
         )
 

@@ -290,7 +290,7 @@ def test_by_topics_consumer_node_and_station_may_die(
     journal, running = Journal.of(hall), listen(hall, ros)
     driven = CanPort(f"{hall.can}&source=0xF6")
     try:
-        with driven.listen(lambda frame: frame.identifier >> 16 == 0x18EF) as ear:
+        with driven.listen_frames(lambda frame: frame.identifier >> 16 == 0x18EF) as ear:
             publishers.append(ros.publish())
             journal.moves()
             assert ear.get(30) is not None, "100 values a second go as Drive messages"

@@ -6,6 +6,7 @@ import threading
 
 import pytest
 
+from teds_provision.links.can.airtime import CanAirtime
 from teds_provision.measure.planning import BusShare, BusTime, NodePlans, plan_node
 from teds_provision.protocol.operation.budget import MOST_LOAD
 from teds_provision.teds.channel import Channel, ChannelKind, SampleForm, Timing
@@ -29,7 +30,9 @@ def measure(share: BusShare, order: list[tuple[bytes, Channel]]) -> dict[bytes, 
     return plans
 
 
-@pytest.mark.parametrize("time", [BusTime(), BusTime(500_000, 2_000_000)], ids=["classic", "fd"])
+@pytest.mark.parametrize(
+    "time", [BusTime(CanAirtime()), BusTime(CanAirtime(500_000, 2_000_000))], ids=["classic", "fd"]
+)
 def test_the_first_node_leaves_the_second_its_half(time: BusTime) -> None:
     plans = measure(BusShare(time, {FIRST, SECOND}), [(FIRST, FAST), (SECOND, FAST)])
     loads = [plan.load for plan in plans.values()]
@@ -40,38 +43,38 @@ def test_the_first_node_leaves_the_second_its_half(time: BusTime) -> None:
 @pytest.mark.parametrize("fast_first", [True, False])
 def test_a_node_that_wants_little_leaves_the_rest_to_the_fast_ones(fast_first: bool) -> None:
     order = [(FIRST, FAST), (SECOND, FAST), (THIRD, SLOW)]
-    plans = measure(BusShare(BusTime(), {FIRST, SECOND, THIRD}), order if fast_first else order[::-1])
+    plans = measure(BusShare(BusTime(CanAirtime()), {FIRST, SECOND, THIRD}), order if fast_first else order[::-1])
     assert plans[THIRD].slowed == ""
     for uuid in (FIRST, SECOND):
         assert plans[uuid].load == pytest.approx((MOST_LOAD - plans[THIRD].load) / 2, rel=0.1)
 
 
 def test_a_node_alone_or_beside_one_that_ended_takes_what_the_bus_bears() -> None:
-    share = BusShare(BusTime(), {FIRST, SECOND})
+    share = BusShare(BusTime(CanAirtime()), {FIRST, SECOND})
     share.drop_node(SECOND)
     assert measure(share, [(FIRST, FAST)])[FIRST].load == pytest.approx(MOST_LOAD, rel=0.1)
 
 
 def test_for_a_node_that_says_nothing_an_equal_part_is_kept() -> None:
-    plans = measure(BusShare(BusTime(), {FIRST, SECOND}), [(FIRST, FAST)])
+    plans = measure(BusShare(BusTime(CanAirtime()), {FIRST, SECOND}), [(FIRST, FAST)])
     assert plans[FIRST].load == pytest.approx(MOST_LOAD / 2, rel=0.1)
 
 
 def test_many_nodes_all_find_room() -> None:
     uuids = [bytes([number]) * 10 for number in range(40)]
-    plans = measure(BusShare(BusTime(), set(uuids)), [(uuid, FAST) for uuid in uuids])
+    plans = measure(BusShare(BusTime(CanAirtime()), set(uuids)), [(uuid, FAST) for uuid in uuids])
     assert min(plan.load for plan in plans.values()) > MOST_LOAD / 40 / 2
 
 
 def test_an_asked_rate_is_kept_or_refused_and_never_shared() -> None:
-    share = BusShare(BusTime(), {FIRST, SECOND})
+    share = BusShare(BusTime(CanAirtime()), {FIRST, SECOND})
     assert share.others(FIRST).taken == 0
     share.taken[SECOND] = 0.25
     assert share.others(FIRST).taken == 0.25
 
 
 def test_a_node_waits_for_the_others_to_say_what_they_want() -> None:
-    share = BusShare(BusTime(), {FIRST, SECOND})
+    share = BusShare(BusTime(CanAirtime()), {FIRST, SECOND})
     seen: list[set[bytes]] = []
 
     def first() -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
-from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -14,17 +14,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from teds_provision.links.can.bus_multiplexer import Listener
+from teds_provision.links.can.data_streams import CanDataListener, CanStreams
 from teds_provision.links.can.isotp import Frame
-from teds_provision.links.can.port import CanPort
+from teds_provision.links.streaming import MeasuringLink
 from teds_provision.measure.blocks import Block
 from teds_provision.measure.clock import ClockMap, Exchange, HostClock, MonotonicStamps, WallClock
 from teds_provision.measure.interpreter import StreamInterpreter
-from teds_provision.measure.stream_receiver import GATHER, CanStreamReceiver, ReceivedStream
+from teds_provision.measure.stream_receiver import GATHER, ReceivedStream, StreamReceiver
 from teds_provision.protocol.operation.can_frames import DataAddress, StreamAssembly, cut
 from teds_provision.protocol.operation.datagram import DatagramSealer, stream_key
 from teds_provision.protocol.operation.stream_commands import StreamKind, SubscribeReply
 from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
 from teds_provision.teds.calibration import fit
+from tests.pace import until
 from tests.teds.test_interpreter import sheet_of
 
 KEY, MS, SECOND = bytes(32), 1_000_000, 10**9
@@ -173,31 +176,56 @@ def test_a_period_of_the_block_is_one_of_the_nodes_clock_mapped() -> None:
         assert block.time == pytest.approx(WALL.unix(scene.clock.host(block.tick)), abs=1e-6)
 
 
-class Silent(CanStreamReceiver):
-    """A bus on which nothing comes but what the test hands over."""
+class Silent:
+    """A bus, for the test, on which nothing comes but the frames that it hands over."""
 
-    def _hear(self) -> None:
-        self._stop.wait(1.0)
+    place, lost = "can:x", 0
+
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+        self._streams = CanStreams()
+
+    def open_stream(self, node: int, stream: int, length: int) -> StreamAssembly:
+        return self._streams.open(node, stream, length, fd=False)
+
+    def close_stream(self, node: int, stream: int) -> None:
+        self._streams.close(node, stream)
+
+    @contextmanager
+    def listen(self) -> Iterator[CanDataListener]:
+        yield CanDataListener(cast(Listener, self), self._streams.opened)
+
+    def get_all(self, seconds: float) -> list[Frame]:
+        time.sleep(seconds)
+        frames, self.frames = self.frames, []
+        return frames
 
 
 def test_what_comes_before_its_stream_is_registered_is_no_loss() -> None:
     """On a busy machine the first message comes before the reply to Subscribe is looked at."""
-    scene = Scene(ago=-60, fd=False)
-    port = SimpleNamespace(spec=SimpleNamespace(source=0xF1), place="can:x")
-    with closing(Silent(cast(CanPort, port))) as hearing:
+    scene, port = Scene(ago=-60, fd=False), Silent()
+    with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
         frames = [
             Frame(DataAddress(0xF1, 0, piece.segment, 0x21).identifier, piece.data, at=scene.arrival(counter) / 1e9)
-            for counter in range(2)
+            for counter in range(3)
             for piece in cut(scene.message(counter), fd=False)
         ]
         old = replace(frames[0], at=time.monotonic() - 1.0)  # of a stream of the session before
         half = len(frames) // 2
-        hearing.expect(0x21, 0)
-        for frame in (old, *frames[:half]):
-            assert hearing._dispatch(frame) is None
+        scene.heard.pieces = hearing.expect(0x21, 0, scene.plan.length)
+        port.frames = [old, *frames[:half]]  # a whole message, and the beginning of the next
+        until(lambda: hearing._early[0x21, 0].messages)
         hearing.register(0x21, 0, scene.heard)
-        for frame in frames[half:]:
-            assert hearing._dispatch(frame) is scene.heard
-        scene.heard.finish()
+        port.frames = frames[half:]
+        until(lambda: scene.heard.receiver.counts.good == 3)
     counts = scene.heard.receiver.counts
-    assert (counts.good, counts.lost, counts.bad, scene.heard.assembly.wrong) == (2, 0, 0, 0)
+    assert (counts.good, counts.lost, counts.bad, scene.heard.pieces.wrong) == (3, 0, 0, 0)
+
+
+def test_a_stream_that_is_forgotten_is_taken_no_more_by_its_link() -> None:
+    scene, port = Scene(ago=-60, fd=False), Silent()
+    with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
+        scene.heard.pieces = hearing.expect(0x21, 0, scene.plan.length)
+        hearing.register(0x21, 0, scene.heard)
+        assert hearing.forget(0x21, 0) is scene.heard
+        assert not port._streams.opened

@@ -14,10 +14,11 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import AddressConflictError, LinkError
+from teds_provision.links.can.discovery import BELIEVED, SOON, CanDiscovery
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
-from teds_provision.measure.discovery import BELIEVED, LEAST, SOON, BroadcastPace, CanDiscovery
-from teds_provision.measure.presence import Presence, Sighting
+from teds_provision.links.discovery import LEAST, BroadcastPace, Sighting
+from teds_provision.measure.presence import Presence
 from teds_provision.ncap.nodes.link_watch import CHECK, MAX_PARALLEL, PresenceCheck
 from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState

@@ -12,10 +12,11 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import AddressConflictError, NodeRefusedError, NoNodeError, PolicyError
+from teds_provision.links.can.link import conflict
+from teds_provision.links.discovery import PolledDiscovery, Sighting
 from teds_provision.links.ports import Contact
 from teds_provision.measure.clock import ClockMap, Exchange
-from teds_provision.measure.discovery import BleDiscovery
-from teds_provision.measure.presence import MOST, TWIN, Presence, Sighting
+from teds_provision.measure.presence import MOST, TWIN, Presence
 from teds_provision.measure.request import Requirements
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.retry_policy import RetryPolicy
@@ -81,7 +82,7 @@ class EmptyAir:
 
 def test_who_asks_a_look_out_that_has_nothing_to_do_waits_for_one_round_alone() -> None:
     air: Any = EmptyAir()
-    lookout = BleDiscovery(air, Presence())
+    lookout = PolledDiscovery(air, Presence())
     began = time.monotonic()
     lookout.discover()
     lookout.discover()
@@ -173,7 +174,7 @@ def test_nothing_is_opened_under_an_address_that_two_nodes_have() -> None:
     told: list[str] = []
     sightings = Presence(note=told.append)
     sightings.add_sighting(seen(ONE, 7))
-    sightings.conflict("can:x", 7)
+    sightings.conflict("can:x", 7, conflict(7))
     with pytest.raises(AddressConflictError):
         find(sightings, ONE)
     assert told

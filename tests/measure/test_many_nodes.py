@@ -34,7 +34,7 @@ def test_fifty_nodes_are_measured_at_once(hall: Hall) -> None:
     port = CanPort(f"{hall.can}&source=0xF7")
 
     def count() -> None:
-        with port.listen(lambda frame: frame.identifier == FUNCTIONAL | 0xF1) as ear:
+        with port.listen_frames(lambda frame: frame.identifier == FUNCTIONAL | 0xF1) as ear:
             while not stop.is_set():
                 asked[0] += ear.get(0.1) is not None
 

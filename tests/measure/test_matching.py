@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.errors import NoRoomError, UsageError
+from teds_provision.links.can.airtime import CanAirtime
 from teds_provision.measure.blocks import ChannelFacts, StationFacts
 from teds_provision.measure.matching import NodeLoad, NodeMatch
 from teds_provision.measure.planning import BusShare, BusTime
@@ -47,7 +48,7 @@ def test_a_node_s_array_is_no_channel_s_topic() -> None:
 
 def test_those_that_come_together_share_and_those_that_run_keep_what_they_have() -> None:
     """What a newcomer wants is known from its datasheet, so nobody waits for it to say so."""
-    share = BusShare(BusTime())
+    share = BusShare(BusTime(CanAirtime()))
     first, second, third = (bytes([item]) * 10 for item in (1, 2, 3))
     share.expect([first, second], 0.5)
     assert share.others(first, sharing=True).taken == pytest.approx(0.3), "half of the room is the other one's"

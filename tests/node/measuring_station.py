@@ -71,7 +71,7 @@ class MeasuringStation(SealedLine):
     def __init__(self, spec: str, uuid: bytes, address: int) -> None:
         self.port = CanPort(spec)
         self.address, self.fd = address, "fd=1" in spec
-        self.ear: Listener = self.port.listen(lambda frame: data_address(frame.identifier) is not None)
+        self.ear: Listener = self.port.listen_frames(lambda frame: data_address(frame.identifier) is not None)
         super().__init__(self.port.link(address), uuid)
         self.clock = self.read_clock()
 

@@ -19,12 +19,15 @@ from typing import Final
 from teds_provision.errors import LinkError, NodeRefusedError, NoNodeError, NoReaderError, TedsProvisionError
 from teds_provision.files import read_limited, whole_file
 from teds_provision.links.ble.adapter import Adapter
+from teds_provision.links.ble.airtime import BleAirtime
 from teds_provision.links.ble.connection import BleConnection
 from teds_provision.links.ble.link import BleLink, Loop
 from teds_provision.links.ble.spec import parse_spec
 from teds_provision.links.ports import BLE, LISTEN_SECONDS, Capabilities, Contact, Notice, NoticeSink, Trace
+from teds_provision.links.streaming import DataListener, DataMessage, MeasuringLink, StreamPieces
 from teds_provision.protocol.messages.frames import IDENTIFY, decode_reply
 from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.protocol.operation.can_frames import read_ble_frame
 
 # Which node was met at which Bluetooth address, kept from command to command (operation.md section 7). A hint.
 #
@@ -97,19 +100,20 @@ def open_port(where: str, trace: Trace | None = None) -> BlePort:
     return BlePort(where, trace)
 
 
-@dataclass(frozen=True)
-class DataMessage:
-    """A data message as it came: ``connection`` is the number of its connection, ``at`` monotonic ns."""
+@dataclass
+class _WholeMessages:
+    """A message is one notification, so none is put together from pieces."""
 
-    connection: int
-    octets: bytes
-    at: int
+    wrong: int = 0
 
 
-class BlePort:
-    """Finds nodes through one Bluetooth adapter; see ``links.ports.Port``. Thread-safe."""
+class BlePort(MeasuringLink):
+    """Finds nodes through one Bluetooth adapter, and measures; see ``links.ports.Port``. Thread-safe.
 
-    via: Final = "ble"
+    A node's number is that of its connection. One that streams is not given up for another node.
+    """
+
+    via = "ble"
 
     def __init__(self, spec_text: str, trace: Trace | None = None) -> None:
         self.trace = trace
@@ -120,6 +124,7 @@ class BlePort:
         self._connections: dict[str, BleConnection] = {}
         self._known = RememberedNodes(cache_file())
         self._data: queue.Queue[DataMessage] = queue.Queue(_MOST_HELD)
+        self._streams: set[tuple[int, int]] = set()  # numbers of connection and stream
         self._heard = self._closed = False
         self.lost = 0  # data messages that were dropped for lack of time
         self._transaction = secrets.randbelow(1 << 16)
@@ -147,30 +152,60 @@ class BlePort:
             self._loop.run(self._all_down())
         self._loop.stop()
 
+    # -- measuring and acting --------------------------------------------------------------------------------------
+
+    def open_stream(self, node: int, stream: int, length: int) -> StreamPieces:
+        """Take data messages of a stream from now on; its connection is kept."""
+        del length
+        with self._lock:
+            self._streams.add((node, stream))
+            self._keep(node)
+        return _WholeMessages()
+
+    def close_stream(self, node: int, stream: int) -> None:
+        """Take them no more."""
+        with self._lock:
+            self._streams.discard((node, stream))
+            self._keep(node)
+
     @contextmanager
-    def listen(self) -> Iterator[Callable[[float], DataMessage | None]]:
-        """Hear data messages: gives a function that waits so many seconds for the next one."""
+    def listen(self) -> Iterator[DataListener]:
+        """Hear the data messages of every connection."""
         self._heard = True
         try:
-            yield self._next_data
+            yield self
         finally:
             self._heard = False
 
-    def link(self, number: int, notice: NoticeSink | None = None) -> BleLink:
+    def get_all(self, seconds: float) -> list[DataMessage]:
+        """Return the data messages that wait; if there are none, wait ``seconds`` for the next one."""
+        messages: list[DataMessage] = []
+        with suppress(queue.Empty):
+            messages.append(self._data.get(timeout=seconds))
+            while True:
+                messages.append(self._data.get_nowait())
+        return messages
+
+    def airtime(self, node: int | None = None) -> BleAirtime:
+        """Return the airtime by the MTU of a connection; None: by the least."""
+        return BleAirtime() if node is None else BleAirtime(self.link(node).mtu)
+
+    def drive(self, node: int, message: bytes) -> None:
+        """Write a Drive message; raises LinkError."""
+        self.link(node).drive(message)
+
+    def link(self, node: int, notice: NoticeSink | None = None) -> BleLink:
         """Return the link over the connection of this number; raises NoNodeError if there is none."""
         connection = next(
-            (ble_connection for ble_connection in self._connections.values() if ble_connection.number == number), None
+            (ble_connection for ble_connection in self._connections.values() if ble_connection.number == node), None
         )
         if connection is None:
             raise NoNodeError("That node is no longer known here.")
         return BleLink(self._loop, connection, self.next_transaction, self._make_room, notice or _silently)
 
-    def mtu(self, number: int) -> int:
-        """Return the ATT MTU of a connection, 23 if it is absent."""
-        return self.link(number).mtu
-
-    def keep(self, number: int, *, streaming: bool) -> None:
-        """Mark a connection as used by a measurement or not, so that it is not given up for another node."""
+    def _keep(self, number: int) -> None:
+        """Mark a connection as used by a measurement or not, so that it is not given up for another node; locked."""
+        streaming = any(node == number for node, _ in self._streams)
         for connection in self._connections.values():
             if connection.number == number:
                 connection.streaming = streaming
@@ -380,17 +415,13 @@ class BlePort:
         return True
 
     def _take_data(self, connection: int, octets: bytes) -> None:
-        if self._heard:
-            try:
-                self._data.put_nowait(DataMessage(connection, octets, time.monotonic_ns()))
-            except queue.Full:
-                self.lost += 1
-
-    def _next_data(self, seconds: float) -> DataMessage | None:
+        read = read_ble_frame(octets) if self._heard else None
+        if read is None or (connection, read[0]) not in self._streams:
+            return
         try:
-            return self._data.get(timeout=seconds)
-        except queue.Empty:
-            return None
+            self._data.put_nowait(DataMessage(connection, *read, time.monotonic_ns()))
+        except queue.Full:
+            self.lost += 1
 
     async def _all_down(self) -> None:
         for connection in self._connections.values():

@@ -61,10 +61,10 @@ class WatchedPort(Protocol):
     def next_transaction(self) -> int:
         """Return a transaction number, 0 to 255."""
 
-    def identify(self, address: int, *, seconds: float = ...) -> Identity | None:
+    def identify(self, node: int, *, seconds: float = ...) -> Identity | None:
         """Ask one address for Identify; None if there is no answer within ``seconds``."""
 
-    def tell_of_rivals(self, notice: NoticeSink) -> None:
+    def report_rivals(self, notice: NoticeSink) -> None:
         """Report other stations that use our source address."""
 
 
@@ -105,7 +105,7 @@ class Arrivals:
         self._conflicts = clashing
         if not stop.is_set():
             self._say_who_left(clashing)
-            self._port.tell_of_rivals(self._notice)
+            self._port.report_rivals(self._notice)
 
     def pause(self, stop: threading.Event) -> None:
         """Wait until everyone may be asked again, or a node announces itself; what a round took counts.

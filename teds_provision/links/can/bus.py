@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import functools
-import importlib
 import logging
 import re
 import select
@@ -18,7 +16,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from teds_provision.errors import LinkError, NoReaderError, UsageError
-from teds_provision.lazy import install_command, late
+from teds_provision.lazy import install_command
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.multicast import Multicast, of_bus, written
 from teds_provision.links.can.pacing import Pacer
@@ -26,11 +24,7 @@ from teds_provision.links.can.spec import CanSpec
 from teds_provision.links.ports import Trace
 
 if TYPE_CHECKING:
-    import inspect
-
     import can
-else:
-    inspect = late("inspect")  # for a bus with special keys
 
 
 # Our own frames, returned by an interface that cannot distinguish them: udp_multicast, SocketCAN.
@@ -87,12 +81,6 @@ _BUS_OFF: Final = 0x40
 """Error class of a SocketCAN error frame (linux/can/error.h, CAN_ERR_BUSOFF)."""
 
 
-_PICKED: Final = re.compile(r"""kwargs(?:\.get\(|\.pop\(|\[)\s*["'](\w+)["']|:param [^:\n]*?(\w+):""")
-"""A key that an interface picks out of what it is given, or that its documentation names."""
-_ANYWHERE: Final = frozenset({"bitrate", "data_bitrate", "receive_own_messages", "timing"})
-_NOT_KEYS: Final = frozenset({"self", "args", "kwargs", "channel", "can_filters", "interface", "fd", ""})
-
-
 _PACKAGES: Final = {
     "gs_usb": "python-can[gs-usb]",
     "canalystii": "python-can[canalystii]",
@@ -120,7 +108,7 @@ _LIBRARIES: Final = {
 """Libraries that come from the maker of the adapter."""
 
 
-__all__ = ["Bus", "Frame", "clock_is_ours", "known_keys", "open_bus", "require_known"]
+__all__ = ["Bus", "Frame", "clock_is_ours", "open_bus"]
 
 
 class Bus:
@@ -306,7 +294,7 @@ def open_bus(spec: CanSpec, filters: Sequence[tuple[int, int]] = ()) -> can.BusA
 
     for name in ("can", "isotp"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    require_known(spec)
+    spec.require_known()
     options = _options(spec)
     try:
         bus = _opened(spec, options)
@@ -330,39 +318,6 @@ def open_bus(spec: CanSpec, filters: Sequence[tuple[int, int]] = ()) -> can.BusA
     if spec.interface == "socketcan" and filters:
         bus.set_filters([{"can_id": value, "can_mask": mask, "extended": True} for value, mask in filters])
     return bus
-
-
-def require_known(spec: CanSpec) -> None:
-    """Raise UsageError for a key that the interface does not have: python-can silently ignores it."""
-    if not spec.options:
-        return
-    known = known_keys(spec.interface)
-    for key, _ in spec.options:
-        if known and key not in known:
-            own = ", ".join(sorted(known | {"node", "source", "pace", "fd"}))
-            raise UsageError(f"--can {spec.interface} has no key {key!r}.", hint=f"It has: {own}.")
-
-
-@functools.cache
-def known_keys(interface: str) -> frozenset[str]:
-    """Return the keys of a python-can interface: arguments of its class and its bases, and those that it reads by name.
-
-    Empty if they cannot be determined: an interface whose driver is not installed, or of another package.
-    """
-    from can.interfaces import BACKENDS
-
-    try:
-        module, name = BACKENDS[interface]
-        if not module.startswith("can."):
-            return frozenset()
-        kinds = [kind for kind in getattr(importlib.import_module(module), name).__mro__ if kind is not object]
-        makers = [kind.__init__ for kind in kinds if "__init__" in vars(kind)]
-        source = "".join(map(inspect.getsource, makers))
-    except Exception:  # noqa: BLE001  a driver's library that is missing raises anything
-        return frozenset()
-    named = {key for make in makers for key in inspect.signature(make).parameters}
-    picked = {key for found in _PICKED.findall(source) for key in found}
-    return frozenset(named | picked | _ANYWHERE) - _NOT_KEYS
 
 
 def _multicast(bus: can.BusABC, spec: CanSpec) -> Multicast | None:

@@ -6,15 +6,19 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from shlex import quote
 from typing import Final
 
-from teds_provision.errors import LinkError, NoNodeError
+from teds_provision.errors import AddressConflictError, LinkError, NoNodeError
+from teds_provision.links.can.airtime import CanAirtime
 from teds_provision.links.can.arrivals import Arrivals
 from teds_provision.links.can.bus import Bus
 from teds_provision.links.can.bus_multiplexer import BusMultiplexer, Listener
+from teds_provision.links.can.data_streams import CanStreams, rival_measures
+from teds_provision.links.can.discovery import CanDiscovery
 from teds_provision.links.can.identify_broadcast import (
     LONGEST_SECONDS,
     SILENCE_SECONDS,
@@ -28,9 +32,12 @@ from teds_provision.links.can.identify_broadcast import (
 )
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.link import CanLink, conflict
-from teds_provision.links.can.spec import LAST_NODE, parse_spec
+from teds_provision.links.can.spec import LAST_NODE, CanSpec, parse_spec
+from teds_provision.links.discovery import SightingSink
 from teds_provision.links.ports import CAN, Capabilities, Contact, Notice, NoticeSink, Trace
+from teds_provision.links.streaming import DataListener, MeasuringLink, StreamPieces
 from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.operation.can_frames import DriveAddress, cut, trigger_identifier
 
 _HELLO_SECONDS: Final = 1.0
 _GUESS_SECONDS: Final = 0.1
@@ -52,10 +59,14 @@ def open_port(where: str, trace: Trace | None = None) -> CanPort:
     return CanPort(where, trace)
 
 
-class CanPort:
-    """Finds nodes on one CAN bus; see ``links.ports.Port``. ``spec_text`` is the value of ``--can``. Thread-safe."""
+class CanPort(MeasuringLink):
+    """Finds nodes on one CAN bus, and measures; see ``links.ports.Port``.
 
-    via: Final = "can"
+    ``spec_text`` is the value of ``--can``. Thread-safe.
+    """
+
+    via = "can"
+    poll_seconds = 30.0
 
     def __init__(self, spec_text: str, trace: Trace | None = None) -> None:
         self.spec = parse_spec(spec_text)
@@ -65,6 +76,7 @@ class CanPort:
         self._transaction = secrets.randbelow(256)
         self._lock = threading.Lock()
         self._rival_told = False
+        self._streams = CanStreams()
 
     @property
     def capabilities(self) -> Capabilities:
@@ -86,20 +98,21 @@ class CanPort:
         self.close()
         self.spec = replace(self.spec, source=source)
 
-    def listen(self, wanted: Callable[[Frame], bool]) -> Listener:
-        """Hear every frame for which ``wanted`` is true, data frames and announcements above all.
-
-        See BusMultiplexer.
-        """
+    def listen_frames(self, wanted: Callable[[Frame], bool]) -> Listener:
+        """Hear every frame for which ``wanted`` is true; see BusMultiplexer."""
         return self.bus().listen(wanted)
 
     def send(self, frame: Frame) -> None:
-        """Put one frame on the bus (trigger, Drive); raises LinkError."""
+        """Put one frame on the bus; raises LinkError."""
         self.bus().send(frame)
 
-    def link(self, address: int) -> CanLink:
+    def link(self, node: int) -> CanLink:
         """Return the link to the node at this address, whichever it is."""
-        return CanLink(self.bus, self.next_transaction, address)
+        return CanLink(self.bus, self.next_transaction, node)
+
+    def contact(self, node: int, identity: Identity) -> Contact:
+        """Return a contact with the node at this address."""
+        return Contact(identity, self.link(node), address=node, trace=self.trace, bus=self.place)
 
     def next_transaction(self) -> int:
         """Return a transaction number, 0 to 255; the first of a process is random."""
@@ -115,7 +128,7 @@ class CanPort:
             bus.close()
 
     def identify(
-        self, address: int, *, seconds: float = _HELLO_SECONDS, until_announced: bool = False, once: bool = False
+        self, node: int, *, seconds: float = _HELLO_SECONDS, until_announced: bool = False, once: bool = False
     ) -> Identity | None:
         """Ask one address for Identify; None if there is no answer. Raises AddressConflictError, LinkError.
 
@@ -123,10 +136,55 @@ class CanPort:
         that asks because of the Announce need not wait for this one.
         ``once``: send one question, even if frames of its answer are missing.
         """
-        link = self.link(address)
+        link = self.link(node)
         if until_announced:
-            link.hopeless = partial(self.bus().announced_since, address, time.monotonic())
+            link.hopeless = partial(self.bus().announced_since, node, time.monotonic())
         return ask_one(partial(link.exchange_limited, tries=1, seconds=seconds), questions=1 if once else 2)
+
+    # -- measuring and acting --------------------------------------------------------------------------------------
+
+    def open_stream(self, node: int, stream: int, length: int) -> StreamPieces:
+        """Take data messages of a stream from now on; see MeasuringLink."""
+        return self._streams.open(node, stream, length, fd=self.spec.fd)
+
+    def close_stream(self, node: int, stream: int) -> None:
+        """Take them no more."""
+        self._streams.close(node, stream)
+
+    def listen(self) -> AbstractContextManager[DataListener]:
+        """Hear the data messages for this station; opens the bus again after it was lost."""
+        return self._streams.listen(self.bus())
+
+    def airtime(self, node: int | None = None) -> CanAirtime:
+        """Return the airtime of the bus: it is the same for every node."""
+        del node
+        return CanAirtime(self.spec.bitrate, self.spec.data_bitrate if self.spec.fd else None)
+
+    def drive(self, node: int, message: bytes) -> None:
+        """Send a Drive message; raises LinkError."""
+        identifier = DriveAddress(node, self.spec.source).identifier
+        for piece in cut(message, fd=self.spec.fd, drive=True):
+            self.send(Frame(identifier, piece.data, self.spec.fd))
+
+    def trigger(self, token: bytes) -> bool:
+        """Send the trigger frame; raises LinkError."""
+        self.send(Frame(trigger_identifier(self.spec.source), token))
+        return True
+
+    def discover(self, sightings: SightingSink, *, poll: float | None = None) -> CanDiscovery:
+        """Begin to find nodes: by announcements, and by asking everyone now and then."""
+        return CanDiscovery(self, sightings, poll=poll)
+
+    @property
+    def shared_bus(self) -> CanSpec:
+        """The bus as it was named, with this station's address."""
+        return self.spec
+
+    def require_sole_source(self) -> None:
+        """Raise AddressConflictError if data comes for our address, and another station sends from it."""
+        bus = self.bus()
+        if rival_measures(bus):
+            raise AddressConflictError(bus.conflicts.text, hint=bus.conflicts.hint)
 
     # -- finding ---------------------------------------------------------------------------------------------------
 
@@ -144,7 +202,7 @@ class CanPort:
         if self.spec.node is None and address is not None and 1 <= address <= LAST_NODE:
             # ask at the node's last address: there is no random wait, unlike after a broadcast
             identity = self.identify(address, seconds=_GUESS_SECONDS)
-            guessed = self._contact(address, identity) if identity is not None and wanted(identity) else None
+            guessed = self.contact(address, identity) if identity is not None and wanted(identity) else None
             if guessed is not None:
                 return guessed
         while (left := until - time.monotonic()) > 0:
@@ -193,7 +251,7 @@ class CanPort:
             if found.identities and time.monotonic() >= enough:
                 break
         if found.identities:
-            return [self._contact(node, identity) for node, identity in sorted(found.identities.items())]
+            return [self.contact(node, identity) for node, identity in sorted(found.identities.items())]
         if self.spec.node is None:
             raise NoNodeError(
                 f"No node answered on {self.spec.text} within {seconds:g} s.",
@@ -218,7 +276,7 @@ class CanPort:
             notice(Notice("unfinished", unfinished_text(found.unfinished)))
         for uuid, addresses in found.twice.items():
             notice(Notice("conflict", twice_text(uuid, addresses)))
-        self.tell_of_rivals(notice)
+        self.report_rivals(notice)
         return found
 
     def _asked_once(self, longest: float, silence: float = SILENCE_SECONDS) -> FunctionalAnswers:
@@ -253,7 +311,7 @@ class CanPort:
                     if lost:
                         lost = False
                         notice(Notice("reader-ready", f"The bus {self.spec.text} is back."))
-                    yield self._contact(address, identity)
+                    yield self.contact(address, identity)
                     if stop.is_set():
                         return
                 if lost:
@@ -267,15 +325,12 @@ class CanPort:
                     notice(Notice("reader-lost", f"{error.message} Waiting for it."))
                 stop.wait(_REOPEN_SECONDS)
 
-    def tell_of_rivals(self, notice: NoticeSink) -> None:
-        """Name another station under our source address, once."""
+    def report_rivals(self, notice: NoticeSink) -> None:
+        """Report another station under our source address, once."""
         rivals = self.bus().conflicts
         if not self._rival_told and rivals.seen():
             self._rival_told = True
             notice(Notice("conflict", f"{rivals.text} {rivals.hint}"))
-
-    def _contact(self, node: int, identity: Identity) -> Contact:
-        return Contact(identity, self.link(node), address=node, trace=self.trace, bus=self.place)
 
     def _at(
         self, node: int, wanted: Callable[[Identity], bool], notice: NoticeSink, told: set[bytes]
@@ -285,7 +340,7 @@ class CanPort:
         if identity is None:
             return None
         if wanted(identity):
-            return self._contact(node, identity)
+            return self.contact(node, identity)
         _report_unwanted(notice, told, node, identity)
         return None
 
@@ -300,15 +355,15 @@ class CanPort:
             if isinstance(news, FunctionalAnswers):
                 found = news
             elif wanted(news[1]):
-                return self._contact(*news)
+                return self.contact(*news)
         found = self.settled(found, time.monotonic() + min(LONGEST_SECONDS, seconds))
         for node in sorted(found.conflicts):
             notice(Notice("conflict", conflict_text(node)))
         for node, identity in sorted(found.identities.items()):
             if wanted(identity):
-                return self._contact(node, identity)
+                return self.contact(node, identity)
             _report_unwanted(notice, told, node, identity)
-        self.tell_of_rivals(notice)
+        self.report_rivals(notice)
         if found.conflicts:
             raise conflict(min(found.conflicts))
         return None

@@ -7,6 +7,7 @@ from typing import Final
 from urllib.parse import unquote
 
 from teds_provision.errors import UsageError
+from teds_provision.links.can.interface_keys import known_keys
 
 FIRST_STATION: Final = 0xF1
 LAST_STATION: Final = 0xF7
@@ -62,6 +63,16 @@ class CanSpec:
         """Identity of this bus: interface, channel, and the options that locate it."""
         where = sorted(f"{key}={value}" for key, value in self.options if key not in _HOW)
         return "?".join([self.text, *(["&".join(where)] if where else [])])
+
+    def require_known(self) -> None:
+        """Raise UsageError for a key that the interface does not have: python-can silently ignores it."""
+        if not self.options:
+            return
+        known = known_keys(self.interface)
+        for key, _ in self.options:
+            if known and key not in known:
+                own = ", ".join(sorted(known | {"node", "source", "pace", "fd"}))
+                raise UsageError(f"--can {self.interface} has no key {key!r}.", hint=f"It has: {own}.")
 
 
 def parse_spec(text: str) -> CanSpec:

@@ -48,7 +48,7 @@ class StreamTotals:
         self.lost += counts.lost
         self.late += counts.late + counts.stale + counts.overflow
         self.bad += counts.bad + counts.junk + counts.future + counts.back + counts.unasked + heard.wrong_pattern
-        self.bad += heard.assembly.wrong
+        self.bad += heard.pieces.wrong
         self.invalid_why = added(self.invalid_why, heard.interpreter.invalid)
         self.invalid = sum(invalid.count for invalid in self.invalid_why)
         self.clock_error = heard.bound if heard.bound is not None else self.clock_error
@@ -127,12 +127,17 @@ class NodeStreams:
     ) -> None:
         """Ask for a stream and hear it; its first sample is taken ``ahead`` seconds from now."""
         number = plan.subscribe.stream
-        bus.receiver.expect(address, number)
-        payload = trusted.node.request(plan.command(), "to stream")
-        with self.mapping:
-            reply = plan.accept(payload, self.clock.ticks_at(time.monotonic_ns()), after=self._run)
-        self._run = reply.run
         before = self.running.get(number)
+        pieces = bus.receiver.expect(address, number, plan.length)
+        try:
+            payload = trusted.node.request(plan.command(), "to stream")
+            with self.mapping:
+                reply = plan.accept(payload, self.clock.ticks_at(time.monotonic_ns()), after=self._run)
+        except BaseException:
+            if before is None:
+                bus.receiver.forget(address, number)
+            raise
+        self._run = reply.run
         receiver = Receiver(
             plan, reply, trusted.node.message_key, previous=before.receiver if before is not None else None
         )
@@ -146,8 +151,7 @@ class NodeStreams:
             monotone,
             raw_only=UNSIGNED if trusted.unsigned else "",
         )
-        assembly = bus.assembly(plan.length)
-        heard = ReceivedStream(receiver, assembly, interpreter, self.clock, self.mapping, self._deliver)
+        heard = ReceivedStream(receiver, pieces, interpreter, self.clock, self.mapping, self._deliver)
         heard.heard += ahead
         self.running[number] = heard
         self.totals.setdefault(number, StreamTotals(plan.layout.channels, plan.subscribe.period / 1e9))

@@ -9,12 +9,10 @@ import time
 from collections.abc import Callable, Sequence
 
 from teds_provision.errors import TedsProvisionError
-from teds_provision.links.can.isotp import Frame
-from teds_provision.links.can.port import CanPort
+from teds_provision.links.streaming import MeasuringLink
 from teds_provision.measure.node_supervisor import NodeSupervisor
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.verified_session import VerifiedSession
-from teds_provision.protocol.operation.can_frames import trigger_identifier
 from teds_provision.protocol.operation.stream_commands import Action
 from teds_provision.protocol.operation.subscription import TickBounds
 from teds_provision.protocol.operation.timing import START_AFTER_MARK, TriggerToken, mark_is_honest
@@ -31,11 +29,12 @@ def pull(common_start: CommonStart, keepers: Sequence[NodeSupervisor], note: Cal
     token = TriggerToken.draw()
     armed = _arm(token, keepers, note)
     ports = {keeper.bus.place: keeper.bus.port for keeper, _ in armed if keeper.bus is not None}
-    sent = {place: _send(port, token) for place, port in ports.items() if isinstance(port, CanPort)}
+    sent = {place: _send(port, token) for place, port in ports.items()}
     for keeper, trusted in armed:
-        if keeper.bus is None or keeper.bus.place not in sent:
+        between = sent.get(keeper.bus.place) if keeper.bus is not None else None
+        if between is None:
             continue
-        mark = _mark(keeper, trusted, *sent[keeper.bus.place], note)
+        mark = _mark(keeper, trusted, *between, note)
         if mark is None:
             continue
         common_start.begun(keeper.uuid, keeper.streams.clock, mark)
@@ -43,11 +42,10 @@ def pull(common_start: CommonStart, keepers: Sequence[NodeSupervisor], note: Cal
             heard.begin(mark + START_AFTER_MARK)
 
 
-def _send(port: CanPort, token: TriggerToken) -> tuple[int, int]:
-    """Send the trigger on one bus; return between which two times (monotonic ns) it went out."""
+def _send(port: MeasuringLink, token: TriggerToken) -> tuple[int, int] | None:
+    """Send the trigger on one link; return between which two times (monotonic ns) it went out, None if it has none."""
     before = time.monotonic_ns()
-    port.send(Frame(trigger_identifier(port.spec.source), token.octets))
-    return before, time.monotonic_ns() + HELD_BACK
+    return (before, time.monotonic_ns() + HELD_BACK) if port.trigger(token.octets) else None
 
 
 def _arm(

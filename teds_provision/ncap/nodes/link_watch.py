@@ -17,12 +17,10 @@ from typing import Any, Final, Protocol
 
 from teds_provision.errors import AddressConflictError, FrozenError, LinkError, NodeBusyError, TedsProvisionError
 from teds_provision.links import Contact, Notice, Port, Trace
-from teds_provision.links.ble.port import BlePort
-from teds_provision.links.can.port import CanPort
-from teds_provision.links.opening import open_place
+from teds_provision.links.discovery import Sighting
+from teds_provision.links.opening import capabilities_at, open_place
+from teds_provision.links.streaming import MeasuringLink
 from teds_provision.measure.buses import Buses
-from teds_provision.measure.discovery import POLL
-from teds_provision.measure.presence import Sighting
 from teds_provision.measure.sources import sole_user
 from teds_provision.measure.standing import is_listed
 from teds_provision.ncap.live import Live
@@ -47,7 +45,7 @@ PATIENCE: Final = (1.0, 3.0)  # seconds for the answer to the first question, an
 class PresenceCheck:
     """Asks the nodes of one bus. ``held`` returns nodes that other parts hear meanwhile: measured, or worked with."""
 
-    def __init__(self, port: CanPort, held: Callable[[str], bool]) -> None:
+    def __init__(self, port: MeasuringLink, held: Callable[[str], bool]) -> None:
         self._port, self._held = port, held
         self._asked: dict[str, float] = {}
         self._last = 0.0
@@ -91,8 +89,7 @@ MOST_KNOWN: Final = 512
 TELL_STRANGERS: Final = 10.0  # seconds between two words about how many strangers there are
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 LOOK_AGAIN: Final = 30.0  # seconds until a node that could not be looked at is looked at again
-POLL_AIR: Final = 15.0
-GONE_POLLS: Final = 2.5
+SILENT: Final = 37.5  # seconds after which a node has left that is not asked by itself
 LENDING: Final = 10.0
 LOOK: Final = 0.5
 
@@ -205,11 +202,9 @@ class LinkWatch:
 
     def _watch(self, port: Port) -> None:
         """See who comes until the link fails or the daemon ends."""
-        if isinstance(port, CanPort):
+        if isinstance(port, MeasuringLink):
             with sole_user(self._station, [port], "ncap run"):
-                self._watch_bus(port, POLL)
-        elif isinstance(port, BlePort):
-            self._watch_bus(port, POLL_AIR)
+                self._watch_bus(port)
         else:
             self._watch_reader(port)
 
@@ -217,14 +212,14 @@ class LinkWatch:
         for contact in port.watch(stop=self._anew, notice=self._notice):
             self._came(contact)
 
-    def _watch_bus(self, port: CanPort | BlePort, poll: float) -> None:
+    def _watch_bus(self, port: MeasuringLink) -> None:
         """Run a bus: discovery reports answering nodes (:meth:`on_sighting`).
 
         Here silent ones are noticed, and whether the bus works.
         """
         bus = self._buses.add(port)
-        bus.discovery.poll(poll)
-        asked = PresenceCheck(port, self._is_held) if isinstance(port, CanPort) else None
+        bus.discovery.poll(port.poll_seconds)
+        asked = PresenceCheck(port, self._is_held) if port.capabilities.connectionless else None
         while not self._stop.is_set():
             if self._anew.is_set():
                 self._anew.clear()
@@ -233,8 +228,8 @@ class LinkWatch:
                     bus.discovery.discover()
             failure = bus.discovery.failure
             self._publish_state("up" if failure is None else "down", failure)
-            if isinstance(port, CanPort) and failure is None:
-                port.tell_of_rivals(self._notice)
+            if failure is None:
+                port.report_rivals(self._notice)
             if asked is not None and failure is None:
                 for uuid, sighting in asked.look(dict(self._known)):
                     if sighting is not None:
@@ -242,7 +237,7 @@ class LinkWatch:
                     elif not self._is_held(uuid):
                         self._gone(uuid)
             else:
-                self._see_who_left(GONE_POLLS * POLL_AIR)
+                self._see_who_left(SILENT)
             self._tell_of_strangers()
             self._anew.wait(LOOK)
 
@@ -286,7 +281,7 @@ class LinkWatch:
 
     def borrow(self, who: object) -> bool:
         """Lend the reader to a command of this machine until it is given back; False if this is no reader."""
-        if not self.place.startswith("nfc:"):
+        if not capabilities_at(self.place).tapped:
             return False
         self._borrowers.add(id(who))
         self._anew.set()

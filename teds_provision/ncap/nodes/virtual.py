@@ -26,9 +26,10 @@ from typing import Any, Final
 from teds_provision.errors import NotFoundError, UsageError
 from teds_provision.files import write_whole
 from teds_provision.handover.life import DECOMMISSIONED
+from teds_provision.links.opening import with_source
 from teds_provision.links.ports import free_port
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.settings import own_source, with_source
+from teds_provision.ncap.settings import own_source
 from teds_provision.node.node_template import create
 from teds_provision.node.sources.base import seconds_of
 from teds_provision.protocol.announce import default_can_address

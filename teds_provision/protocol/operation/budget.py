@@ -7,6 +7,8 @@ from typing import Final
 from teds_provision.protocol.operation.can_frames import FD_OCTETS, fd_length, frames_of
 
 MILLION: Final = 10**6
+MOST_OCTETS: Final = 240
+"""Octets of the longest data message, whatever the link."""
 MOST_LOAD: Final = 0.6
 """Share of a CAN bus that a station lets data frames take, at worst-case stuffing."""
 BLE_OVERHEAD: Final = 4

@@ -19,7 +19,6 @@ TAG_OCTETS: Final = 8
 COUNTER_OCTETS: Final = 4
 
 """Counter, flags and tag."""
-MOST_OCTETS: Final = 240
 LAST_COUNTER: Final = 0xFFFFFFFF
 LAST_RUN: Final = 0xFFFF
 DRIVE_HEAD: Final = 4

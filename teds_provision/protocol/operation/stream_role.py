@@ -14,7 +14,6 @@ from teds_provision.protocol.operation.claims import Claims
 from teds_provision.protocol.operation.commands import channel_list, demand_form
 from teds_provision.protocol.operation.datagram import (
     LAST_RUN,
-    MOST_OCTETS,
     DatagramSealer,
     DriveValues,
     Layout,
@@ -138,7 +137,7 @@ class StreamRole:
         demand(max(1, *shortest) <= asked.period <= LONGEST_PERIOD, Reason.OUT_OF_RANGE)
         demand(self._hardware.keeps(asked.period), Reason.OUT_OF_RANGE)
         length = asked.length(layout.octets)
-        most = min(MOST_OCTETS, port.mtu - budget.BLE_OVERHEAD) if port.kind == "ble" else MOST_OCTETS
+        most = min(budget.MOST_OCTETS, port.mtu - budget.BLE_OVERHEAD) if port.kind == "ble" else budget.MOST_OCTETS
         demand(length <= most, Reason.TOO_LARGE)
         old = self._find(session, asked.stream)
         others = [stream for stream in self._streams if stream is not old]

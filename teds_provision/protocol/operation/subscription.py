@@ -13,10 +13,10 @@ from typing import Final, NamedTuple
 
 from teds_provision.errors import NotAuthenticError
 from teds_provision.protocol.messages.frames import Command
+from teds_provision.protocol.operation.budget import MOST_OCTETS
 from teds_provision.protocol.operation.commands import NOT_VALID, TEST_PATTERN
 from teds_provision.protocol.operation.datagram import (
     COUNTER_OCTETS,
-    MOST_OCTETS,
     DatagramSealer,
     Layout,
     pattern,

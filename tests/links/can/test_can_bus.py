@@ -8,7 +8,8 @@ import can
 import pytest
 
 from teds_provision.errors import LinkError, UsageError
-from teds_provision.links.can.bus import Bus, Frame, known_keys
+from teds_provision.links.can.bus import Bus, Frame
+from teds_provision.links.can.interface_keys import known_keys
 from teds_provision.links.can.spec import parse_spec
 from tests.pace import PATIENCE
 

@@ -336,7 +336,7 @@ def test_a_late_reply_to_a_station_that_died_makes_no_second_node(hub: Hub) -> N
     with serving(hub.spec, EchoNode(0x21)), opened(hub.spec) as port, opened(hub.spec + "&source=0xF2") as other:
 
         def reply_late() -> None:
-            with other.listen(lambda frame: frame.identifier == FUNCTIONAL | 0xF1) as ear:
+            with other.listen_frames(lambda frame: frame.identifier == FUNCTIONAL | 0xF1) as ear:
                 listening.set()
                 asked = ear.get(PATIENCE)
             assert asked is not None

@@ -36,7 +36,7 @@ def answering(hub: Hub, answer: Callable[[int], None]) -> threading.Event:
 def test_flow_controls_that_nobody_waits_for_do_not_pile_up(hub: Hub) -> None:
     port = CanPort(hub.spec)
     try:
-        with port.listen(lambda frame: frame.identifier == ANNOUNCE) as ear:
+        with port.listen_frames(lambda frame: frame.identifier == ANNOUNCE) as ear:
             for number in range(500):
                 hub.send(TO_US, bytes([0x30 + number % 3]) + WAIT[1:])
             hub.send(ANNOUNCE, bytes(8))

@@ -136,7 +136,7 @@ def test_an_exchange_is_given_up_when_nobody_hopes_for_its_reply(hub: Hub) -> No
 def test_a_listener_hears_what_it_wants_beside_an_exchange(hub: Hub, nodes: Start) -> None:
     nodes(hub.spec, 0x21)
     port = CanPort(hub.spec)
-    with port.listen(lambda frame: frame.identifier == ANNOUNCE) as ear:
+    with port.listen_frames(lambda frame: frame.identifier == ANNOUNCE) as ear:
         before = time.monotonic()
         hub.send(ANNOUNCE, b"\x01\x02abcd\x00\x00")
         assert port.link(0x21).exchange(write(b"abc")) == b"cba"
@@ -150,7 +150,7 @@ def test_a_listener_hears_what_it_wants_beside_an_exchange(hub: Hub, nodes: Star
 def test_a_listener_that_does_not_read_loses_what_does_not_fit_and_knows_it(hub: Hub) -> None:
     port = CanPort(hub.spec)
     ear = port.bus().listen(lambda frame: True, most=10)
-    fence = port.listen(lambda frame: frame.data == b"end")
+    fence = port.listen_frames(lambda frame: frame.data == b"end")
     for number in range(25):
         hub.send(ANNOUNCE, bytes([number]))
     hub.send(ANNOUNCE, b"end")
@@ -163,7 +163,7 @@ def test_a_listener_that_does_not_read_loses_what_does_not_fit_and_knows_it(hub:
 def test_a_bus_that_goes_away_wakes_whoever_waits() -> None:
     hub = Hub()
     port = CanPort(hub.spec)
-    ear = port.listen(lambda frame: True)
+    ear = port.listen_frames(lambda frame: True)
     threading.Timer(0.2, hub.close).start()
     results = in_threads(lambda number: ear.get(PATIENCE) if number else port.link(0x21).exchange(write(b"x")), 2)
     assert [isinstance(result, LinkError) for result in results] == [True, True], results

@@ -7,8 +7,9 @@ import dataclasses
 import pytest
 
 from teds_provision.errors import GarbledError, NotAuthenticError
+from teds_provision.protocol.operation.budget import MOST_OCTETS
 from teds_provision.protocol.operation.commands import TEST_PATTERN
-from teds_provision.protocol.operation.datagram import MOST_OCTETS, DatagramSealer, Layout, drive_key, stream_key
+from teds_provision.protocol.operation.datagram import DatagramSealer, Layout, drive_key, stream_key
 from teds_provision.protocol.operation.driving import Driver
 from teds_provision.protocol.operation.stream_commands import (
     NONE,
