@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # Compiled modules are kept: each of five pytests would else rewrite every assert again, 13 s of CPU each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo demo-page page-picture test test-system lint types unit compiled quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale test-rclpy fuzz faults pairs model house words man coverage mutants soak api test-other vectors-c sbom firmware firmware-faults firmware-zephyr firmware-arm firmware-coverage firmware-soak test-c room clean
+.PHONY: demo demo-page page-picture test test-system lint types unit compiled quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale bench-short test-rclpy fuzz faults pairs model house words man coverage mutants soak api test-other vectors-c sbom firmware firmware-faults firmware-zephyr firmware-arm firmware-coverage firmware-soak test-c room clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -280,8 +280,12 @@ docs: $(VENV)/.dev
 	$(BIN)/python scripts/api.py build/site/python
 
 # Before a release: the gate, and what proves the same at greater length.
-test-all: test
+test-all: test bench-short
 	$(BIN)/python -m pytest tests/release tests/plant/test_returned_pages.py tests/ncap/test_by_topics.py -m soak -rs
+
+# Each benchmark at its smallest size, so that none breaks unseen; the figures mean nothing.
+bench-short: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.short
 
 # The steps of service/Containerfile on a Debian root, and the demo in it as its user on a read-only root. As root, with
 # debootstrap; no container engine is needed. Keeps the bare root in build/container for the next time.
