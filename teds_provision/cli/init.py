@@ -27,6 +27,7 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     "teds-provision init --keystore file",
     "teds-provision init --name lab --request lab.request",
     "teds-provision init --certificate lab.cert",
+    "teds-provision --home new init --ca owner-ca.pem",
 )
 @click.option("--name", help="Station name, shown in every datasheet it signs.")
 @click.option(
@@ -40,16 +41,32 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option(
     "--certificate", type=FileToRead(), metavar="CERT", help='Install the certificate that "trust ca sign" issued.'
 )
+@click.option(
+    "--ca",
+    "ca_file",
+    type=FileToRead(),
+    metavar="FILE",
+    help='Use the owner\'s CA key from this file of "trust ca export" instead of creating one.',
+)
 @yes_option
 @pass_app
 def init(
-    app: App, name: str | None, keystore: str | None, request: Path | None, certificate: Path | None, yes: bool
+    app: App,
+    name: str | None,
+    keystore: str | None,
+    request: Path | None,
+    certificate: Path | None,
+    ca_file: Path | None,
+    yes: bool,
 ) -> None:
     """Create this base station's identity and CA key; a second run shows them.
 
     The keys are kept in the OS keyring, in a PKCS #11 token, or encrypted with a passphrase. Stations of one owner
-    share one CA: --request here, "trust ca sign" on the station with the CA key, --certificate here.
+    share one CA: --request here, "trust ca sign" on the station with the CA key, --certificate here. If no station with
+    that CA is left but its exported file is, use --ca.
     """
+    if ca_file is not None and (request is not None or certificate is not None):
+        raise click.UsageError("Use --ca alone: the key in its file certifies this station at once.")
     if request is not None and certificate is not None:
         raise click.UsageError("Use --request first, then --certificate once the CA has signed it.")
     if request is not None:
@@ -58,6 +75,11 @@ def init(
     if certificate is not None:
         _adopt(app, certificate, yes)
         why = "this station was certified"
+        station = app.station()
+    elif ca_file is not None:
+        passphrase = app.ask_secret("Passphrase of the CA key's file")
+        handover.trust.found_under(app.home, ca_file, passphrase, name=name, keystore=keystore, ask=app.ask_secret)
+        why = f"with the CA key of {ca_file}"
         station = app.station()
     else:
         station, why = station_room.station.initialise(

@@ -15,7 +15,7 @@ import click
 
 from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.sanitize import sanitize
-from teds_provision.talk.progress import NOTHING, Reporter, SilentReporter, StepResult
+from teds_provision.talk.progress import FAILED, NOTHING, SKIPPED, Reporter, SilentReporter, StepResult
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from teds_provision.links import Notice
 
 _PIPE_COLUMNS = 1000
+_MARKS = {NOTHING: "·", SKIPPED: "–", FAILED: "✗"}
+_STYLES = {NOTHING: "dim", SKIPPED: "dim", FAILED: "red"}
 
 
 def count_of(number: int) -> str:
@@ -132,7 +134,7 @@ class LineReporter:
 
 def line_of(step: StepResult) -> str:
     """``✓ agree       0.05 s  key epoch 1``."""
-    mark = "·" if step.result == NOTHING else "✓"
+    mark = _MARKS.get(step.result, "✓")
     detail = step.detail if step.result != NOTHING else f"{NOTHING}{': ' if step.detail else ''}{step.detail}"
     whose = f"{step.of}: " if step.of else ""
     return f"{whose}{mark} {step.name:<11} {step.seconds:6.2f} s  {detail}".rstrip()
@@ -156,7 +158,7 @@ class LiveReporter:
     def finished(self, step: StepResult) -> None:
         """Put the step above the live line."""
         self._stop()
-        style = "dim" if step.result == NOTHING else "green"
+        style = _STYLES.get(step.result, "green")
         self._console.print(line_of(step), style=style, markup=False)
 
     def notice(self, notice: Notice) -> None:

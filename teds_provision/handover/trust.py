@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
@@ -160,6 +161,30 @@ def adopt_certificate(home: Path, certificate: Certificate, *, ask: Ask) -> Stat
         station.close()
         raise
     return station
+
+
+def found_under(home: Path, path: Path, passphrase: str, *, name: str | None, keystore: str | None, ask: Ask) -> None:
+    """Make a station of an owner whose CA key survived in a file of ``trust ca export``; the key comes into its vault.
+
+    Run again after a cut, it carries on. Raises WrongPassphraseError, VaultError (no such file), PolicyError (the home
+    has a station of another CA).
+    """
+    owner = SoftwareKey.from_secret(vaults.ca_file.read_ca(path, passphrase))
+    if has_store(home):
+        with Store.open(home) as store:
+            identity = Station(store, ask).identity
+            if identity.is_complete() and identity.ca != owner.point:
+                raise PolicyError(
+                    f"{home} holds a station of another CA ({fingerprint(identity.ca)[:16]}). Nothing was changed.",
+                    hint="Choose an empty home: teds-provision --home NEW init --ca FILE",
+                )
+    request = read_request(ask_for_certificate(home, name=name, keystore=keystore, ask=ask))
+    signature = owner.sign(station_key_message(request.station))
+    certificate = Certificate(request.name, request.station, owner.point, signature)
+    with closing(adopt_certificate(home, certificate, ask=ask)) as station:
+        vault = station.vault
+        with StoreLock(home, command="init"):
+            import_ca(station, vault, path, passphrase)
 
 
 def _adopt(station: Station, certificate: Certificate) -> None:

@@ -220,7 +220,7 @@ class _ZeroRun:
             step.detail = f"{written.octets} octets"
         with self.steps.step("verify") as step:
             judged = verify_node(station, node, written.on_node, who.point, by=_NAME, c=node.open_counter)
-            step.detail = judged.verified.verdict
+            step.take_verdict(judged.verified.verdict)
             trusted = trusted_from(station, node, NodeVerification(written.on_node, judged))
             channel, own = _adjustable(trusted, found.channel.number)
             turn = turn_of(own, full_turn=channel.full_turn)

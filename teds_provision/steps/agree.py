@@ -28,7 +28,7 @@ from teds_provision.station.station import NodeKey, Station
 from teds_provision.station.store import KeyRecord, WhitelistEntry, utc_now
 from teds_provision.steps.identify import IdentifiedNode
 from teds_provision.steps.teds_read import read_block, read_identity
-from teds_provision.talk.conversation import Conversation, SessionLostError
+from teds_provision.talk.conversation import OTHER_OWNER_REMEDY, Conversation, SessionLostError
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
 
@@ -159,6 +159,8 @@ def unknown_key(station: Station, node: Conversation) -> PolicyError:
     uuid = node.uuid.hex()
     elsewhere = agreed_elsewhere(station, node)
     said = "it answers that it knows none of the keys held here"
+    if elsewhere and _signed_for_another_ca(station, node.uuid, _shown_security(node)):
+        return PolicyError(f"No session with node {uuid}: {said}; {elsewhere}.", hint=OTHER_OWNER_REMEDY)
     if elsewhere:
         return PolicyError(
             f"No session with node {uuid}: {said}; {elsewhere}.",
@@ -182,10 +184,10 @@ def agreed_elsewhere(station: Station, node: Conversation) -> str:
         return ""
     how = "keyed elsewhere by tap or rotated by another holder (unverified)"  # a plain Identify cannot distinguish them
     hint = f"it reports key epoch {said}, after {held} here: {how}"
+    octets = _shown_security(node)
     try:
-        octets = read_block(node, SECURITY)
         shown = security.decode(octets)
-    except (BadDataError, NodeRefusedError, LinkError):
+    except BadDataError:
         return hint
     if shown.station_key not in (None, station.point) and signature_good(shown, octets, node.uuid):
         names = {record.point: record.name for record in station.policy.trusted("station")}
@@ -195,6 +197,44 @@ def agreed_elsewhere(station: Station, node: Conversation) -> str:
         if any(station_signature_good(shown, ca) for ca in station.policy.trusted_cas(node.uuid)):
             return f"{hint}; its datasheet is signed by station {digits}, which your CA certified"
     return f"{hint}; which station did so will show once it signs the datasheet"
+
+
+def _shown_security(node: Conversation) -> bytes:
+    """Return the Security TEDS that a node shows outside a session; empty if it shows none."""
+    try:
+        return read_block(node, SECURITY)
+    except (BadDataError, NodeRefusedError, LinkError):
+        return b""
+
+
+def _signed_for_another_ca(station: Station, uuid: bytes, teds: bytes) -> bool:
+    """Return True if the datasheet is signed by a station that the CA to agree under here did not certify.
+
+    A node accepts datasheets and keys from stations of its own CA only, so it would refuse an agreement (14).
+    """
+    try:
+        shown = security.decode(teds)
+    except BadDataError:
+        return False
+    signed = shown.station_key is not None and signature_good(shown, teds, uuid)
+    return signed and not station_signature_good(shown, station.keys.ca_of(uuid))
+
+
+def require_own_ca(station: Station, uuid: bytes, state: NodeState, teds: bytes) -> None:
+    """Raise PolicyError for a node without a key of ours whose datasheet another owner's station signed.
+
+    It is read outside a session: that may refuse, never permit. Checked before a person is asked anything, and before
+    the node is whitelisted.
+    """
+    keyed = state != NodeState.FACTORY and not station.keys.held(uuid)
+    if not keyed or not _signed_for_another_ca(station, uuid, teds):
+        return
+    signer = security.decode(teds).station_key
+    assert signer is not None
+    raise PolicyError(
+        f"Node {uuid.hex()} belongs to another owner's CA: station {fingerprint(signer)[:16]} signed its datasheet.",
+        hint=OTHER_OWNER_REMEDY,
+    )
 
 
 def agree(
@@ -253,6 +293,7 @@ def _agree(
             return _new_key(station, node, who, entry, returning=returning, demanded=True)
         return AgreeResult(held.record.epoch, held.record.key_id, fresh=again)
     if not new:
+        require_own_ca(station, node.uuid, who.state, who.security_teds)
         word.require(station, node)
     return _new_key(station, node, who, entry, returning=returning, demanded=demanded)
 
@@ -278,15 +319,18 @@ class _TakeoverConsent:
                 " out the current holder?"
             )
         elif not self.rotate:
-            raise must_take_over(node.uuid)
+            raise must_take_over(station, node.uuid)
         self.given = True
 
 
-def must_take_over(uuid: bytes) -> PolicyError:
+def must_take_over(station: Station, uuid: bytes) -> PolicyError:
     """Return the error if a node has another station's key, and a take-over was not confirmed."""
+    listed = station.pins.entry(uuid) is not None
+    first = "" if listed else "identify --add, then "
     return PolicyError(
         f"Node {uuid.hex()} has a key that this station does not hold; a new key would lock out the current holder.",
-        hint=f"Have the key handed over (export-keys there), or take the node over: agree {uuid.hex()} --rotate --yes",
+        hint=f"Have the key handed over (export-keys there), or take the node over at a tap:"
+        f" {first}agree {uuid.hex()} --rotate --yes",
     )
 
 
@@ -388,7 +432,7 @@ def _agree_anew(
     if returning and not agreed.unsigned:
         station.policy.require_not_given_away(uuid)
     if only_new and not agreed.unsigned:
-        raise must_take_over(uuid)
+        raise must_take_over(station, uuid)
     with station.durable("agree"):
         if returning:
             station.policy.take_back([uuid])

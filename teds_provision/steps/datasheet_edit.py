@@ -170,6 +170,6 @@ def write_sheet(
         step.detail = f"{written.octets} octets" if written.octets else ""
     with steps.step("verify") as step:
         verified = verify_node(station, node, written.on_node, keys.key, by="write").verified
-        step.detail = verified.verdict
+        step.take_verdict(verified.verdict)
     require_authentic(verified)
     return SheetEditResult(plan, tuple(steps.done), verified)

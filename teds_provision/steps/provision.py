@@ -19,7 +19,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry
 from teds_provision.station.store.records import Assurance
 from teds_provision.steps.adoption import Adopt, read_factory_datasheet, refuse_adoption, require_a_reason
-from teds_provision.steps.agree import AgreeResult, TakeOver, agree
+from teds_provision.steps.agree import AgreeResult, TakeOver, agree, require_own_ca
 from teds_provision.steps.board_type import (
     HardwareCheck,
     Retype,
@@ -94,7 +94,7 @@ def verify_only(station: Station, node: Conversation, line: ProductionLine, repo
             try:
                 with steps.step("verify") as step:
                     looked = verify_at_node(station, node, who)
-                    step.detail = looked.verified.verdict
+                    step.take_verdict(looked.verified.verdict)
                     told = differences(looked.image.blocks, prepared.profile) if prepared.profile is not None else ()
                     if told:
                         require_board_type(who.uuid, told)
@@ -237,6 +237,7 @@ class _Run:
         self.retype, self._retyped, self.adopt = retype or require_board_type, False, adopt
         self.line = line
         self.unit: Unit | None = None
+        self._enlisting: StepResult | None = None
         self.released = False  # the running `ncap` measured the node and let it go
 
     def proven(self) -> ProvisionResult:
@@ -316,20 +317,31 @@ class _Run:
         return named_for(self.station, who.uuid, prepared, keep=True)
 
     def _whitelist(self, who: IdentifiedNode) -> WhitelistEntry | None:
-        """None for a node that is whitelisted; else its entry, which the key agreement makes durable with the key."""
-        with self.steps.step("whitelist") as step:
+        """None for a node that is whitelisted; else its entry, which the key agreement makes durable with the key.
+
+        Until then the step is open: it is reported as done by :meth:`_agree`, once the entry is kept.
+        """
+        with self.steps.deferred("whitelist") as step:
             if who.whitelisted is not None:
                 step.result = NOTHING
+                self.steps.finish(step)
                 return None
+            require_own_ca(self.station, who.uuid, who.state, who.security_teds)
             entry = new_whitelist_entry(self.station, self.node, who)
             self.accept(who)
+        self._enlisting = step
         return entry
 
     def _agree(self, who: IdentifiedNode, entry: WhitelistEntry | None) -> AgreeResult:
-        with self.steps.step("agree") as step:
-            agreed = agree(self.station, self.node, who, newcomer=entry, take_over=self.take_over)
-            step.result = DONE if agreed.fresh else NOTHING
-            step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"
+        try:
+            with self.steps.deferred("agree") as step:
+                agreed = agree(self.station, self.node, who, newcomer=entry, take_over=self.take_over)
+                step.result = DONE if agreed.fresh else NOTHING
+                step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"
+        finally:
+            if self._enlisting is not None and self.station.pins.entry(who.uuid) is not None:
+                self.steps.finish(self._enlisting)
+        self.steps.finish(step)
         return agreed
 
     def _build(self, who: IdentifiedNode, prepared: PreparedOrder, present: NodeSnapshot) -> Proposal:
@@ -423,7 +435,7 @@ class _Run:
     def _verify(self, who: IdentifiedNode, written: WriteResult) -> Verification:
         with self.steps.step("verify") as step:
             verified = verify_node(self.station, self.node, written.on_node, who.point, by="provision").verified
-            step.detail = verified.verdict
+            step.take_verdict(verified.verdict)
         return verified
 
 

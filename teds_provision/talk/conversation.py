@@ -61,8 +61,14 @@ _MEANING = {
     Reason.NO_ROOM: "it has no room for one more",
     Reason.FAULT: "a hardware fault, or too little power",
 }
+OTHER_OWNER_REMEDY = (
+    "If a lost station of yours keyed it, bring that one back in an empty home: teds-provision --home NEW restore FILE"
+    " (or init --ca FILE, with its exported CA key). If it is another owner's: export-keys there, import-keys here."
+    " Otherwise reset it by hand: hold its button for 5 s (a virtual node: node reset DIR)."
+)
+"""Remedies for a node that belongs to another CA, which accepts no key from this station."""
 _CURE = {
-    Reason.UNTRUSTED_STATION: "Have this station signed by that CA, or reset the node by hand (button held 5 s).",
+    Reason.UNTRUSTED_STATION: OTHER_OWNER_REMEDY,
     Reason.NOT_PERMITTED: "Tap the node on the NFC reader (--via nfc), or reset it by hand.",
     Reason.UNKNOWN_KEY: "Try it on the reader. If another station rotated the key, tap the node: agree UUID --rotate.",
     Reason.STALE_SEQUENCE: "Sign again against the node: sign UUID --read-node.",

@@ -13,11 +13,12 @@ from teds_provision.links import Notice
 NOTHING = "nothing to do"
 DONE = "done"
 SKIPPED = "skipped"
+FAILED = "failed"
 
 
 @dataclass
 class StepResult:
-    """One step: ``result`` is "done", "nothing to do" or "skipped"; ``detail`` one short sentence for people.
+    """One step: ``result`` is "done", "nothing to do", "skipped" or "failed"; ``detail`` one short sentence for people.
 
     ``of`` names the node if several are worked on at once.
     """
@@ -27,6 +28,10 @@ class StepResult:
     seconds: float = 0.0
     detail: str = ""
     of: str = ""
+
+    def take_verdict(self, verdict: str) -> None:
+        """End a step that verified a node: every verdict but "authentic" fails it."""
+        self.result, self.detail = DONE if verdict == "authentic" else FAILED, verdict
 
 
 class Reporter(Protocol):
@@ -96,10 +101,20 @@ class Steps:
     @contextmanager
     def step(self, name: str) -> Iterator[StepResult]:
         """Run one step; what it found is put into the yielded result."""
+        with self.deferred(name) as result:
+            yield result
+        self.finish(result)
+
+    @contextmanager
+    def deferred(self, name: str) -> Iterator[StepResult]:
+        """Run one step whose effect a later one keeps: it is reported by :meth:`finish`, and not before."""
         self.current = name
         self.reporter.started(name)
         result, began = StepResult(name), time.monotonic()
         yield result
         result.seconds = round(time.monotonic() - began, 4)
+
+    def finish(self, result: StepResult) -> None:
+        """Report a step as it ended."""
         self.done.append(result)
         self.reporter.finished(result)

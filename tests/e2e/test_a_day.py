@@ -138,7 +138,7 @@ def test_a_board_of_another_owner_is_not_whitelisted(desk: Desk, station: Statio
     node.start()
     assert desk.station("rival").provision("nfc", "-p", ANGLE)["verdict"] == "authentic"
     said = station.provision("nfc", "-p", ANGLE, code=6)["error"]
-    assert "a key that this station does not hold" in said["message"]
+    assert "another owner's CA" in said["message"]
     assert station.ask("whitelist", "list")["whitelist"] == []
     (entry,) = [entry for entry in station.ask("log")["entries"] if entry["act"] == "provision"]
     assert (entry["uuid"], entry["outcome"]) == (node.uuid, "refused")

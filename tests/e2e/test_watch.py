@@ -73,7 +73,7 @@ def test_one_node_that_fails_does_not_end_the_watch(desk: Desk, station: Station
     watch = station.start("--json", "provision", "--watch", "--yes", "--profile", ANGLE, *desk.links.over("nfc"))
     (said,) = watch.wait_for_lines(1)
     assert said["error"]["code"] == "refused"
-    assert "a key that this station does not hold" in said["error"]["message"]
+    assert "another owner's CA" in said["error"]["message"]
     assert foreign.octets == sheet
     foreign.stop()
     own.start()

@@ -204,14 +204,18 @@ def test_a_revoked_node_is_refused(station: Station, board: Board) -> None:
         run(station, board)
 
 
+def _must_not_be_asked(question: str) -> None:
+    raise AssertionError(question)
+
+
 def test_another_owners_station_is_refused(station: Station, board: Board, tmp_path: Path) -> None:
     run(station, board)
     before, stranger = board.state, make_station(tmp_path / "stranger")
-    with pytest.raises(PolicyError, match="has a key that this station does not hold"):
+    with pytest.raises(PolicyError, match="belongs to another owner's CA"):
         run(stranger, board)
-    with talk(board) as node, pytest.raises(NodeRefusedError) as refused:  # a person's word does not help either
-        provision(stranger, node, ANGLE, accept=accept, reporter=SilentReporter(), take_over=lambda question: None)
-    assert refused.value.reason == Reason.UNTRUSTED_STATION
+    with talk(board) as node, pytest.raises(PolicyError, match="belongs to another owner's CA"):
+        provision(stranger, node, ANGLE, accept=accept, reporter=SilentReporter(), take_over=_must_not_be_asked)
+    assert stranger.pins.entry(board.uuid) is None
     assert board.state == before
 
 
