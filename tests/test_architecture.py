@@ -227,3 +227,67 @@ def test_nothing_outside_the_station_reaches_past_it_into_the_store() -> None:
         and getattr(node.value, "id", "") != "self"
     ]
     assert not wrong
+
+
+_KNOWS_NO_LINK = ("measure", "ncap")
+_LINK_FOLDERS = tuple(sorted(path.name for path in (PACKAGE / "links").iterdir() if (path / "__init__.py").is_file()))
+
+
+@cache
+def classes_of_links() -> frozenset[str]:
+    """Names of the classes in the folder of each link: CanPort, BleLink …."""
+    trees = [parsed(path) for name in _LINK_FOLDERS for path in (PACKAGE / "links" / name).rglob("*.py")]
+    named = (node.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+    return frozenset(name for name in named if name.lower().startswith(_LINK_FOLDERS))
+
+
+def places_that_know_a_link(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Yield each place that distinguishes links: an import from its folder, its class, or its name."""
+    names = {f"{name}{end}" for name in _LINK_FOLDERS for end in ("", ":")}
+
+    def is_named(part: ast.AST) -> bool:
+        return any(isinstance(node, ast.Constant) and node.value in names for node in ast.walk(part))
+
+    for name, line in imports(tree):
+        parts = name.split(".")
+        if parts[:2] == ["teds_provision", "links"] and len(parts) > 2 and parts[2] in _LINK_FOLDERS:
+            yield line, f"imports {name}"
+    for node in ast.walk(tree):
+        match node:
+            case ast.Compare() if is_named(node):
+                yield node.lineno, f"compares {ast.unparse(node)}"
+            case ast.Call(func=ast.Attribute(attr="startswith" | "removeprefix"), args=[part]) if is_named(part):
+                yield node.lineno, f"compares {ast.unparse(node)}"
+            case ast.MatchValue() if is_named(node):
+                yield node.lineno, f"matches {ast.unparse(node)}"
+            case ast.Name(id=name) | ast.Attribute(attr=name) if name in classes_of_links():
+                yield node.lineno, f"names {name}"
+
+
+def test_measure_and_ncap_know_a_link_by_its_capabilities_alone() -> None:
+    """A link that streams is a MeasuringLink, and no file above `links` has to change for it (docs/extending.md)."""
+    assert len(_LINK_FOLDERS) >= 3
+    wrong = [
+        f"{name_of(path)}:{line} {what}"
+        for path in MODULES
+        if room_of(path) in _KNOWS_NO_LINK
+        for line, what in places_that_know_a_link(parsed(path))
+    ]
+    assert not wrong
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "from teds_provision.links.can.port import CanPort",
+        "from teds_provision.links import ble",
+        "isinstance(port, ports.BlePort)",
+        "links.via == 'can'",
+        "port.via in ('nfc', 'ble')",
+        "place.startswith('can:')",
+        "place.startswith(('nfc:', 'ble:'))",
+        "match place.partition(':')[0]:\n    case 'can':\n        pass",
+    ],
+)
+def test_each_way_to_know_a_link_is_seen(code: str) -> None:
+    assert list(places_that_know_a_link(ast.parse(code)))
