@@ -5,6 +5,7 @@
 #include "clock.h"
 #include "drive.h"
 #include "isotp.h"
+#include "manage.h"
 #include "node.h"
 #include "operation.h"
 #include "session.h"
@@ -29,6 +30,10 @@
 #define START_NS 500000000u
 #define UNIT_BITS 26 /* of the Announce times kept: 67 ms */
 #define A_MINUTE (60u * TEDS_SECOND >> UNIT_BITS)
+/* Presses: ten at once and one each 6 s, so 20 in any minute. */
+#define PRESSES_APART ((TEDS_SECOND >> UNIT_BITS) + 2)
+#define PRESS_UNITS (A_MINUTE / 10)
+#define PRESSES_PAID (A_MINUTE - PRESS_UNITS)
 #define MOVES_AT_ONCE 3u
 #define QUIET_NS (600u * TEDS_SECOND) /* without a conflict: moves are immediate again */
 #define LONGEST_STAY UINT64_C(60)     /* s */
@@ -172,10 +177,15 @@ void teds_node_bus_off(teds_node *node)
 {
     lose_all(node);
     be_silent(&node->can, teds_now(node));
-    node->can.announces = false;
+    node->can.announces = node->can.pressed = false;
     if (node->can.moves_to != 0) { /* no reply leaves any more */
         teds_can_move(node, node->can.moves_to);
     }
+#if TEDS_MANAGED
+    if (node->managed.restart_link >= FIRST_STATION) {
+        teds_restart_after(node, node->managed.restart_link);
+    }
+#endif
 }
 
 /* Every link is a pair of addresses: with a new own one all begin anew. */
@@ -476,7 +486,8 @@ static void announced(teds_node *node, const teds_can_frame *frame, uint64_t now
     teds_can *can = &node->can;
     uint8_t address = (uint8_t)frame->identifier;
     uint32_t crc, own;
-    if (address != node->can.address || frame->length != 8 || frame->data[0] != 1 || frame->data[1] > 2) {
+    if (address != node->can.address || frame->length != 8 || frame->data[0] != 1 || frame->data[1] > 2 ||
+        frame->data[6] == 1) { /* a pressed button claims nothing */
         return;
     }
     crc = teds_get32(frame->data + 2);
@@ -511,6 +522,19 @@ static bool may_announce(teds_node *node, uint64_t now)
     can->announced[can->announced_at] = at;
     can->announced_at = (uint8_t)((can->announced_at + 1) % 20);
     return true;
+}
+
+void teds_can_pressed(teds_node *node, uint64_t now)
+{
+    teds_can *can = &node->can;
+    const uint32_t at = (uint32_t)(now >> UNIT_BITS) + 1;
+    const uint32_t paid = can->pressed_paid > at ? can->pressed_paid : at;
+    if (now < can->back_at || (can->pressed_at != 0 && at - can->pressed_at < PRESSES_APART) || paid - at > PRESSES_PAID) {
+        return;
+    }
+    can->pressed = true;
+    can->pressed_at = at;
+    can->pressed_paid = paid + PRESS_UNITS + 1;
 }
 
 static void announce(const teds_node *node, teds_can_frame *frame)
@@ -622,6 +646,12 @@ bool teds_can_tx(teds_node *node, teds_can_frame *frame, uint64_t now)
         node->can.turned_away = 0;
         return true;
     }
+    if (node->can.pressed) {
+        node->can.pressed = false;
+        announce(node, frame);
+        frame->data[6] = 1;
+        return true;
+    }
     if (node->can.announces && now >= node->can.announce_due) {
         node->can.announces = false;
         if (may_announce(node, now)) {
@@ -643,7 +673,7 @@ uint64_t teds_can_poll(teds_node *node, uint64_t now)
     if (can->gives_up && now >= can->move_at) {
         give_up_address(node, now);
     }
-    due = can->turned_away != 0 ? now : TEDS_NEVER;
+    due = can->turned_away != 0 || can->pressed ? now : TEDS_NEVER;
     if (can->announces) {
         teds_sooner(&due, can->announce_due);
     }

@@ -56,7 +56,10 @@ enum {
     TEDS_ARM = 17,
     TEDS_POWER = 18,
     TEDS_OPERATION_STATE = 19,
-    TEDS_DRIVE = 20
+    TEDS_DRIVE = 20,
+    TEDS_ABOUT = 21,
+    TEDS_LOCATE = 22,
+    TEDS_MANAGE = 23
 };
 
 /* Functions of class 1. */
@@ -98,6 +101,11 @@ typedef int teds_handler(teds_node *node, const teds_command *command, teds_orig
 static inline bool teds_has_nfc(const teds_node *node)
 {
     return TEDS_NFC && node->config->nfc.present;
+}
+/* The boot loader reverts the running image unless it is confirmed: what is stored stays as it is. */
+static inline bool teds_on_trial(const teds_node *node)
+{
+    return TEDS_MANAGED && (node->firmware & TEDS_FIRMWARE_ON_TRIAL) != 0;
 }
 static inline bool teds_in_factory(const teds_node *node)
 {

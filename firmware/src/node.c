@@ -1,6 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* One node: which command may be run when (security-teds.md, 4), routing, and the commands that need little. */
 #include "node.h"
+#include "about.h"
 #include "agree.h"
 #include "ble.h"
 #include "can.h"
@@ -8,6 +9,7 @@
 #include "commit.h"
 #include "drive.h"
 #include "isotp.h"
+#include "manage.h"
 #include "operation.h"
 #include "session.h"
 #include "stream.h"
@@ -44,6 +46,11 @@ static const known KNOWN[] = {
     {TEDS_CLASS_SECURITY, TEDS_RESET, 32, reset},
     {TEDS_CLASS_SECURITY, TEDS_SET_CAN_ADDRESS, 1, set_can_address},
     {TEDS_CLASS_SECURITY, TEDS_LIST, 0, list},
+    {TEDS_CLASS_SECURITY, TEDS_ABOUT, ANY, teds_about},
+    {TEDS_CLASS_SECURITY, TEDS_LOCATE, ANY, teds_locate},
+#if TEDS_MANAGED
+    {TEDS_CLASS_SECURITY, TEDS_MANAGE, ANY, teds_manage},
+#endif
 #if TEDS_OPERATION /* from here on those of operation.md */
     {TEDS_CLASS_SECURITY, TEDS_SAMPLE, ANY, teds_sample},
     {TEDS_CLASS_SECURITY, TEDS_SET, ANY, teds_set},
@@ -61,7 +68,7 @@ static const known KNOWN[] = {
     {TEDS_CLASS_COMMON, TEDS_SELF_TEST, ANY, teds_self_test},
 #endif
 };
-#define MEASURES 13u /* place of the first of operation.md */
+#define MEASURES (TEDS_MANAGED ? 16u : 15u) /* place of the first of operation.md */
 
 /* NULL: no such command here. A board without channels offers none of operation.md. */
 static const known *look_up(const teds_node *node, const teds_command *command)
@@ -120,8 +127,11 @@ static int plain_security(teds_node *node, const teds_command *command, const te
     case TEDS_SEALED:
         return !teds_in_factory(node) && teds_any_on(node, origin->link) ? 0 : -TEDS_WRONG_STATE;
     case TEDS_IDENTIFY: return 0;
+    case TEDS_ABOUT: /* by radio a board with a key would be told apart by it */
+        return teds_in_factory(node) || origin->arrival->kind == TEDS_CAN ? 0 : -TEDS_NOT_PERMITTED;
     case TEDS_PROVE: return spare_actuators(node);
-    case TEDS_RESET: return teds_in_factory(node) ? 0 : -TEDS_NOT_PERMITTED;
+    case TEDS_RESET:
+    case TEDS_LOCATE: return teds_in_factory(node) ? 0 : -TEDS_NOT_PERMITTED;
     case TEDS_LIST: return hold_strangers_back(node);
     default: return -TEDS_NOT_PERMITTED; /* Close, and what measures */
     }
@@ -152,11 +162,17 @@ static int permitted(teds_node *node, const teds_command *command, const teds_or
     const uint8_t function = command->function;
     int refused;
     if (command->command_class == TEDS_CLASS_SECURITY &&
-        (command->channel != 0 || function == 0 || function == TEDS_NO_FUNCTION || function > TEDS_DRIVE ||
-         (function == TEDS_SET_CAN_ADDRESS && node->config->no_can))) {
+        (command->channel != 0 || function == 0 || function == TEDS_NO_FUNCTION || function > TEDS_MANAGE ||
+         (function == TEDS_SET_CAN_ADDRESS && node->config->no_can) ||
+         ((function == TEDS_ABOUT || function == TEDS_LOCATE) && node->port->about == NULL))) {
         return -TEDS_UNKNOWN_COMMAND;
     }
     refused = origin->session != NULL ? inner(command) : plain(node, command, origin);
+#if TEDS_MANAGED
+    if (!refused) {
+        refused = teds_demand_no_image(node, command);
+    }
+#endif
 #if TEDS_OPERATION
     if (!refused && command->command_class == TEDS_CLASS_COMMON &&
         (function == TEDS_WRITE || function == TEDS_UPDATE)) {
@@ -451,7 +467,7 @@ teds_stored_reply *teds_reply_place(teds_node *node, teds_link link)
     return found;
 }
 
-/* Identify, Prove, List, Query and Read outside Sealed are always run anew. */
+/* Identify, Prove, About, List, Query and Read outside Sealed are always run anew. */
 static bool always_anew(const uint8_t *frame, size_t length)
 {
     if (length < 4) {
@@ -461,7 +477,7 @@ static bool always_anew(const uint8_t *frame, size_t length)
         return frame[3] == TEDS_QUERY || frame[3] == TEDS_READ;
     }
     return frame[2] == TEDS_CLASS_SECURITY &&
-           (frame[3] == TEDS_IDENTIFY || frame[3] == TEDS_PROVE || frame[3] == TEDS_LIST);
+           (frame[3] == TEDS_IDENTIFY || frame[3] == TEDS_PROVE || frame[3] == TEDS_LIST || frame[3] == TEDS_ABOUT);
 }
 
 teds_stored_reply *teds_answer(teds_node *node, teds_link link, const teds_arrival *arrival, const uint8_t *transaction,
@@ -492,6 +508,7 @@ teds_stored_reply *teds_answer(teds_node *node, teds_link link, const teds_arriv
 int teds_node_init_as_built(teds_node *node, uint32_t built, const teds_config *config, const teds_port *port)
 {
     uint8_t counter[8];
+    teds_firmware firmware;
     int failed;
     if (built != teds_built()) {
         return TEDS_E_BUILD; /* this node may be larger than the board's */
@@ -514,6 +531,7 @@ int teds_node_init_as_built(teds_node *node, uint32_t built, const teds_config *
         return TEDS_E_USAGE;
     }
 #endif
+    (void)teds_firmware_read(node, &firmware); /* first: while an image is on trial no flash is changed */
     failed = teds_store_load(node);
     if (failed) {
         return failed;
@@ -541,6 +559,9 @@ void teds_node_reply_left(teds_node *node, teds_link link)
     if (node->can.moves_to != 0 && node->can.moves_link == link) {
         teds_can_move(node, node->can.moves_to);
     }
+#if TEDS_MANAGED
+    teds_restart_after(node, link);
+#endif
 }
 
 void teds_node_link_lost(teds_node *node, teds_link link)
@@ -549,6 +570,9 @@ void teds_node_link_lost(teds_node *node, teds_link link)
     if (node->can.moves_to != 0 && node->can.moves_link == link) {
         teds_can_move(node, node->can.moves_to); /* nobody waits for the reply any more */
     }
+#if TEDS_MANAGED
+    teds_restart_after(node, link);
+#endif
 }
 
 int teds_node_reset_by_hand(teds_node *node)
@@ -557,6 +581,10 @@ int teds_node_reset_by_hand(teds_node *node)
 #if TEDS_OPERATION
     teds_everything_safe(node);
 #endif
+    if (teds_on_trial(node) && node->port->restart != NULL) {
+        node->port->restart(node->port->user);
+        return 0;
+    }
     failed = teds_in_factory(node) ? 0 : teds_to_factory(node); /* no write where nothing changes */
     if (failed) {
         return TEDS_E_FLASH;
@@ -575,6 +603,10 @@ uint64_t teds_node_poll(teds_node *node, uint64_t now)
     teds_nfc_poll(node);
 #endif
     teds_sooner(&next, teds_can_poll(node, now));
+    teds_sooner(&next, teds_locate_poll(node, now));
+#if TEDS_MANAGED
+    teds_sooner(&next, teds_trial_poll(node, now));
+#endif
     teds_store_poll(node, now);
 #if TEDS_NFC
     if (node->old_slot_due && now < node->nfc.busy_until) {

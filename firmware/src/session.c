@@ -4,6 +4,7 @@
 #include "session.h"
 #include "agree.h"
 #include "clock.h"
+#include "manage.h"
 #include "operation.h"
 #include "teds_store.h"
 #include "inside.h"
@@ -49,6 +50,9 @@ void teds_session_end(teds_node *node, teds_session *session)
     if (node->staging_of == session) {
         teds_staging_drop(node);
     }
+#if TEDS_MANAGED
+    teds_upload_end(node, session);
+#endif
     if (node->pending.used && node->pending.session == session) {
         teds_pending_forget(node);
     }

@@ -29,6 +29,7 @@
 #define OLD_SLOT_NS (15u * TEDS_SECOND) /* no station repeats a command after that */
 static const uint8_t IDENTITY_MAGIC[8] = {'T', 'I', 'D', 'N', 1, 0, 0, 0};
 static const uint8_t SLOT_MAGIC[5] = {'T', 'S', 'L', 'T', 1};
+#define FORM_AT 4u /* in both; what is before it, a slot's length and the CRC are the same in every form */
 
 /* -- writing one area, unit by unit --------------------------------------------------------------------------------- */
 
@@ -142,6 +143,9 @@ static int read_identity(teds_node *node, bool *good)
         crc_good(port, TEDS_IDENTITY, IDENTITY_OCTETS, good) != 0) {
         return TEDS_E_FLASH;
     }
+    if (*good && memcmp(magic, IDENTITY_MAGIC, FORM_AT) == 0 && magic[FORM_AT] != IDENTITY_MAGIC[FORM_AT]) {
+        return TEDS_E_FORM;
+    }
     *good = *good && memcmp(magic, IDENTITY_MAGIC, sizeof magic) == 0;
     return 0;
 }
@@ -176,12 +180,12 @@ static int load_identity(teds_node *node)
         if (failed || good) {
             return failed;
         }
-        failed = forget_torn_identity(port);
+        failed = teds_on_trial(node) ? TEDS_E_IDENTITY : forget_torn_identity(port);
         if (failed) {
             return failed;
         }
     }
-    failed = make_identity(node);
+    failed = teds_on_trial(node) ? TEDS_E_IDENTITY : make_identity(node);
     if (!failed) {
         failed = read_identity(node, &good);
     }
@@ -190,20 +194,26 @@ static int load_identity(teds_node *node)
 
 /* -- slots ---------------------------------------------------------------------------------------------------------- */
 
-/* Whether a slot is good; the numbers of its head. */
+/* Whether a slot is good; the numbers of its head. One that is whole in a form of other firmware is never taken for torn:
+ * the start fails, and an image on trial reverts. */
 static int look(const teds_port *port, int area, uint8_t head[NUMBERS_OCTETS], bool *good)
 {
     uint32_t total;
+    int failed;
     *good = false;
     if (read_area(port, area, 0, head, NUMBERS_OCTETS) != 0) {
         return TEDS_E_FLASH;
     }
     total = teds_get32(head + 12);
-    if (memcmp(head, SLOT_MAGIC, sizeof SLOT_MAGIC) != 0 || total < HEAD_OCTETS + 4 || total > port->slot_octets ||
-        teds_get32(head + 16) > total - HEAD_OCTETS - 4) {
+    if (memcmp(head, SLOT_MAGIC, FORM_AT) != 0 || total < NUMBERS_OCTETS + 4 || total > port->slot_octets) {
         return 0;
     }
-    return crc_good(port, area, total, good);
+    failed = crc_good(port, area, total, good);
+    if (!failed && *good && head[FORM_AT] != SLOT_MAGIC[FORM_AT]) {
+        return TEDS_E_FORM;
+    }
+    *good = *good && total >= HEAD_OCTETS + 4 && teds_get32(head + 16) <= total - HEAD_OCTETS - 4;
+    return failed;
 }
 
 static int take_slot(teds_node *node, int area, const uint8_t head[NUMBERS_OCTETS])
@@ -231,15 +241,23 @@ int teds_store_load(teds_node *node)
         return failed;
     }
     for (int i = 0; i < 2; i++) {
-        if (look(port, TEDS_SLOT_A + i, head[i], &good[i]) != 0) {
-            return TEDS_E_FLASH;
+        failed = look(port, TEDS_SLOT_A + i, head[i], &good[i]);
+        if (failed) {
+            return failed;
         }
     }
     if (good[0] && good[1]) {
         good[teds_get32(head[0] + 8) > teds_get32(head[1] + 8) ? 1 : 0] = false;
     }
+    if (teds_on_trial(node) && !good[0] && !good[1]) {
+        return TEDS_E_IDENTITY;
+    }
     for (int i = 0; i < 2; i++) {
         if (good[i]) {
+            continue;
+        }
+        if (teds_on_trial(node)) {
+            node->free_slot_dirty = true; /* erased when the image is confirmed */
             continue;
         }
         if (look_over(port, TEDS_SLOT_A + i, port->slot_octets, &blank, &crc) != 0 ||

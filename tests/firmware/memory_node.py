@@ -22,6 +22,12 @@ _ANSWER: Final = ctypes.CFUNCTYPE(
 _HOOK: Final = ctypes.CFUNCTYPE(
     ctypes.c_int, ctypes.c_char, ctypes.c_uint8, ctypes.c_uint64, ctypes.c_void_p, ctypes.c_size_t
 )
+_FIRMWARE: Final = ctypes.CFUNCTYPE(
+    ctypes.c_size_t, ctypes.c_char, ctypes.c_uint, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t
+)
+FirmwareHook = Callable[[str, int, bytes], bytes]
+"""Asked with ``a`` about (flags, version, image and text come back), ``l`` locate (seconds), ``m`` manage (a packet
+comes, one goes back) or ``r`` restart."""
 Hook = Callable[[str, int, int, bytes], int | tuple[bytes, int]]
 """Asked with a word of memory.h, a channel, an argument and octets: what it says, or octets to put there and that."""
 _KEYED, _PROVISIONED = 1, 2
@@ -36,6 +42,8 @@ def _library(path: Path) -> Any:
     library.memory_handle.restype = library.memory_flash.restype = ctypes.c_size_t
     library.memory_steps.restype = library.memory_chip_calls.restype = library.memory_reads.restype = ctypes.c_long
     library.memory_poll.restype = ctypes.c_uint64
+    library.memory_image_flash.restype = ctypes.c_size_t
+    library.memory_restarts.restype = library.memory_images.restype = ctypes.c_bool
     library.memory_written.restype, library.memory_spare_slot_fails.restype = ctypes.c_long, ctypes.c_bool
     library.memory_dead.restype = library.memory_misused.restype = library.memory_nfc_written.restype = ctypes.c_bool
     library.memory_ble_advertises.restype = library.memory_ble_drops.restype = ctypes.c_bool
@@ -93,6 +101,44 @@ class MemoryNode:
 
         self._hook = _HOOK(ask)  # kept, too
         self._library.memory_hook_up(self._board, self._hook)
+
+    def has_firmware(self, hook: FirmwareHook, most: int = 0) -> None:
+        """Have its firmware in the test's hands, with packets of at most ``most`` octets; before the start."""
+
+        def ask(what: bytes, argument: int, octets: Any, length: int, room: int) -> int:
+            said = hook(what.decode(), argument, ctypes.string_at(octets, length) if octets else b"")
+            if octets:
+                ctypes.memmove(octets, said, min(len(said), room))
+            return len(said)
+
+        self._firmware = _FIRMWARE(ask)  # kept, too
+        self._library.memory_firmware(self._board, self._firmware, ctypes.c_uint16(most))
+
+    def has_images(self, owner: bytes, image: bytes, *, counter: bool = False) -> None:
+        """Have two slots, a boot loader of this owner and an SMP server; ``image`` runs first. Before the start."""
+        assert self._library.memory_images(self._board, owner, ctypes.c_size_t(len(owner)), ctypes.c_bool(counter))
+        self.images = image + self.images[len(image) :]
+
+    @property
+    def images(self) -> bytes:
+        """Every octet of both slots and of the boot loader's records; may be put back before a start."""
+        octets = ctypes.create_string_buffer(self._library.memory_image_flash(self._board, None))
+        self._library.memory_image_flash(self._board, octets)
+        return octets.raw
+
+    @images.setter
+    def images(self, octets: bytes) -> None:
+        self._library.memory_put_image_flash(self._board, octets)
+
+    def restart_if_asked(self) -> int | None:
+        """Restart if the node asked for it, steps of flash counting on; what the start gives, None: it did not ask."""
+        self._now()
+        return int(self._library.memory_restart(self._board)) if self._library.memory_restarts(self._board) else None
+
+    def press(self) -> None:
+        """A button is released that was held for a short time."""
+        self._now()
+        self._library.memory_pressed(self._board)
 
     def without(self, what: str) -> None:
         """A board that has none of this: a word of memory.h."""

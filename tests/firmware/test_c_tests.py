@@ -12,6 +12,7 @@ from tests.vectors import c_arrays
 
 pytestmark = pytest.mark.system
 
+OF_UPDATES_ALONE = "-DTEDS_MANAGED=1 -DTEDS_OPERATION=0"
 WARNINGS = [
     *("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Wstrict-prototypes", "-Wmissing-prototypes"),
     *("-pedantic", "-Werror", "-fsyntax-only"),
@@ -42,15 +43,19 @@ def test_it_compiles_without_a_warning_for_clang_too() -> None:
     folders = ("port/bearssl", "port/posix")
     sources = [path for folder in ("src", *folders) for path in sorted((builds.FIRMWARE / folder).glob("*.c"))]
     where = [f"-I{builds.FIRMWARE / folder}" for folder in ("include", "src", *folders)]
-    compiled = [compiler, *WARNINGS, "-DTEDS_NFC=1", "-DTEDS_BLE=1", *where, *map(str, sources)]
+    compiled = [compiler, *WARNINGS, "-DTEDS_NFC=1", "-DTEDS_BLE=1", "-DTEDS_MANAGED=1", *where, *map(str, sources)]
     done = subprocess.run(compiled, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("left_out", ["-DTEDS_OPERATION=0", "-DTEDS_CAN_FD=0", "-DTEDS_NFC=1", "-DTEDS_BLE=1"])
+@pytest.mark.parametrize(
+    "left_out",
+    ["-DTEDS_OPERATION=0", "-DTEDS_CAN_FD=0", "-DTEDS_NFC=1", "-DTEDS_BLE=1", "-DTEDS_MANAGED=1", OF_UPDATES_ALONE],
+)
 def test_it_compiles_with_parts_left_out(left_out: str) -> None:
     builds.need("make", "gcc")
     sources = map(str, sorted((builds.FIRMWARE / "src").glob("*.c")))
     where = [f"-I{builds.FIRMWARE}/include", f"-I{builds.FIRMWARE}/src"]
-    done = subprocess.run(["gcc", *WARNINGS, left_out, *where, *sources], capture_output=True, text=True, check=False)
+    options = left_out.split()
+    done = subprocess.run(["gcc", *WARNINGS, *options, *where, *sources], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -151,7 +151,8 @@ def test_functions_that_are_none(group: int, inside: bool) -> None:
     for desk in (Desk(), CDesk()):
         desk.agree().open()
         ask = desk.sealed if inside else desk.plain
-        said = [ask(Command(0, group, function, b"\x80\0")) for function in (0, 1, 3, 5, 6, 8, 12, 18, 20, 21, 99, 255)]
+        functions = (0, 1, 3, 5, 6, 8, 12, 18, 20, 21, 22, 24, 99, 255)
+        said = [ask(Command(0, group, function, b"\x80\0")) for function in functions]
         reasons.append([reply.reason for reply in said])
     assert reasons[0] == reasons[1]
 

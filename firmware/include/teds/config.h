@@ -45,6 +45,11 @@
 #endif
 #endif
 
+#ifndef TEDS_MANAGED
+/** 1: takes firmware updates and the other packets of 128.23 (SMP), if the port has `manage`. 0: that command is unknown. */
+#define TEDS_MANAGED 0
+#endif
+
 #ifndef TEDS_CAN_FD
 /** 1: answers CAN FD in FD. 0: classic frames alone. */
 #define TEDS_CAN_FD 1

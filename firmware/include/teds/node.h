@@ -28,7 +28,8 @@ enum {
     TEDS_E_RANDOM = -3,   /**< no randomness */
     TEDS_E_IDENTITY = -4, /**< the identity area is torn: a node never makes a second key over one that it has shown */
     TEDS_E_CRYPTO = -5,   /**< a function of the port's cryptography failed */
-    TEDS_E_BUILD = -6     /**< board and library were compiled with different options, sizes or versions */
+    TEDS_E_BUILD = -6,    /**< board and library were compiled with different options, sizes or versions */
+    TEDS_E_FORM = -7      /**< flash was written in a form that this firmware does not know; it stays as it is */
 };
 
 /** Links that are not CAN. */
@@ -110,7 +111,7 @@ static inline uint32_t teds_built(void)
         sizeof(teds_node), sizeof(teds_port), sizeof(teds_config), sizeof(teds_can_frame), sizeof(teds_channel),
         TEDS_MAX_MESSAGE, TEDS_STAGING, TEDS_SESSIONS, TEDS_REPLIES, TEDS_CAN_LINES, TEDS_CAN_FD, TEDS_OPERATION,
         TEDS_CHANNELS, TEDS_STREAMS, TEDS_DRIVE_OCTETS, TEDS_EVENT_CHANNELS, TEDS_EVENTS, TEDS_EVENT_OCTETS,
-        TEDS_SHA256_OCTETS, TEDS_NFC, TEDS_MAX_NDEF, TEDS_BLE, TEDS_BLE_CONNECTIONS, TEDS_VERSION,
+        TEDS_SHA256_OCTETS, TEDS_MANAGED, TEDS_NFC, TEDS_MAX_NDEF, TEDS_BLE, TEDS_BLE_CONNECTIONS, TEDS_VERSION,
     };
     uint32_t built = 0;
     for (size_t i = 0; i < sizeof facts / sizeof facts[0]; i++) {
@@ -163,8 +164,13 @@ void teds_node_bus_off(teds_node *node);
 /** @name Events of the board */
 /** @{ */
 
-/** Button, pad or magnet held for 5 s: the effect of Reset. 0, or #TEDS_E_FLASH. */
+/** Button, pad or magnet held for 5 s: the effect of Reset. 0, or #TEDS_E_FLASH. While an image is on trial it restarts
+ * the board instead, and nothing is reset: hold the button again. */
 int teds_node_reset_by_hand(teds_node *node);
+
+/** A button was released that was held for 50 ms to 2 s: announce it on CAN, so that a person sees which board this is. At
+ * most once a second and 20 times a minute, the rest is left out. */
+void teds_can_pressed(teds_node *node, uint64_t now);
 
 /** An event sensor has seen something at `tick`. The one function that an interrupt may call, each sensor from an
  * interrupt of its own. `octets` is a data set. If its ring is full the event is lost, and the counter of its stream

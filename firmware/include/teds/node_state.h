@@ -159,6 +159,18 @@ typedef struct teds_line {
     uint64_t asked_due;
 } teds_line;
 
+#if TEDS_MANAGED
+/* Of 128.23: the upload that lives, the last one that began, and a restart that is due when its reply has left. */
+typedef struct teds_managed {
+    teds_session *upload_of;   /* NULL: none lives */
+    uint64_t upload_until, sha_until;
+    uint32_t upload_octets;    /* of the whole image */
+    bool begun, restarts;
+    teds_link restart_link;
+    uint8_t sha_length, sha[32];
+} teds_managed;
+#endif
+
 typedef struct teds_can {
     uint8_t address, moves_to; /* moves_to: where 128.10 leads once its reply has left; 0: nowhere */
     teds_link moves_link;
@@ -167,6 +179,7 @@ typedef struct teds_can {
     uint8_t announced_at;
     uint8_t moves; /* because of another node's claim, since the start or the last ten minutes without a conflict */
     bool gives_up; /* this address, at move_at */
+    bool pressed;  /* to be announced now */
     bool rx_wanted; /* another pair was refused because of the long request that is coming in */
     bool turned_away_fd;
     uint8_t turned_away, turned_away_transaction; /* a station that finds no line is refused; 0: none */
@@ -189,6 +202,7 @@ typedef struct teds_can {
     uint8_t heard[30];
     uint8_t everyone[27]; /* the answer to everyone: of all lines, but for its first octet, which leaves at once */
     uint32_t announced[20];
+    uint32_t pressed_at, pressed_paid; /* the last press announced, and until when presses are paid for */
 } teds_can;
 
 #if TEDS_NFC
@@ -229,6 +243,7 @@ struct teds_node {
     const teds_port *port;
     const teds_config *config;
     uint8_t slot; /* the one that counts */
+    uint8_t firmware; /* flags of About, as last read */
     bool free_slot_dirty, old_slot_due;
     bool spare_slot_fails; /* it could not be erased when that was last tried: the node answers and writes nothing */
     teds_session *staging_of; /* NULL: nobody's */
@@ -237,10 +252,14 @@ struct teds_node {
     uint64_t opens; /* c */
     uint64_t staged_until; /* then another session may take the staging */
     uint64_t old_slot_by; /* then the old slot is erased, whoever still waits for a reply */
+    uint64_t locate_until; /* 0: it does not blink */
     uint64_t address_again, strangers_again; /* from then on: a write of the address, a plain Read or List beside streams */
 #if TEDS_OPERATION
     uint32_t safe, stopped; /* bits by place */
     uint64_t missed;
+#endif
+#if TEDS_MANAGED
+    teds_managed managed;
 #endif
     teds_can can;
     teds_state state;

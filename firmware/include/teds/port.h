@@ -86,6 +86,26 @@ typedef struct teds_power {
     int8_t temperature; /**< degrees Celsius, 7F if unknown */
 } teds_power;
 
+/** Flags of teds_firmware, as About (128.21) reports them. The node itself adds those of Locate and Manage. */
+enum {
+    TEDS_FIRMWARE_LOCATES = 1,  /**< added by the node: the port has `locate` */
+    TEDS_FIRMWARE_MANAGES = 2,  /**< added by the node: it takes packets of 128.23 */
+    TEDS_FIRMWARE_ON_TRIAL = 4, /**< the boot loader reverts the running image unless it is confirmed */
+    TEDS_FIRMWARE_PENDING = 8,  /**< another image starts at the next restart */
+    TEDS_FIRMWARE_SIGNED = 16,  /**< the boot loader checks the owner's signature */
+    TEDS_FIRMWARE_COUNTER = 32  /**< the boot loader keeps a security counter */
+};
+
+/** The firmware that is running. */
+typedef struct teds_firmware {
+    uint8_t flags;         /**< TEDS_FIRMWARE_… */
+    uint8_t major, minor;  /**< its version, as in MCUboot's header */
+    uint16_t patch;        /**< of the version */
+    uint32_t build;        /**< of the version */
+    uint8_t image[32];     /**< MCUboot's SHA256 TLV (of a longer digest its first 32 octets), zeros if there is none */
+    const char *text;      /**< board and application, divided by the last `/`: at most 48 of A-Z a-z 0-9 . _ + - /; NULL: "" */
+} teds_firmware;
+
 /** A board, as the node sees it. It must outlive the node. */
 typedef struct teds_port {
     /** First argument of each function. With port/bearssl it points to a structure that begins with a teds_bearssl. */
@@ -177,6 +197,27 @@ typedef struct teds_port {
     bool (*fault)(void *user, uint8_t channel);
     /** Return the state of the supply. */
     void (*power)(void *user, teds_power *out);
+    /** @} */
+
+    /** @name Firmware
+     * Which board this is, what runs on it, and its updates (128.21 to 128.23). NULL if the board has none of that. */
+    /** @{ */
+    /** Describe the running firmware; `out` comes filled with zeros. Asked at the start, by About and after a change of
+     * images, so it reads what is stored and remembers nothing itself. */
+    void (*about)(void *user, teds_firmware *out);
+    /** Begin to blink or beep (`seconds` > 0), or stop (0). The node calls it again with 0 when the time is over. */
+    void (*locate)(void *user, uint8_t seconds);
+    /** Answer one SMP packet with one SMP packet, both of version 2; return its octets, at most `room`, or 0 if there is
+     * none (the station gets 11). `packet` and `out` share memory: read all of the packet before the first octet of the
+     * answer is written. The node has checked that the packet is permitted now; reset (0/5) it answers itself. Nothing
+     * takes longer than 1 s: erase a slot page by page as it is written. A confirmation is in flash when it returns.
+     * Set it only if the boot loader checks the owner's signature, starts a new image on trial, reverts by itself, has one
+     * image (number 0) and knows images by their SHA256 TLV; without #TEDS_FIRMWARE_SIGNED it is never called. */
+    size_t (*manage)(void *user, const uint8_t *packet, size_t length, uint8_t *out, size_t room);
+    uint16_t manage_octets; /**< longest packet of `manage` (buf_size of 0/6); 0: what a sealed command holds */
+    /** Restart: a station asked for it and its reply has left, or an image was on trial for ten minutes. Without it
+     * nothing is managed. */
+    void (*restart)(void *user);
     /** @} */
 } teds_port;
 

@@ -10,16 +10,20 @@
 #include <stdint.h>
 #include <sys/socket.h>
 
+#include "images.h"
 #include "teds/node.h"
 
 #define HOST_IDENTITY 256u
 #define HOST_SLOT 16384u
 #define HOST_UNIT 8u
 
-/* -- flash_file.c: flash in a file, as NOR flash behaves ------------------------------------------------------------ */
+/* -- flash_file.c: flash in files, as NOR flash behaves ------------------------------------------------------------- */
+
+#define HOST_IMAGE 0x80000u /* octets of an image's slot */
 
 typedef struct host_flash {
     int file;
+    int images[3]; /* of the two slots and the boot loader's records (images.h) */
     long cut; /* the process ends at this step (an erase, or a unit written), counted from 1; 0: never */
     bool torn; /* half of that step is done */
     long steps;
@@ -31,6 +35,31 @@ int host_flash_open(host_flash *flash, const char *path);
 int host_flash_erase(host_flash *flash, int area);
 int host_flash_write(host_flash *flash, int area, uint32_t at, const uint8_t *octets, size_t length);
 int host_flash_read(const host_flash *flash, int area, uint32_t at, uint8_t *out, size_t length);
+/* Open or make the files of the images in `folder`, and put `image` into the first slot if both are blank, as a programmer
+ * would (NULL: not); 0, or -1 with errno. Each step of theirs counts as one of flash, too. */
+int host_flash_images(host_flash *flash, const char *folder, const char *image, images_flash *out);
+
+/* -- firmware.c: what runs, and its images -------------------------------------------------------------------------------- */
+
+typedef struct host_firmware_options {
+    const char *about, *images, *image, *owner;
+    bool keeps_counter;
+} host_firmware_options;
+
+typedef struct host_firmware {
+    host_flash *flash;
+    bool silent, has_images; /* silent: it has neither About nor Locate */
+    teds_firmware report;
+    images images;
+} host_firmware;
+
+/* Read the options, and run the boot step if there are images; -1 after words on stderr. `port` has its cryptography. */
+int host_firmware_start(host_firmware *own, const host_firmware_options *given, host_flash *flash, const teds_port *port);
+void host_firmware_about(const host_firmware *own, teds_firmware *out);
+/* True if the running image is one of tests that does this ("mute", "crash", "confirm"). */
+bool host_firmware_behaves(const host_firmware *own, const char *how);
+/* Begin again as after a reset: the same program with the same words. Returns only if that fails. */
+void host_restart(host_flash *flash, char **words);
 
 /* -- pacing.c: frames that take as long as on a wire or on air ----------------------------------------------------- */
 

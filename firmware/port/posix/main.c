@@ -25,18 +25,22 @@ typedef struct board {
     host_channels channels;
     host_bus bus;
     host_nfc nfc;
+    host_firmware firmware;
     host_pace pace;
     teds_port plain; /* the cryptography behind the watch of a paced port */
-    bool has_bus;
+    bool has_bus, restarts;
+    uint8_t uuid[10];
     uint64_t started, seed;
 } board;
 
-static volatile sig_atomic_t stopping, by_hand;
+static volatile sig_atomic_t stopping, by_hand, pressed;
 
 static void on_signal(int number)
 {
     if (number == SIGUSR1) {
         by_hand = 1;
+    } else if (number == SIGUSR2) {
+        pressed = 1;
     } else {
         stopping = 1;
     }
@@ -125,6 +129,41 @@ static void port_safe(void *user, uint8_t channel)
     memset(own->channels.set_points[place_of(own, channel)], 0, 8);
 }
 
+static void print_hex(const uint8_t *octets, size_t length)
+{
+    for (size_t i = 0; i < length; i++) {
+        (void)printf("%02x", (unsigned)octets[i]);
+    }
+}
+
+static void port_about(void *user, teds_firmware *out)
+{
+    host_firmware_about(&((board *)user)->firmware, out);
+}
+
+static void port_locate(void *user, uint8_t seconds)
+{
+    const board *own = user;
+    (void)printf("{\"event\": \"locate\", \"uuid\": \"");
+    print_hex(own->uuid, sizeof own->uuid);
+    (void)printf("\", \"seconds\": %u}\n", (unsigned)seconds);
+    (void)fflush(stdout);
+}
+
+static size_t port_manage(void *user, const uint8_t *packet, size_t length, uint8_t *out, size_t room)
+{
+    board *own = user;
+    const uint64_t began = host_clock();
+    const size_t answer = images_manage(&own->firmware.images, packet, length, out, room);
+    own->pace.flash += host_clock() - began;
+    return answer;
+}
+
+static void port_restart(void *user)
+{
+    ((board *)user)->restarts = true;
+}
+
 static void fill_port(teds_port *port, board *own)
 {
     memset(port, 0, sizeof *port);
@@ -151,6 +190,18 @@ static void fill_port(teds_port *port, board *own)
     port->set = port_set;
     port->set_point = port_set_point;
     port->safe = port_safe;
+}
+
+static void fill_firmware(teds_port *port, const board *own)
+{
+    if (!own->firmware.silent) {
+        port->about = port_about;
+        port->locate = port_locate;
+    }
+    if (own->firmware.has_images) {
+        port->manage = port_manage;
+        port->restart = port_restart;
+    }
 }
 
 /* -- a paced port tells what P-256 took beside the rest of its own part --------------------------------------------- */
@@ -204,13 +255,16 @@ static void watch(teds_port *port, board *own)
 
 typedef struct options {
     const char *flash, *can, *nfc, *uuid, *channels, *source, *cut, *seed;
+    host_firmware_options firmware;
     bool fd, pace, tell;
 } options;
 
 static int usage(void)
 {
     (void)fprintf(stderr, "teds-node --flash FILE [--can SPEC [--fd]] [--nfc udp:localhost:PORT] [--uuid HEX]\n"
-                          "          [--channels FILE] [--source noise|sine:S|ramp:S] [--cut N[:torn]] [--seed N] [--pace] [--tell]\n");
+                          "          [--channels FILE] [--source noise|sine:S|ramp:S] [--cut N[:torn]] [--seed N] [--pace] [--tell]\n"
+                          "          [--about none|VERSION[+BUILD][,TEXT]] [--images FOLDER --owner PUBLIC_KEY [--image FILE]\n"
+                          "          [--security-counter]]\n");
     return 2;
 }
 
@@ -222,13 +276,19 @@ static int read_options(int count, char **words, options *out)
     } known[] = {{"--flash", &out->flash}, {"--can", &out->can},       {"--nfc", &out->nfc},
                  {"--uuid", &out->uuid},
                  {"--channels", &out->channels}, {"--source", &out->source}, {"--cut", &out->cut},
-                 {"--seed", &out->seed}};
+                 {"--seed", &out->seed},
+                 {"--about", &out->firmware.about},
+                 {"--images", &out->firmware.images},
+                 {"--image", &out->firmware.image},
+                 {"--owner", &out->firmware.owner}};
     for (int i = 1; i < count; i++) {
         const bool fd = strcmp(words[i], "--fd") == 0, pace = strcmp(words[i], "--pace") == 0;
-        bool found = fd || pace || strcmp(words[i], "--tell") == 0;
+        const bool counter = strcmp(words[i], "--security-counter") == 0, tells = strcmp(words[i], "--tell") == 0;
+        bool found = fd || pace || tells || counter;
         out->fd = out->fd || fd;
         out->pace = out->pace || pace;
-        out->tell = out->tell || (found && !fd);
+        out->tell = out->tell || tells || pace;
+        out->firmware.keeps_counter = out->firmware.keeps_counter || counter;
         for (size_t k = 0; k < sizeof known / sizeof known[0] && !found; k++) {
             if (strcmp(words[i], known[k].name) == 0 && i + 1 < count) {
                 *known[k].value = words[++i];
@@ -255,13 +315,6 @@ static int read_uuid(const char *text, uint8_t out[10])
         out[i] = (uint8_t)octet;
     }
     return 0;
-}
-
-static void print_hex(const uint8_t *octets, size_t length)
-{
-    for (size_t i = 0; i < length; i++) {
-        (void)printf("%02x", (unsigned)octets[i]);
-    }
 }
 
 static void say_ready(const teds_node *node, const teds_port *port, const options *given)
@@ -312,12 +365,16 @@ static int run(board *own, teds_node *node)
     if (own->has_bus) {
         teds_can_start(node, port_now(own));
     }
-    while (!stopping) {
+    while (!stopping && !own->restarts) {
         uint64_t due;
         bool busy = false;
         if (by_hand) {
             by_hand = 0;
             (void)teds_node_reset_by_hand(node);
+        }
+        if (pressed) {
+            pressed = 0;
+            teds_can_pressed(node, port_now(own));
         }
         while (own->nfc.in >= 0 && host_nfc_serve(&own->nfc, node)) {
             (void)teds_node_poll(node, port_now(own));
@@ -394,6 +451,13 @@ int main(int count, char **words)
         return 1;
     }
 #endif
+    if (host_firmware_start(&own.firmware, &given.firmware, &own.flash, &port) != 0) {
+        return 1;
+    }
+    fill_firmware(&port, &own);
+    if (host_firmware_behaves(&own.firmware, "confirm")) {
+        (void)images_confirm(&own.firmware.images);
+    }
     if (given.pace) {
         watch(&port, &own);
     }
@@ -405,14 +469,18 @@ int main(int count, char **words)
     if (given.uuid != NULL ? read_uuid(given.uuid, config.uuid) != 0 : port_random(&own, config.uuid, 10) != 0) {
         return usage();
     }
-    failed = teds_node_init(&node, &config, &port);
+    failed = host_firmware_behaves(&own.firmware, "crash") ? TEDS_E_FLASH : teds_node_init(&node, &config, &port);
+    if (failed && own.firmware.has_images && images_on_trial(&own.firmware.images)) {
+        host_restart(&own.flash, words); /* which reverts it */
+    }
     if (failed) {
         (void)fprintf(stderr, failed == TEDS_E_IDENTITY ? "The identity in %s is torn; erase the board.\n"
                                                         : "The node does not start (%s).\n",
                       given.flash);
         return 1;
     }
-    own.has_bus = given.can != NULL;
+    memcpy(own.uuid, node.identity.uuid, sizeof own.uuid);
+    own.has_bus = given.can != NULL && !host_firmware_behaves(&own.firmware, "mute");
     own.nfc.in = -1;
     if ((own.has_bus && host_bus_open(&own.bus, given.can, given.fd, &own.pace, given.pace) != 0) ||
         (given.nfc != NULL && (port_random(&own, uid, sizeof uid) != 0 ||
@@ -424,9 +492,14 @@ int main(int count, char **words)
     (void)sigaction(SIGTERM, &action, NULL);
     (void)sigaction(SIGINT, &action, NULL);
     (void)sigaction(SIGUSR1, &action, NULL);
+    (void)sigaction(SIGUSR2, &action, NULL);
     say_ready(&node, &port, &given);
     own.pace.chip = own.pace.flash = 0; /* of its start */
     failed = run(&own, &node);
+    if (own.restarts) {
+        host_restart(&own.flash, words);
+        return 1;
+    }
     if (given.tell) {
         tell(&own, &node);
     }

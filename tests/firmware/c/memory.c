@@ -308,6 +308,174 @@ void memory_hook_up(memory_board *board, memory_hook hook)
     port->power = ask_power;
 }
 
+static void tell_about(void *user, teds_firmware *out)
+{
+    memory_board *board = user;
+    uint8_t report[128] = {0};
+    const size_t length = board->firmware('a', 0, report, 0, sizeof report);
+    out->flags = report[0];
+    out->major = report[1];
+    out->minor = report[2];
+    out->patch = teds_get16(report + 3);
+    out->build = teds_get32(report + 5);
+    memcpy(out->image, report + 9, 32);
+    memset(board->text, 0, sizeof board->text);
+    if (length > 41) {
+        memcpy(board->text, report + 41, length - 41 < sizeof board->text ? length - 41 : sizeof board->text - 1);
+        out->text = board->text;
+    }
+}
+
+static void tell_locate(void *user, uint8_t seconds)
+{
+    (void)((memory_board *)user)->firmware('l', seconds, NULL, 0, 0);
+}
+
+/* -- images: their flash fails at the same steps -------------------------------------------------------------------------- */
+
+static uint8_t *image_at(memory_board *board, int area, uint32_t at, size_t length)
+{
+    const uint32_t octets_of_it = area == IMAGES_RECORDS ? IMAGES_RECORD_OCTETS : MEMORY_IMAGE;
+    return at > octets_of_it || length > octets_of_it - at ? NULL : board->image_flash + (size_t)area * MEMORY_IMAGE + at;
+}
+
+static int erase_page(void *user, int area, uint32_t at)
+{
+    memory_board *board = user;
+    const bool was_dead = board->dead, fails = fails_now(board);
+    uint8_t *there = image_at(board, area, at, IMAGES_PAGE);
+    if (was_dead || there == NULL || at % IMAGES_PAGE != 0) {
+        board->misused = board->misused || !was_dead;
+        return -1;
+    }
+    if (!fails || board->torn) {
+        memset(there, 0xFF, fails ? IMAGES_PAGE / 2 : IMAGES_PAGE);
+    }
+    return fails ? -1 : 0;
+}
+
+static int write_image(void *user, int area, uint32_t at, const uint8_t *octets_of_it, size_t length)
+{
+    memory_board *board = user;
+    const bool was_dead = board->dead, fails = fails_now(board);
+    uint8_t *there = image_at(board, area, at, length);
+    if (was_dead || there == NULL || at % IMAGES_UNIT != 0 || length % IMAGES_UNIT != 0) {
+        board->misused = board->misused || !was_dead;
+        return -1;
+    }
+    for (size_t i = 0; i < length; i++) {
+        board->misused = board->misused || there[i] != 0xFF;
+    }
+    if (!fails || board->torn) {
+        memcpy(there, octets_of_it, fails ? length / 2 : length);
+    }
+    return fails ? -1 : 0;
+}
+
+static int read_image(void *user, int area, uint32_t at, uint8_t *out, size_t length)
+{
+    memory_board *board = user;
+    const uint8_t *there = image_at(board, area, at, length);
+    if (board->dead || there == NULL) {
+        return -1;
+    }
+    memcpy(out, there, length);
+    return 0;
+}
+
+static void image_about(void *user, teds_firmware *out)
+{
+    images_about(&((memory_board *)user)->images, out);
+}
+
+static size_t image_manage(void *user, const uint8_t *packet, size_t length, uint8_t *out, size_t room)
+{
+    return images_manage(&((memory_board *)user)->images, packet, length, out, room);
+}
+
+static void image_restart(void *user)
+{
+    ((memory_board *)user)->restarts = true;
+}
+
+bool memory_images(memory_board *board, const uint8_t *owner, size_t length, bool counter)
+{
+    board->images.flash = (images_flash){board, erase_page, write_image, read_image, MEMORY_IMAGE};
+    board->images.port = &board->port;
+    board->images.keeps_counter = counter;
+    memset(board->image_flash, 0xFF, sizeof board->image_flash);
+    board->has_images = true;
+    board->port.about = image_about;
+    board->port.manage = image_manage;
+    board->port.restart = image_restart;
+    return images_owner(&board->images, owner, length) == 0;
+}
+
+size_t memory_image_flash(const memory_board *board, uint8_t *out)
+{
+    if (out != NULL) {
+        memcpy(out, board->image_flash, sizeof board->image_flash);
+    }
+    return sizeof board->image_flash;
+}
+
+void memory_put_image_flash(memory_board *board, const uint8_t *octets_of_it)
+{
+    memcpy(board->image_flash, octets_of_it, sizeof board->image_flash);
+}
+
+bool memory_restarts(memory_board *board)
+{
+    const bool restarts = board->restarts;
+    board->restarts = false;
+    return restarts;
+}
+
+int memory_restart(memory_board *board)
+{
+    memset(board->next, 0, sizeof board->next);
+    if (board->has_images && images_boot(&board->images) != 0) {
+        return MEMORY_NO_IMAGE;
+    }
+    return teds_node_init(&board->node, &board->config, &board->port);
+}
+
+/* -- firmware in a test's hands ------------------------------------------------------------------------------------------ */
+
+/* What comes is kept apart, so that the sanitizer sees what is read beyond it; both share memory. */
+static size_t tell_manage(void *user, const uint8_t *packet, size_t length, uint8_t *out, size_t room)
+{
+    memory_board *board = user;
+    uint8_t octets_of_it[TEDS_MAX_MESSAGE];
+    size_t answered;
+    memcpy(octets_of_it, packet, length);
+    answered = board->firmware('m', 0, octets_of_it, length, sizeof octets_of_it);
+    if (answered <= room) {
+        memcpy(out, octets_of_it, answered);
+    }
+    return answered;
+}
+
+static void tell_restart(void *user)
+{
+    (void)((memory_board *)user)->firmware('r', 0, NULL, 0, 0);
+}
+
+void memory_firmware(memory_board *board, memory_firmware_hook hook, uint16_t most)
+{
+    board->firmware = hook;
+    board->port.about = tell_about;
+    board->port.locate = tell_locate;
+    board->port.manage = tell_manage;
+    board->port.manage_octets = most;
+    board->port.restart = tell_restart;
+}
+
+void memory_pressed(memory_board *board)
+{
+    teds_can_pressed(&board->node, board->now);
+}
+
 void memory_without(memory_board *board, char what)
 {
     teds_port *port = &board->port;
@@ -322,6 +490,10 @@ void memory_without(memory_board *board, char what)
     case 'F': port->fault = NULL; break;
     case 'p': port->power = NULL; break;
     case 'm': port->arm = NULL; break;
+    case 'A': port->about = NULL; break;
+    case 'L': port->locate = NULL; break;
+    case 'M': port->manage = NULL; break;
+    case 'R': port->restart = NULL; break;
     default: port->kick = NULL; break;
     }
 }
@@ -378,8 +550,7 @@ int memory_start_cut(memory_board *board, long step, bool torn)
     board->cut = step;
     board->torn = torn;
     board->steps = 0;
-    memset(board->next, 0, sizeof board->next);
-    return teds_node_init(&board->node, &board->config, &board->port);
+    return memory_restart(board);
 }
 
 void memory_channel(memory_board *board, uint8_t number, uint8_t kind, uint8_t model, uint8_t octets_of_one,

@@ -3,11 +3,13 @@
 #ifndef TEDS_MEMORY_H
 #define TEDS_MEMORY_H
 
+#include "images.h"
 #include "teds/node.h"
 #include "teds_bearssl.h"
 
 #define MEMORY_IDENTITY 256u
 #define MEMORY_SLOT (TEDS_STAGING + 4096u)
+#define MEMORY_IMAGE 16384u
 
 /* `kind` n: octets for a nonce or counter; i, o: the scalar of an identity or one-time key. */
 typedef int (*memory_random)(char kind, uint8_t *out, size_t length);
@@ -15,6 +17,10 @@ typedef int (*memory_random)(char kind, uint8_t *out, size_t length);
 /* The channels, in a test's hands: `what` s sample, b bears, a set, g set point, f safe, m arm (argument: ms), k kick,
  * t self-test, T testing, F fault, p power (7 octets as the reply has them). */
 typedef int (*memory_hook)(char what, uint8_t channel, uint64_t argument, uint8_t *octets, size_t length);
+
+/* The firmware, in a test's hands: `what` a about (flags, major, minor, patch 2, build 4, image 32, text; returns the
+ * length), l locate (argument: seconds), m manage (octets in, answer out; returns its length), r restart. */
+typedef size_t (*memory_firmware_hook)(char what, unsigned argument, uint8_t *octets, size_t length, size_t room);
 
 typedef struct memory_board {
     teds_bearssl crypto; /* first: the port of BearSSL looks here */
@@ -34,6 +40,11 @@ typedef struct memory_board {
     long written, garbled;  /* units; the one that is taken and reads back as something else, 0: none */
     long reads, unreadable; /* of flash; the one that fails, 0: none */
     memory_hook hook;
+    memory_firmware_hook firmware;
+    char text[64];
+    bool has_images, restarts;
+    images images;
+    uint8_t image_flash[2 * MEMORY_IMAGE + IMAGES_RECORD_OCTETS];
     teds_port chip; /* its cryptography, behind what fails */
     long calls, failing; /* of the chip; the one that fails, 0: none */
     bool fd; /* how commands come */
@@ -57,6 +68,19 @@ bool memory_spare_slot_fails(const memory_board *board);
 void memory_no_channels(memory_board *board);
 void memory_halt(memory_board *board, uint8_t number, uint8_t halt);
 void memory_hook_up(memory_board *board, memory_hook hook);
+/* It reports its firmware, is located and managed; packets of at most so many octets, 0: what fits. Before the start. */
+void memory_firmware(memory_board *board, memory_firmware_hook hook, uint16_t most);
+void memory_pressed(memory_board *board);
+/* It has two slots and a boot loader of this owner (port/posix/images.h); before the start, in place of memory_firmware.
+ * False if that is no key. A start whose boot step fails returns MEMORY_NO_IMAGE. */
+#define MEMORY_NO_IMAGE (-100)
+bool memory_images(memory_board *board, const uint8_t *owner, size_t length, bool counter);
+/* All of their flash: out, and in again. */
+size_t memory_image_flash(const memory_board *board, uint8_t *out);
+void memory_put_image_flash(memory_board *board, const uint8_t *octets);
+/* True once after the node asked for a restart; and the restart, in which steps of flash count on. */
+bool memory_restarts(memory_board *board);
+int memory_restart(memory_board *board);
 /* A board that has none of this: a word of memory_hook. After hook_up. */
 void memory_without(memory_board *board, char what);
 void memory_slow(memory_board *board, bool slow);

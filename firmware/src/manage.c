@@ -1,0 +1,452 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+/* Manage (profile.md, "Firmware"): one SMP packet in, one out. The port's manager sees a packet only if it is one of a short
+ * list, with a body that cannot mean two things, at a moment that harms nobody: two packets in one, erasing of storage, an
+ * image that is permanent before it ran and recovery modes never pass. Whether an image may run is the boot loader's
+ * decision. */
+#include "manage.h"
+#include "about.h"
+#include "clock.h"
+#include "inside.h"
+
+#if TEDS_MANAGED
+
+#define HEADER_OCTETS 8u
+#define SHORTEST (HEADER_OCTETS + 1u)
+/* A sealed command's headers, counter, tag and longest padding. */
+#define LONGEST (TEDS_MAX_MESSAGE - 53u)
+#define UPLOAD_NS (60u * TEDS_SECOND)   /* without a good packet an upload is over */
+#define ANOTHER_NS (10u * TEDS_SECOND)  /* between beginnings of different uploads: each erases flash */
+#define TRIAL_NS (600u * TEDS_SECOND)
+#define SHA_OCTETS 32u
+#define DEPTH 8u /* of maps and arrays in each other */
+#define AN_ANSWER 1u /* in the first octet */
+
+/* -- CBOR (RFC 8949), as far as a filter needs it --------------------------------------------------------------------- */
+
+enum { UNSIGNED = 0, OCTETS = 2, TEXT = 3, ARRAY = 4, MAP = 5, TAG = 6, SIMPLE = 7 };
+#define OPEN_END 31u /* of an array or map without a length; as a simple value it closes one */
+
+typedef struct reading {
+    const uint8_t *at, *end;
+} reading;
+
+typedef struct item {
+    uint8_t major;
+    bool open;
+    uint32_t value;        /* number, length or count; UINT32_MAX if it is more */
+    const uint8_t *octets; /* of a string: where they begin */
+} item;
+
+/* Read an item's head, and a string's octets; false if it is cut or of a kind that never passes (tags, floating numbers,
+ * strings in pieces). */
+static bool next_item(reading *in, item *out)
+{
+    uint8_t additional;
+    if (in->at == in->end) {
+        return false;
+    }
+    out->major = (uint8_t)(*in->at >> 5);
+    additional = *in->at++ & 31u;
+    out->open = additional == OPEN_END;
+    out->value = additional;
+    out->octets = in->at;
+    if (out->open) {
+        return out->major == ARRAY || out->major == MAP || out->major == SIMPLE;
+    }
+    if (out->major == TAG || additional > 27 || (out->major == SIMPLE && additional > 23)) {
+        return false;
+    }
+    if (additional >= 24) {
+        const size_t octets = (size_t)1 << (additional - 24u);
+        bool more = false;
+        if (octets > (size_t)(in->end - in->at)) {
+            return false;
+        }
+        out->value = 0;
+        for (size_t i = 0; i < octets; i++) {
+            more = more || out->value > 0xFFFFFFu;
+            out->value = out->value << 8 | *in->at++;
+        }
+        out->value = more ? UINT32_MAX : out->value;
+    }
+    out->octets = in->at;
+    if (out->major == OCTETS || out->major == TEXT) {
+        if (out->value > (size_t)(in->end - in->at)) {
+            return false;
+        }
+        in->at += out->value;
+    }
+    return true;
+}
+
+/* What an upload's packet or the answer to one says. */
+typedef struct said {
+    bool off_there, length_there, sha_there, refuses, complete;
+    uint32_t off, length;
+    const uint8_t *sha;
+    uint8_t sha_length;
+} said;
+
+enum { OF_NO_CONCERN, OFF, LENGTH, SHA, REFUSAL, MATCH };
+
+static unsigned key_of(const item *key)
+{
+    static const struct {
+        char name[6];
+        uint8_t length, key;
+    } known[] = {{"off", 3, OFF}, {"len", 3, LENGTH}, {"sha", 3, SHA}, {"rc", 2, REFUSAL}, {"err", 3, REFUSAL}, {"match", 5, MATCH}};
+    for (size_t i = 0; i < sizeof known / sizeof known[0]; i++) {
+        if (key->value == known[i].length && memcmp(key->octets, known[i].name, key->value) == 0) {
+            return known[i].key;
+        }
+    }
+    return OF_NO_CONCERN;
+}
+
+/* Note a value; false if it has another type, or is there twice: the manager could take the other one. */
+static bool note_value(said *out, unsigned key, const item *value)
+{
+    bool good = true;
+    switch (key) {
+    case OFF:
+        good = !out->off_there && value->major == UNSIGNED;
+        out->off_there = true;
+        out->off = value->value;
+        break;
+    case LENGTH:
+        good = !out->length_there && value->major == UNSIGNED;
+        out->length_there = true;
+        out->length = value->value;
+        break;
+    case SHA:
+        good = !out->sha_there && value->major == OCTETS && value->value <= SHA_OCTETS;
+        out->sha_there = true;
+        out->sha = value->octets;
+        out->sha_length = (uint8_t)value->value;
+        break;
+    case REFUSAL: out->refuses = true; break;
+    case MATCH: out->complete = true; break;
+    default: break;
+    }
+    return good;
+}
+
+/* A map or array that is being read. */
+typedef struct level {
+    bool map, open, odd; /* odd: a key came, its value comes next */
+    uint32_t left;
+} level;
+
+/* True if the octets are one map and nothing else. `plain`: of a known length, with text as keys and without maps or arrays in
+ * it. `out` takes what stands in the map itself; NULL: that is of no concern. */
+static bool read_map(const uint8_t *octets, size_t length, bool plain, said *out)
+{
+    reading in = {octets, octets + length};
+    level levels[DEPTH];
+    size_t depth = 0;
+    unsigned key = OF_NO_CONCERN;
+    do {
+        level *in_it = depth > 0 ? &levels[depth - 1] : NULL;
+        item it;
+        if (!next_item(&in, &it) || (in_it == NULL && it.major != MAP)) {
+            return false;
+        }
+        if (it.major == SIMPLE && it.open) {
+            if (in_it == NULL || !in_it->open || in_it->odd) {
+                return false;
+            }
+            depth--;
+        } else {
+            const bool container = it.major == ARRAY || it.major == MAP;
+            if (depth == 1) {
+                if (plain && (container || (!in_it->odd && it.major != TEXT))) {
+                    return false;
+                }
+                if (out != NULL && in_it->odd && !note_value(out, key, &it)) {
+                    return false;
+                }
+                key = !in_it->odd && it.major == TEXT ? key_of(&it) : OF_NO_CONCERN;
+            }
+            if (in_it != NULL) {
+                in_it->odd = in_it->map && !in_it->odd;
+                in_it->left -= in_it->open ? 0u : 1u;
+            }
+            if (container) {
+                if (depth == DEPTH || (plain && it.open) || (!it.open && it.value > (size_t)(in.end - in.at))) {
+                    return false;
+                }
+                levels[depth].map = it.major == MAP;
+                levels[depth].open = it.open;
+                levels[depth].odd = false;
+                levels[depth].left = it.major == MAP ? 2u * it.value : it.value;
+                depth++;
+            }
+        }
+        while (depth > 0 && !levels[depth - 1].open && levels[depth - 1].left == 0) {
+            depth--;
+        }
+    } while (depth > 0);
+    return in.at == in.end;
+}
+
+/* -- the list ----------------------------------------------------------------------------------------------------------- */
+
+typedef enum request { READS, ECHO, RESTART, CONFIRM, TRY, UPLOAD, NOT_LISTED, BAD_BODY } request;
+
+#define GROUP_IMAGE 1u
+enum { OP_READ = 0x08, OP_WRITE = 0x0A };
+
+static bool is_body(const uint8_t *body, size_t length, const uint8_t *is, size_t octets)
+{
+    return length == octets && memcmp(body, is, octets) == 0;
+}
+
+/* Of 1/0: the three bodies that there are, octet for octet. None makes an image permanent that has not run. */
+static request state_of(const uint8_t *body, size_t length)
+{
+    static const uint8_t confirm[] = {0xA1, 0x67, 'c', 'o', 'n', 'f', 'i', 'r', 'm', 0xF5};
+    static const uint8_t hash[] = {0xA1, 0x64, 'h', 'a', 's', 'h', 0x58, 0x20};
+    static const uint8_t after[] = {0x67, 'c', 'o', 'n', 'f', 'i', 'r', 'm', 0xF4};
+    const size_t one = sizeof hash + SHA_OCTETS;
+    if (is_body(body, length, confirm, sizeof confirm)) {
+        return CONFIRM;
+    }
+    if (length < one || memcmp(body + 1, hash + 1, sizeof hash - 1) != 0) {
+        return BAD_BODY;
+    }
+    if (body[0] == hash[0] ? length == one
+                           : body[0] == 0xA2 && is_body(body + one, length - one, after, sizeof after)) {
+        return TRY;
+    }
+    return BAD_BODY;
+}
+
+static request listed(const uint8_t *packet)
+{
+    static const struct {
+        uint8_t operation, group, id, request;
+    } list[] = {
+        {OP_READ, 0, 6, READS},   {OP_READ, 0, 8, READS},    {OP_READ, 1, 0, READS},  {OP_READ, 1, 6, READS},
+        {OP_WRITE, 0, 0, ECHO},   {OP_WRITE, 0, 5, RESTART}, {OP_WRITE, 1, 0, TRY},   {OP_WRITE, 1, 1, UPLOAD},
+    };
+    for (size_t i = 0; i < sizeof list / sizeof list[0]; i++) {
+        if (packet[0] == list[i].operation && teds_get16(packet + 4) == list[i].group && packet[7] == list[i].id) {
+            return (request)list[i].request;
+        }
+    }
+    return NOT_LISTED;
+}
+
+/* Which request a packet is. `out`: what an upload says. */
+static request request_of(const uint8_t *packet, size_t length, said *out)
+{
+    const uint8_t *body = packet + HEADER_OCTETS;
+    const size_t octets = length - HEADER_OCTETS;
+    request asked = listed(packet);
+    switch (asked) {
+    case RESTART: return octets == 1 && body[0] == 0xA0 ? RESTART : BAD_BODY;
+    case TRY: return state_of(body, octets);
+    case UPLOAD: return read_map(body, octets, true, out) && out->off_there ? UPLOAD : BAD_BODY;
+    case READS:
+    case ECHO: return read_map(body, octets, false, NULL) ? asked : BAD_BODY;
+    default: return NOT_LISTED;
+    }
+}
+
+/* -- when ---------------------------------------------------------------------------------------------------------------- */
+
+static bool upload_lives(teds_node *node)
+{
+    if (node->managed.upload_of != NULL && teds_now(node) >= node->managed.upload_until) {
+        node->managed.upload_of = NULL;
+    }
+    return node->managed.upload_of != NULL;
+}
+
+static bool any_claim(const teds_node *node)
+{
+#if TEDS_OPERATION
+    for (const teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
+        if (each->claims != 0) {
+            return true;
+        }
+    }
+#else
+    (void)node;
+#endif
+    return false;
+}
+
+/* Another image is to be uploaded right after the last one began. */
+static bool too_soon(const teds_node *node, const said *upload)
+{
+    const teds_managed *own = &node->managed;
+    return upload->off == 0 && own->begun && teds_now(node) < own->sha_until &&
+           (upload->sha_length != own->sha_length || (own->sha_length > 0 && memcmp(upload->sha, own->sha, own->sha_length) != 0));
+}
+
+static int not_now(teds_node *node, request asked, const said *upload, const teds_session *session)
+{
+    if (asked == CONFIRM) {
+        return teds_on_trial(node) ? 0 : -TEDS_WRONG_STATE;
+    }
+    if (asked == READS || asked == ECHO) {
+        return 0;
+    }
+    if (any_claim(node) || (node->staging_of != NULL && node->staging_of != session) ||
+        (upload_lives(node) && node->managed.upload_of != session)) {
+        return -TEDS_BUSY;
+    }
+    if (asked != RESTART && (node->firmware & (TEDS_FIRMWARE_ON_TRIAL | TEDS_FIRMWARE_PENDING)) != 0) {
+        return -TEDS_BUSY; /* the second slot holds the way back */
+    }
+    return asked == UPLOAD && too_soon(node, upload) ? -TEDS_BUSY : 0;
+}
+
+/* What the running trial keeps as it is, and what an upload does not bear beside it. */
+int teds_demand_no_image(teds_node *node, const teds_command *command)
+{
+    const uint8_t function = command->function;
+    const bool common = command->command_class == TEDS_CLASS_COMMON;
+    const bool security = command->command_class == TEDS_CLASS_SECURITY;
+    if (teds_on_trial(node) &&
+        ((common && (function == TEDS_WRITE || function == TEDS_UPDATE)) ||
+         (security && (function == TEDS_REQUEST || function == TEDS_CONFIRM || function == TEDS_RESET ||
+                       function == TEDS_SET_CAN_ADDRESS)))) {
+        return -TEDS_BUSY;
+    }
+    if (((common && function == TEDS_WRITE) || (command->command_class == TEDS_CLASS_EITHER && function == 1)) &&
+        upload_lives(node)) {
+        return -TEDS_BUSY;
+    }
+    return 0;
+}
+
+/* -- the packet ------------------------------------------------------------------------------------------------------------ */
+
+static int restart_after(teds_node *node, const uint8_t *packet, teds_link link, uint8_t *out)
+{
+    memmove(out, packet, SHORTEST);
+    out[0] = OP_WRITE | AN_ANSWER;
+    node->managed.restarts = true;
+    node->managed.restart_link = link;
+    return (int)SHORTEST;
+}
+
+static void upload_begins(teds_managed *own, const said *upload, uint64_t now)
+{
+    own->begun = true;
+    own->sha_until = now + ANOTHER_NS;
+    own->upload_octets = upload->length;
+    own->sha_length = upload->sha_length;
+    if (upload->sha_length > 0) {
+        memcpy(own->sha, upload->sha, upload->sha_length);
+    }
+}
+
+static void upload_goes_on(teds_node *node, teds_session *session, const said *answer)
+{
+    teds_managed *own = &node->managed;
+    if (answer->refuses) {
+        return;
+    }
+    own->upload_of = answer->complete || (answer->off_there && answer->off >= own->upload_octets) ? NULL : session;
+    own->upload_until = teds_now(node) + UPLOAD_NS;
+}
+
+/* The images have changed; what a trial left to be erased goes when it is confirmed. */
+static void images_changed(teds_node *node)
+{
+    const bool was = teds_on_trial(node);
+    teds_firmware own;
+    (void)teds_firmware_read(node, &own);
+    if (was && !teds_on_trial(node) && node->free_slot_dirty) {
+        node->old_slot_due = true;
+        node->old_slot_by = teds_now(node);
+    }
+}
+
+static bool answers(const uint8_t head[HEADER_OCTETS], const uint8_t *out, size_t length)
+{
+    return length >= SHORTEST && out[0] == (head[0] | AN_ANSWER) && out[1] == 0 &&
+           teds_get16(out + 2) == length - HEADER_OCTETS && memcmp(out + 4, head + 4, 4) == 0;
+}
+
+int teds_manage(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
+{
+    const teds_port *port = node->port;
+    const uint8_t *packet = command->payload;
+    size_t length = command->length;
+    const size_t most = port->manage_octets != 0 && port->manage_octets < LONGEST ? port->manage_octets : LONGEST;
+    uint8_t head[HEADER_OCTETS];
+    said upload = {0}, answer = {0};
+    request asked;
+    int failed;
+    if ((node->firmware & TEDS_FIRMWARE_MANAGES) == 0) {
+        return -TEDS_UNKNOWN_COMMAND;
+    }
+    if (length > most) {
+        return -TEDS_TOO_LARGE;
+    }
+    if (length < SHORTEST || (packet[0] != OP_READ && packet[0] != OP_WRITE) || packet[1] != 0 ||
+        teds_get16(packet + 2) != length - HEADER_OCTETS) {
+        return -TEDS_BAD_FORM;
+    }
+    asked = request_of(packet, length, &upload);
+    if (asked == NOT_LISTED || asked == BAD_BODY) {
+        return asked == NOT_LISTED ? -TEDS_NOT_PERMITTED : -TEDS_BAD_FORM;
+    }
+    failed = not_now(node, asked, &upload, origin->session);
+    if (failed) {
+        return failed;
+    }
+    if (asked == RESTART) {
+        return restart_after(node, packet, origin->link, out);
+    }
+    if (asked == UPLOAD && upload.off == 0) {
+        upload_begins(&node->managed, &upload, teds_now(node));
+    }
+    memcpy(head, packet, sizeof head); /* the answer takes its place */
+    length = port->manage(port->user, packet, length, out, most);
+    if (asked == CONFIRM || asked == TRY) {
+        images_changed(node);
+    }
+    if (length > most || !answers(head, out, length) ||
+        !read_map(out + HEADER_OCTETS, length - HEADER_OCTETS, false, asked == UPLOAD ? &answer : NULL)) {
+        return -TEDS_FAILURE;
+    }
+    if (asked == UPLOAD) {
+        upload_goes_on(node, origin->session, &answer);
+    }
+    return (int)length;
+}
+
+/* -- beside commands --------------------------------------------------------------------------------------------------------- */
+
+void teds_upload_end(teds_node *node, const teds_session *session)
+{
+    if (node->managed.upload_of == session) {
+        node->managed.upload_of = NULL;
+    }
+}
+
+void teds_restart_after(teds_node *node, teds_link link)
+{
+    if (node->managed.restarts && node->managed.restart_link == link) {
+        node->managed.restarts = false;
+        node->port->restart(node->port->user);
+    }
+}
+
+uint64_t teds_trial_poll(teds_node *node, uint64_t now)
+{
+    if (!teds_on_trial(node)) {
+        return TEDS_NEVER;
+    }
+    if (now >= TRIAL_NS && node->port->restart != NULL) {
+        node->port->restart(node->port->user);
+    }
+    return now >= TRIAL_NS ? TEDS_NEVER : TRIAL_NS;
+}
+
+#endif
