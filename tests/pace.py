@@ -14,7 +14,7 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-PATIENCE = 60.0  # seconds; what comes at all comes by then, on any machine
+PATIENCE = 120.0  # seconds; what comes at all comes by then, on any machine
 
 
 class FailedTryWarning(UserWarning):

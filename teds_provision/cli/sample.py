@@ -17,7 +17,7 @@ from teds_provision import measure, talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import ChannelNumber, Number, WholeNumber, command, link_options, said_here
 from teds_provision.cli.rendering import print_table, reporter_for, shown, tidy
-from teds_provision.errors import LinkError, NodeRefusedError, UsageError
+from teds_provision.errors import NodeRefusedError, UsageError
 from teds_provision.links import LinkSettings
 from teds_provision.protocol import operation
 from teds_provision.teds.channel import within_turn
@@ -253,12 +253,8 @@ def set_value(
                 if left <= 0 or stop.wait(left):
                     break
     station.audit("set", uuid, "done", channel=channel, safe=actuator.safe)
-    if actuator.safe is None:
-        raise LinkError(
-            "The node did not confirm that its actuator is in its safe state.",
-            hint="Its dead-man timer brings it there. To check: teds-provision mode UUID",
-        )
-    app.emit({"event": "end", "safe": actuator.safe}, "safe" if actuator.safe else "NOT in its safe state")
+    safe = actuator.require_confirmation()
+    app.emit({"event": "end", "safe": safe}, "safe" if safe else "NOT in its safe state")
 
 
 def _require_unit(app: App, channel: Channel, value: float, unit: str | None) -> None:

@@ -99,6 +99,15 @@ class HeldActuator:
         except (TedsProvisionError, SessionLostError, KeyError):
             self.safe = None  # it cannot be reported from here; the node's dead-man takes care of it
 
+    def require_confirmation(self) -> bool:
+        """Return True if the node reported its safe state at release; raise LinkError if it did not answer."""
+        if self.safe is None:
+            raise LinkError(
+                "The node did not confirm that its actuator is in its safe state.",
+                hint="Its dead-man timer brings it there. To check: teds-provision mode UUID",
+            )
+        return self.safe
+
     @property
     def pause(self) -> float:
         """Seconds after which a value that stays is sent again, and the node's standing is looked at."""

@@ -38,7 +38,7 @@ FILES = 14
 LEAST, MOST = 20.0, 90.0
 """Seconds that the tests of one mutant get, whatever the time that is left says."""
 MARKS = "not slow and not soak and not machine and not realtime"
-_FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
+_FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+?(?:\[.*?\])?)(?: - .*)?$", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Bench:
             last = began + (MOST if mutant.rule else min(MOST, max(LEAST, share)))
             by, code = "", 1
             while not by and code not in (0, None, 5):
-                without = [word for test in self._bad for word in ("--deselect", test)]
+                without = [word for test in self._bad for word in ("--deselect" if "::" in test else "--ignore", test)]
                 copy.put(mutant.path, mutant.applied(source))
                 code, said = copy.run([*without, *files], max(1.0, last - time.monotonic()))
                 if code in (0, None, 5):

@@ -154,7 +154,8 @@ def test_unverified_ones_are_measured_calibrated_and_everything_says_so(desk: De
         assert after["channels"][0]["topic"] == "/bench/joint/angle"
         assert not after["unverified"]
         assert after["problem"] is None
-        until(lambda: {run["id"]: len(run["nodes"]) for run in asked.measurements()} == {"unverified": 0, "adopted": 1})
+        sizes = lambda: {run["id"]: len(run["nodes"]) for run in asked.measurements()}  # noqa: E731
+        until(lambda: sizes() == {"unverified": 0, "adopted": 1}, lambda: (sizes(), told(service, node)))
     assert told(service, node) == [("unverified", "joined"), ("unverified", "left"), ("adopted", "joined")]
     service.end()
     texts = {file.name.split("-")[0]: file.read_text() for file in record.glob("*.csv")}

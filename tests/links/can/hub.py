@@ -13,7 +13,7 @@ class Hub:
         self.lose = lose
         self.frames: list[tuple[int, bytes]] = []
         self._clients: list[socket.socket] = []
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # ``lose`` may send: that frame goes before its own
         self._socket = socket.create_server(("127.0.0.1", port))
         self.port = self._socket.getsockname()[1]
         threading.Thread(target=self._accept, daemon=True).start()

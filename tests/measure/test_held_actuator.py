@@ -1,0 +1,131 @@
+"""One actuator held by ``set``: what its dead-man allows, and what is reported of its end. The node is a mock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import LinkError, NodeRefusedError
+from teds_provision.measure import held_actuator
+from teds_provision.measure.held_actuator import HeldActuator
+from teds_provision.measure.verified_session import VerifiedSession
+from teds_provision.protocol.messages.frames import Command, Function
+from teds_provision.protocol.operation.commands import ChannelState, OperationReply
+from teds_provision.talk.conversation import SessionLostError
+from tests.measure.test_topic_actuators import SHEET
+
+DEAD_MAN = 400
+Answer = Callable[[], None]
+
+
+class Clock:
+    """The clock that the module reads; an answer of the node may take some of it."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+class Node:
+    """A session with a node: ``writes`` happens when a value is written, ``idles`` when it is released."""
+
+    def __init__(self, state: ChannelState, writes: Answer, idles: Answer) -> None:
+        self.state, self.writes, self.idles = state, writes, idles
+        self.allowed: list[float | None] = []
+
+    def request(self, command: Command, doing: str, *, within: float | None = None) -> bytes:
+        match command.function, doing:
+            case _, "to set the actuator":
+                self.allowed.append(within)
+                self.writes()
+            case _, "to let go of the actuator":
+                self.idles()
+            case Function.OPERATION, _:
+                return OperationReply(True, {1: (self.state, 0)}).encode()
+        return b""
+
+
+def lost() -> None:
+    raise SessionLostError(LinkError("The node does not answer."))
+
+
+def refused() -> None:
+    raise NodeRefusedError("The node refused.", reason=1)
+
+
+def quiet() -> None:
+    """Answer at once."""
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(held_actuator, "time", made)
+    return made
+
+
+def held(
+    state: ChannelState = ChannelState.SAFE, *, writes: Answer = quiet, idles: Answer = quiet
+) -> tuple[HeldActuator, Node]:
+    node: Any = Node(state, writes, idles)
+    return HeldActuator(VerifiedSession(node, SHEET, "00" * 32, "g"), 1, dead_man=DEAD_MAN), node
+
+
+def test_a_value_is_abandoned_at_the_end_of_the_dead_man(clock: Clock) -> None:
+    actuator, node = held()
+    with actuator:
+        assert actuator.apply(0.05).value == pytest.approx(0.05, abs=1e-4)
+    assert node.allowed == [DEAD_MAN / 1000]
+    assert actuator.require_confirmation() is True
+
+
+@pytest.mark.parametrize(("took", "in_time"), [(0.4, True), (0.41, False)])
+def test_a_value_that_took_longer_than_the_dead_man_moved_nothing_that_is_left(
+    clock: Clock, took: float, in_time: bool
+) -> None:
+    def slowly() -> None:
+        clock.now += took
+
+    clock.now = 0.0
+    actuator, _ = held(writes=slowly)
+    with actuator:
+        if in_time:
+            actuator.apply(0.05)
+            return
+        with pytest.raises(LinkError, match="longer than the dead-man") as late:
+            actuator.apply(0.05)
+        assert "in its safe state" in late.value.hint
+
+
+def test_a_session_that_is_lost_while_it_moves_says_who_makes_it_safe(clock: Clock) -> None:
+    actuator, _ = held(writes=lost)
+    with actuator, pytest.raises(LinkError, match="lost while the actuator was in use: The node does not") as gone:
+        actuator.apply(0.05)
+    assert "safe state by itself" in gone.value.hint
+
+
+@pytest.mark.parametrize("idles", [lost, refused])
+def test_a_node_that_does_not_confirm_its_safe_state_is_left_to_its_dead_man(clock: Clock, idles: Answer) -> None:
+    actuator, _ = held(idles=idles)
+    with actuator:
+        actuator.apply(0.05)
+    with pytest.raises(LinkError, match="did not confirm") as unconfirmed:
+        actuator.require_confirmation()
+    assert "dead-man timer" in unconfirmed.value.hint
+
+
+def test_an_actuator_that_is_not_safe_at_the_end_is_reported_so(clock: Clock) -> None:
+    actuator, _ = held(ChannelState.ACTUATOR)
+    with actuator:
+        actuator.apply(0.05)
+    assert actuator.require_confirmation() is False
+
+
+def test_a_value_is_sent_again_after_a_quarter_of_the_dead_man_and_half_a_second_at_most(clock: Clock) -> None:
+    assert held()[0].pause == pytest.approx(DEAD_MAN / 4000)
+    slow: Any = Node(ChannelState.SAFE, quiet, quiet)
+    assert HeldActuator(VerifiedSession(slow, SHEET, "00" * 32, "g"), 1, dead_man=10_000).pause == pytest.approx(0.5)
