@@ -8,7 +8,7 @@ from typing import Final
 # ruff: noqa: E501
 OPTIONS: Final[dict[str, frozenset[str]]] = {
     "": frozenset({"home", "json", "verbose", "quiet", "debug", "no-input", "passphrase-fd", "version"}),
-    "init": frozenset({"name", "keystore", "request", "certificate", "yes"}),
+    "init": frozenset({"name", "keystore", "request", "certificate", "ca", "yes"}),
     "provision": frozenset({"profile", "calibration", "item", "trust-dcc", "due", "no-calibration", "name", "accept-calibration", "retype", "adopt", "watch", "batch", "report", "all", "job", "calibrations", "files", "only", "label-to", "label-format", "scan", "evidence", "operator", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "verify": frozenset({"accept-calibration", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "nodes": frozenset({"state", "profile", "group", "due", "since", "fits", "format", "plant"}),
@@ -102,6 +102,7 @@ FILES: Final = frozenset({"batch", "calibration", "calibrations", "certificate",
 """Options that name a file or a folder, in every command that has them."""
 PARAMETERS: Final[dict[str, dict[str, str]]] = {
     "": {"json": "as_json"},
+    "init": {"ca": "ca_file"},
     "provision": {"all": "everything"},
     "nodes": {"format": "form", "plant": "of_plant"},
     "measure": {"channel": "channels", "to": "files"},

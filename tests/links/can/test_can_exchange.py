@@ -217,7 +217,7 @@ class StillBus:
     def identify(self, address: int) -> Identity:
         return self.identity
 
-    def tell_of_rivals(self, notice: object) -> None:
+    def report_rivals(self, notice: object) -> None:
         pass
 
 
