@@ -153,6 +153,12 @@ class KeyMismatchError(PolicyError):
     code = "other-key"
 
 
+class KnownUuidError(PolicyError):
+    """A new node would have the UUID of a node that the station or its bus has already."""
+
+    code = "uuid-known"
+
+
 class FrozenError(PolicyError):
     """Something is being measured and stays as it is until that ends."""
 

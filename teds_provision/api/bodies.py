@@ -158,6 +158,7 @@ class NewVirtual:
     content: Annotated[str, Meta(description="a datasheet in XML or JSON")] | None = None
     format: Annotated[str, Meta(description="ignored: the content shows what it is")] | None = None
     profile: ProfileName | None = None
+    new_uuid: Annotated[bool, Meta(description="give it another UUID than its datasheet has")] | None = None
 
     RULE: ClassVar = Meta(
         oneOf=[

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import functools
 import itertools
+import secrets
 import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,15 +20,18 @@ from teds_provision import node as node_room
 from teds_provision import protocol, talk, teds
 from teds_provision import teds as teds_room
 from teds_provision.cli.check import check
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import SOCKET, App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, Number, WholeNumber, command, examples
-from teds_provision.errors import UsageError
+from teds_provision.errors import KnownUuidError, StoreError, TedsProvisionError, UsageError
+from teds_provision.lazy import late
 from teds_provision.node import ble as ble_room
 from teds_provision.node import can as can_room
 from teds_provision.node import hardware as hardware_room
 from teds_provision.node import nfc as nfc_room
+from teds_provision.station import store as store_room
 
 if TYPE_CHECKING:
+    from teds_provision import client
     from teds_provision.node.ble.server import BleServer
     from teds_provision.node.can.server import CanServer
     from teds_provision.node.flash_file import FlashFile
@@ -35,6 +40,8 @@ if TYPE_CHECKING:
     from teds_provision.node.virtual import LinkServer, VirtualNode
     from teds_provision.node.wrapped.running import SensorPlace, WrappedRun
     from teds_provision.protocol.operation.streams import DataFrame
+else:
+    client = late("teds_provision.client")
 
 
 @click.group(
@@ -81,7 +88,15 @@ def _name(_ctx: click.Context, _parameter: click.Parameter, text: str) -> str:
 )
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--uuid", callback=_uuid, metavar="HEX", help="UUID, 20 hex digits (default: from the file, or random).")
-@click.option("--name", default="", callback=_name, help="Manufacturer's name for it, at most 120 octets.")
+@click.option(
+    "--new-uuid", is_flag=True, help="Replace the UUID in the file: two nodes with one UUID cannot be told apart."
+)
+@click.option(
+    "--name",
+    default="",
+    callback=_name,
+    help="Manufacturer's name for it, at most 120 octets (default: the one in the file).",
+)
 @click.option(
     "--teds",
     type=FileToRead(),
@@ -109,6 +124,7 @@ def create(
     app: App,
     folder: Path,
     uuid: bytes | None,
+    new_uuid: bool,
     name: str,
     teds: Path | None,
     profile: str | None,
@@ -118,7 +134,9 @@ def create(
 ) -> None:
     """Create a virtual node in DIR, in factory state, with its own key.
 
-    With --teds or --profile, it has the channels of that datasheet and carries its TEDS unsigned. With --from it wraps
+    With --teds or --profile, it has the channels of that datasheet and carries its TEDS unsigned. If this station or
+    its running ncap knows the UUID in the file, you are asked for a new one (--new-uuid, or --uuid to name one
+    yourself). With --from it wraps
     an existing sensor, whose values `node run --source` reads, and is marked as wrapped.
     """
     named = {"--teds": teds, "--profile": profile, "--from": wrapped}
@@ -129,6 +147,9 @@ def create(
         )
     if message is not None and wrapped is None:
         raise UsageError("--message needs --from dbc:FILE.")
+    if new_uuid and (uuid is not None or teds is None):
+        raise UsageError("--new-uuid replaces the UUID in a file.", hint="Give it with --teds FILE and without --uuid.")
+    uuid = _free_uuid(app, folder, uuid, teds, new_uuid)
     sensor = node_room.wrapped.reading.describe(wrapped, message) if wrapped is not None else None
     for note in sensor.notes if sensor is not None else ():
         app.note(note)
@@ -169,6 +190,52 @@ def create(
         + (f", {len(channels)} channel{'' if len(channels) == 1 else 's'}" if channels else "")
         + (f", wraps {origin.text}." if origin is not None else "."),
     )
+
+
+def _free_uuid(app: App, folder: Path, uuid: bytes | None, teds: Path | None, new_uuid: bool) -> bytes | None:
+    """Return the UUID of a new node: ``uuid``, None for the file's, or a new one if the file's is another node's.
+
+    Raises KnownUuidError without a terminal to ask on.
+    """
+    made = node_room.flash_file.FlashFile
+    if (folder / node_room.flash_file.FILE).exists():
+        return made(folder).load().uuid if new_uuid else uuid
+    own = secrets.token_bytes(teds_room.formats.UUID_OCTETS)
+    if new_uuid:
+        return own
+    stated = uuid or (node_room.node_template.from_file(teds).uuid if teds is not None else None)
+    known = _known_as(app, stated) if stated is not None else None
+    if stated is None or known is None:
+        return uuid
+    if uuid is not None:
+        app.warn(f"{known} has this UUID: two nodes with one UUID cannot be told apart. Run only one of them.")
+        return uuid
+    found = f"{known} has the UUID {stated.hex()} of {teds}; two nodes with one UUID cannot be told apart."
+    if not app.interactive:
+        raise KnownUuidError(
+            found,
+            hint=f"Add --new-uuid to give the new node its own, or --uuid {stated.hex()} to copy it as it is.",
+        )
+    app.note(found)
+    if not app.ask_yes_no("Create the node with a new UUID?"):
+        raise KnownUuidError("Cancelled. Nothing was created.", hint=f"To make the copy anyway: --uuid {stated.hex()}")
+    return own
+
+
+def _known_as(app: App, uuid: bytes) -> str | None:
+    """Return what has a UUID already: a node of this home's station, or one on a link of its running ncap."""
+    if not store_room.database.has_store(app.home):
+        return None
+    with suppress(StoreError):  # a virtual node can be made beside a store that cannot be read
+        station = app.station()
+        if station.nodes.is_known(uuid):
+            known = station.nodes.get(uuid)
+            return f"Node {known.name!r}" if known is not None and known.name else "A node of this station"
+    if (app.home / SOCKET).exists():
+        with suppress(TedsProvisionError):
+            client.connect(home=app.home).node(uuid.hex())
+            return "A node on a link of the running ncap"
+    return None
 
 
 @node.command(

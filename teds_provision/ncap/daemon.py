@@ -434,10 +434,20 @@ class Daemon:
     # -- virtual transducers -----------------------------------------------------------------------------------------
 
     def make_virtual(
-        self, *, name: str | None, source: str, content: str | None, profile: str | None
+        self, *, name: str | None, source: str, content: str | None, profile: str | None, new_uuid: bool = False
     ) -> dict[str, Any]:
-        """Make one and start it; it is provisioned when it answers. Raises UsageError, BadDataError, NotFoundError."""
-        made = self.virtuals.make(name=name, source=source, content=content, profile=profile)
+        """Make one and start it; it is provisioned when it answers.
+
+        Raises UsageError, BadDataError, NotFoundError, KnownUuidError.
+        """
+        made = self.virtuals.make(
+            name=name,
+            source=source,
+            content=content,
+            profile=profile,
+            new_uuid=new_uuid,
+            on_bus=self.directory.heard(),
+        )
         self._start_virtuals()
         self.directory.refresh([made.uuid])
         return made.as_json()

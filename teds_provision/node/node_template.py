@@ -18,6 +18,7 @@ from teds_provision.teds.formats import UUID_OCTETS, placed, stated_uuid, under
 from teds_provision.teds.image import SECURITY, BlockId, Image
 from teds_provision.teds.origin import ORIGIN
 from teds_provision.teds.profile import load_profile
+from teds_provision.teds.profile.model import renamed
 from teds_provision.teds.sheet import Sheet
 
 if TYPE_CHECKING:
@@ -79,11 +80,14 @@ def create(
 ) -> FlashFile:
     """Make a node, or open the one that was made so before. Its UUID: the one given, else the file's, else random.
 
+    ``name`` replaces the one in the file.
     With ``sensor`` it wraps that one: its Origin TEDS is read-only.
 
     Raises UsageError (the folder holds another node), NotFoundError, BadDataError, StoreError.
     """
     described = from_file(teds) if teds is not None else None
+    if described is not None and name:
+        described = NodeTemplate(renamed(described.blocks, name), described.uuid)
     wanted = uuid or (described.uuid if described is not None else None)
     if wanted is None:
         wanted = FlashFile(folder).load().uuid if (folder / FILE).exists() else secrets.token_bytes(UUID_OCTETS)

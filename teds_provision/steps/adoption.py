@@ -15,14 +15,13 @@ from teds_provision.lazy import late
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.sanitize import printable
 from teds_provision.station.station import Station
-from teds_provision.teds import compose
 from teds_provision.teds.channel import Channel
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import AccessCode, Field
 from teds_provision.teds.codec.tables import TEXT_BASED, name_of
 from teds_provision.teds.formats import stated_uuid
 from teds_provision.teds.image import BlockId, Image
-from teds_provision.teds.profile.model import USER_DEFINED_NAME
+from teds_provision.teds.profile.model import renamed
 from teds_provision.teds.profile.reader import NAME_OCTETS
 from teds_provision.teds.sheet import Sheet
 
@@ -86,8 +85,7 @@ def read_factory_datasheet(station: Station, image: Image, *, name: str | None =
     """
     blocks = dict(image.unsigned_blocks())
     if name is not None:
-        edition = decode(blocks[_NAME]).edition if _NAME in blocks else None
-        blocks[_NAME] = compose(AccessCode.NAME, {"Format": USER_DEFINED_NAME, "TCName": name}, edition=edition or 2007)
+        blocks = renamed(blocks, name)
     uuid = image.uuid.hex()
     for (channel, code), octets in blocks.items():
         if not can_be_stored((channel, code)) or not passes_own_check((channel, code), octets):

@@ -469,11 +469,13 @@ def test_a_virtual_transducer_is_made_from_a_document_under_a_uuid_of_its_own(
     service: Service, asked: Client, hand: str
 ) -> None:
     document = asked.request("GET", f"/nodes/{hand}/teds?format=xml")
-    refused(asked, 422, "usage", "POST", "/virtual", {"content": document, "source": "noise"})
-    copy = document.replace(f"<octets>{hand}</octets>", f"<octets>{'00' * 10}</octets>")
-    made = asked.request("POST", "/virtual", {"content": copy, "name": "copy", "source": "ramp:1"})
+    assert hand in refused(asked, 409, "uuid-known", "POST", "/virtual", {"content": document, "source": "noise"})
+    copy = {"content": document, "name": "copy", "source": "ramp:1", "new_uuid": True}
+    made = asked.request("POST", "/virtual", copy)
+    assert made["uuid"] != hand
     node = verified(service, made["uuid"])
     assert (verdict(node), node["virtual"], len(node["channels"])) == ("authentic", True, 3)
+    assert node["name"] == "copy"
     assert {item["name"] for item in asked.request("GET", "/virtual")["virtual"]} == {"hand", "copy"}
     asked.request("DELETE", f"/virtual/{made['uuid']}")
     gone = until(lambda: (node := asked.node(made["uuid"]))["present"] is False and node)

@@ -106,3 +106,11 @@ def test_hardware_stays_when_the_datasheet_changes(tmp_path: Path) -> None:
     before = made.hardware
     made.commit(made.load().__class__(**{**made.load().__dict__, "blocks": {}}))
     assert FlashFile(tmp_path / "node").hardware == before
+
+
+def test_a_name_that_is_given_replaces_the_one_in_the_file(tmp_path: Path, image: Image) -> None:
+    for form, path in files(tmp_path, image).items():
+        made = node_template.create(tmp_path / form / "node", teds=path, name="left hand")
+        assert (made.name, Sheet.from_blocks(made.hardware).meta.name) == ("left hand", "left hand"), form
+        assert Sheet.from_image(Image(UUID, made.hardware)).errors == (), form
+        assert node_template.create(tmp_path / form / "node", teds=path, name="left hand").hardware == made.hardware

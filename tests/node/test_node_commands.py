@@ -11,9 +11,14 @@ from pathlib import Path
 import pytest
 
 from teds_provision.node.flash_file import FlashFile
+from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
 from tests.bench import make_station
 from tests.cli.shell import spawn as run
 from tests.e2e.desk import Links, Running
+from tests.terminal import on_terminal
+
+UUID = bytes.fromhex("8d4d9da65281f7000000")
 
 
 @contextmanager
@@ -82,3 +87,32 @@ def test_many_nodes_on_one_bus_in_one_process_are_all_found(tmp_path: Path, coun
             if found == uuids:
                 break
         assert found == uuids, done
+
+
+def test_a_copy_of_a_known_node_gets_a_uuid_of_its_own_or_is_refused(tmp_path: Path) -> None:
+    """A datasheet's UUID that this station knows is never taken over without a word."""
+    home, file = tmp_path / "home", tmp_path / "real.json"
+    with closing(make_station(home)) as station:
+        image = Image(UUID, load_profile("gripper").build(UUID, name="hand").blocks)
+        file.write_text(image.to_json())
+        station.nodes.remember(UUID, name="hand")
+    make = ("--home", home, "--json", "node", "create")
+    refused = run(*make, tmp_path / "copy", "--teds", file)
+    assert (refused.code, refused.json["error"]["code"]) == (6, "uuid-known")
+    assert all(word in refused.json["error"]["hint"] for word in ("--new-uuid", f"--uuid {UUID.hex()}"))
+    assert not (tmp_path / "copy").exists()
+
+    made = run(*make, tmp_path / "copy", "--teds", file, "--new-uuid", "--name", "spare")
+    assert (made.code, made.json["name"]) == (0, "spare")
+    assert made.json["uuid"] != UUID.hex()
+    again = run(*make, tmp_path / "copy", "--teds", file, "--new-uuid", "--name", "spare")
+    assert (again.code, again.json["uuid"]) == (0, made.json["uuid"])
+
+    asked = run(*make, tmp_path / "twin", "--teds", file, "--uuid", UUID.hex())
+    assert (asked.code, asked.json["uuid"]) == (0, UUID.hex())
+    assert "cannot be told apart" in asked.err
+    assert run(*make, tmp_path / "no", "--new-uuid").code == 2
+
+    answered = on_terminal(home, "node", "create", tmp_path / "third", "--teds", file, answers=["y"])
+    assert answered.code == 0, answered
+    assert FlashFile(tmp_path / "third").load().uuid != UUID

@@ -169,6 +169,12 @@ class NodeDirectory:
             told |= {} if verdict is None else {"verdict": verdict}
             self._live.event("node", uuid=uuid, state=state, **told)
 
+    def heard(self) -> frozenset[str]:
+        """Return the nodes that answer on a link now, strangers of whitelist mode included."""
+        with self._lock:
+            here = {uuid for uuid, seen in self._seen.items() if seen.present}
+            return frozenset(here.union(*self._strangers.values()))
+
     def seen(self, uuid: str) -> NodePresence:
         """Return a node's state on the links."""
         with self._lock:

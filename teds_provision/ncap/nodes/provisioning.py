@@ -44,7 +44,6 @@ from teds_provision.steps.teds_read import list_blocks
 from teds_provision.steps.verify import Verification, require_authentic
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.progress import SilentReporter, StepResult
-from teds_provision.teds.formats import placed
 
 _log = logging.getLogger(__name__)
 WAITING: Final = 300.0  # seconds for a tap
@@ -410,7 +409,7 @@ class AutoProvisioner:
                 profile, calibration=self._virtuals.calibration_of(uuid), name=self._virtuals.name_of(uuid) or None
             )
             return provision(station, node, order, accept=lambda _who: None, reporter=SilentReporter()).verified
-        blocks = placed((self._virtuals.document_of(uuid) or "").encode())
+        blocks = self._virtuals.blocks_of(uuid)
         with station.node_lock(node.uuid):
             agree(station, node, identify(station, node))
             done = write_sheet(station, node, blocks, SilentReporter())

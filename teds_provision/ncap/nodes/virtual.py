@@ -17,19 +17,21 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Container
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.errors import NotFoundError, UsageError
+from teds_provision.errors import KnownUuidError, NotFoundError, UsageError
 from teds_provision.files import write_whole
 from teds_provision.handover.life import DECOMMISSIONED
 from teds_provision.links.opening import with_source
 from teds_provision.links.ports import free_port
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.settings import own_source
+from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.node_template import create
 from teds_provision.node.sources.base import seconds_of
 from teds_provision.protocol.announce import default_can_address
@@ -38,6 +40,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry
 from teds_provision.steps.build import check_name
 from teds_provision.teds.formats import UUID_OCTETS, placed, stated_uuid
+from teds_provision.teds.image import BlockId
 from teds_provision.teds.profile import default_folders
 from teds_provision.teds.sheet import Sheet
 
@@ -123,10 +126,20 @@ class Virtuals:
 
     # -- making and removing -----------------------------------------------------------------------------------------
 
-    def make(self, *, name: str | None, source: str, content: str | None, profile: str | None) -> Virtual:
+    def make(
+        self,
+        *,
+        name: str | None,
+        source: str,
+        content: str | None,
+        profile: str | None,
+        new_uuid: bool = False,
+        on_bus: Container[str] = (),
+    ) -> Virtual:
         """Make one from a datasheet (XML, JSON, hex) or a profile, whitelist it under the key in its file.
 
-        Raises UsageError, BadDataError, NotFoundError.
+        ``new_uuid``: the datasheet's own UUID is replaced. ``on_bus`` are the nodes that links have heard. Raises
+        UsageError, BadDataError, NotFoundError, KnownUuidError.
         """
         _check_source(source)
         if (content is None) == (profile is None):
@@ -135,7 +148,7 @@ class Virtuals:
             raise UsageError(f"This station already has {MOST} virtual transducers.", hint="Remove one first.")
         folder = self._home / secrets.token_hex(6)
         try:
-            one = self._create(folder, name or "", source, content, profile)
+            one = self._create(folder, name or "", source, content, profile, None if new_uuid else on_bus)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
@@ -144,21 +157,31 @@ class Virtuals:
         self._live.event("virtual", state="made", uuid=one.uuid, name=one.name)
         return one
 
-    def _create(self, folder: Path, name: str, source: str, content: str | None, profile: str | None) -> Virtual:
+    def _create(
+        self,
+        folder: Path,
+        name: str,
+        source: str,
+        content: str | None,
+        profile: str | None,
+        on_bus: Container[str] | None,
+    ) -> Virtual:
+        """Make its folder; ``on_bus`` None: it gets a UUID that the station chooses, whatever the datasheet has."""
         folder.mkdir(parents=True, mode=0o700)
         teds: Path | None = None
         if content is not None:
             teds = folder / "datasheet"
             placed(content.encode())  # its own message names the fault, not the file's
             teds.write_text(content, encoding="utf-8")
-        uuid_ = None if content is not None and stated_uuid(placed(content.encode())) else self._new_uuid()
+        stated = stated_uuid(placed(content.encode())) if content is not None and on_bus is not None else None
+        uuid_ = None if stated else self._new_uuid()
         folders = default_folders(self._station.home)
         flash = create(folder, uuid=uuid_, name=name, teds=teds, profile=profile, folders=folders)
         state = flash.load()
         sheet = Sheet.from_blocks(flash.hardware)
         one = Virtual(state.uuid.hex(), name or sheet.meta.name, source, folder, len(sheet.channels))
         check_name(one.name or None)
-        self._require_free(state.uuid, state.can_address, one.name)
+        self._require_free(state.uuid, state.can_address, one.name, on_bus or ())
         if profile is not None and (lines := ideal_calibration(sheet)):
             write_whole(folder / _CALIBRATION, lines.encode())
         write_whole(folder / _FACTS, json.dumps({**one.as_json(), "profile": profile}).encode())
@@ -168,12 +191,12 @@ class Virtuals:
             self._station.audit("virtual", state.uuid, "made", fingerprint=key)
         return one
 
-    def _require_free(self, uuid: bytes, address: int, name: str) -> None:
+    def _require_free(self, uuid: bytes, address: int, name: str, on_bus: Container[str]) -> None:
         """Refuse a UUID, an address or a name that another node has: that one would be tried again for ever."""
-        if uuid.hex() in self._all or self._station.nodes.is_known(uuid):
-            raise UsageError(
-                f"Node {uuid.hex()} already exists.",
-                hint="Clear the UUID in its Meta-TEDS; a new one is generated.",
+        if uuid.hex() in self._all or self._station.nodes.is_known(uuid) or uuid.hex() in on_bus:
+            raise KnownUuidError(
+                f"The datasheet has the UUID of node {uuid.hex()}, which this station already knows.",
+                hint='Two nodes with one UUID cannot be told apart. Give the new one its own UUID ("new_uuid": true).',
             )
         if address in self._addresses():
             raise UsageError(
@@ -208,10 +231,9 @@ class Virtuals:
         """Return the name that it was given, "" for none."""
         return self._virtual_of(uuid).name
 
-    def document_of(self, uuid: str) -> str | None:
-        """Return the datasheet that one was made from, None if it was a profile."""
-        path = self._virtual_of(uuid).folder / "datasheet"
-        return path.read_text(encoding="utf-8") if path.exists() else None
+    def blocks_of(self, uuid: str) -> dict[BlockId, bytes]:
+        """Return the TEDS that one was made with, under its own UUID and name."""
+        return FlashFile(self._virtual_of(uuid).folder).hardware
 
     def forget(self, uuid: str) -> Virtual:
         """Remove one from the station; it still runs until :meth:`end`; raises NotFoundError."""

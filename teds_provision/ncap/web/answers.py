@@ -20,6 +20,7 @@ from teds_provision.api import schema
 from teds_provision.errors import (
     DatasheetChangedError,
     FrozenError,
+    KnownUuidError,
     LinkError,
     NodeBusyError,
     NodeRefusedError,
@@ -42,6 +43,7 @@ _MOVING: Final = ThreadPoolExecutor(16, "moves an actuator")
 _STATUS: Final[tuple[tuple[type[TedsProvisionError], int], ...]] = (
     (NotFoundError, 404),
     (FrozenError, 409),
+    (KnownUuidError, 409),
     (DatasheetChangedError, 412),
     (NodeBusyError, 423),
     (LinkError, 503),

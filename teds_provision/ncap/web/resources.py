@@ -392,7 +392,13 @@ class Resources:
             )
 
         def make() -> dict[str, Any]:
-            return self._daemon.make_virtual(name=body.name, source=source, content=body.content, profile=body.profile)
+            return self._daemon.make_virtual(
+                name=body.name,
+                source=source,
+                content=body.content,
+                profile=body.profile,
+                new_uuid=bool(body.new_uuid),
+            )
 
         return JSONResponse(await changing(make), 201)
 

@@ -12,6 +12,7 @@ from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import Calibration, Monotone
 from teds_provision.teds.calibration.samples import raw_range
 from teds_provision.teds.codec.composer import compose
+from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import AccessCode, Edition, Units
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.units import WrittenUnit
@@ -240,6 +241,14 @@ def _described(profile: Profile, channel: ChannelProfile, given: Calibration | N
         fields = {**channel.fields, "CalKey": key}
         profile.composed[place] = compose(AccessCode.CHANNEL, fields, edition=edition)
     return profile.composed[place]
+
+
+def renamed(blocks: Mapping[BlockId, bytes], name: str) -> dict[BlockId, bytes]:
+    """Return the same TEDS with another name of the node, in the edition that its name TEDS has."""
+    present = blocks.get((0, AccessCode.NAME))
+    edition = decode(present).edition if present is not None else None
+    own = compose(AccessCode.NAME, {"Format": USER_DEFINED_NAME, "TCName": name}, edition=edition or 2007)
+    return {**blocks, (0, int(AccessCode.NAME)): own}
 
 
 @lru_cache(maxsize=64)

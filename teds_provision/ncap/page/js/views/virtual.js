@@ -12,7 +12,7 @@ export function virtualView(main) {
   const file = h("input", { type: "file", accept: ".xml,.json,application/xml,application/json" });
   const name = h("input", { type: "text", maxlength: "120", autocomplete: "off" });
   const source = h("select", {}, h("option", { value: "sine:5" }, "Sine, 5 s"), h("option", { value: "ramp:5" }, "Ramp, 5 s"), h("option", { value: "noise" }, "Noise"));
-  const make = button("Create", { class: "main", onclick: () => make.busy(create) }, "plus");
+  const make = button("Create", { class: "main", onclick: () => make.busy(() => create()) }, "plus");
   const error = h("div", {});
   main.append(
     h("h2", { class: "view-title" }, "Virtual transducers"),
@@ -45,7 +45,7 @@ export function virtualView(main) {
     else if (!none.firstChild) fill(none, empty("No virtual transducers yet.", h("p", {}, "Choose a type on this page and press Create. It appears under Nodes like a real node.")));
   }
 
-  async function create() {
+  async function create(newUuid = false) {
     error.replaceChildren();
     const chosen = file.files[0];
     if (!chosen && !type.value) {
@@ -58,6 +58,7 @@ export function virtualView(main) {
         body.content = await chosen.text();
         body.format = body.content.trimStart().startsWith("<") ? "xml" : "json";
       } else body.profile = type.value;
+      if (newUuid) body.new_uuid = true;
       const made = await post("virtual", body);
       file.value = name.value = "";
       say(`Virtual transducer ${made.name ?? ""} created.`);
@@ -65,6 +66,7 @@ export function virtualView(main) {
       await refresh("virtual", "nodes");
     } catch (refusal) {
       fill(error, trouble(refusal));
+      if (refusal.code === "uuid-known") error.append(h("button", { type: "button", onclick: () => create(true) }, "Create it with a new UUID"));
     }
   }
 
