@@ -179,7 +179,7 @@ def close(station: Station, octets: bytes) -> CloseResult:
         raise PolicyError(
             f"This move was undone here, but station {peer_name(station, receipt.sender)} took"
             f" {len(receipt.imported)} keys in all the same.",
-            hint="Rotate them at once: teds-provision agree UUID --rotate. Or export the move anew.",
+            hint="Rotate them at once: teds-provision agree UUID --rotate. Or export the move again.",
         )
     with station.transaction():
         _settle(station, row, receipt)

@@ -207,7 +207,7 @@ def other_key(pinned: str, node: bytes) -> KeyMismatchError:
     """Return the error for a known UUID that comes with another key."""
     return KeyMismatchError(
         f"This UUID is known with key {pinned[:16]}, the node shows {fingerprint(node)[:16]}.",
-        hint="It may be a clone. If the board was replaced on purpose: whitelist remove UUID, then whitelist it anew.",
+        hint="It may be a clone. If the board was replaced on purpose: whitelist remove UUID, then whitelist add UUID.",
     )
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from teds_provision.errors import (
     BadDataError,
     GarbledError,
+    KeyMismatchError,
     LinkError,
     NodeRefusedError,
     NodeSilentError,
@@ -157,6 +158,9 @@ def unknown_key(station: Station, node: Conversation) -> PolicyError:
     The operator decides what that means, never the tool (profile, section 2).
     """
     uuid = node.uuid.hex()
+    another = _shows_another_key(station, node)
+    if another is not None:
+        return another
     elsewhere = agreed_elsewhere(station, node)
     said = "it answers that it knows none of the keys held here"
     if elsewhere and _signed_for_another_ca(station, node.uuid, _shown_security(node)):
@@ -197,6 +201,19 @@ def agreed_elsewhere(station: Station, node: Conversation) -> str:
         if any(station_signature_good(shown, ca) for ca in station.policy.trusted_cas(node.uuid)):
             return f"{hint}; its datasheet is signed by station {digits}, which your CA certified"
     return f"{hint}; which station did so will show once it signs the datasheet"
+
+
+def _shows_another_key(station: Station, node: Conversation) -> KeyMismatchError | None:
+    """Return the error if the node shows another identity key than the pinned one: a copy with the same UUID."""
+    try:
+        shown = security.decode(_shown_security(node))
+        if shown.node_key is not None:
+            station.pins.check(node.uuid, shown.node_key)
+    except BadDataError:
+        return None
+    except KeyMismatchError as mismatch:
+        return mismatch
+    return None
 
 
 def _shown_security(node: Conversation) -> bytes:

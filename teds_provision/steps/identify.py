@@ -51,7 +51,7 @@ def prove(node: Conversation, point: bytes) -> None:
     if not verify(point, prove_message(node.uuid, challenge), proof):
         raise NotAuthenticError(
             f"The node cannot prove that it holds the key {fingerprint(point)[:16]}, which it presents.",
-            hint="This may be a copied tag. Do not use it.",
+            hint="This may be a copied tag, or two boards with one UUID answer. Do not use it; connect one alone.",
         )
 
 

@@ -22,7 +22,7 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry
-from teds_provision.steps.agree import AgreeResult, agree, open_session
+from teds_provision.steps.agree import AgreeResult, agree, open_session, require_session
 from teds_provision.steps.identify import identify
 from teds_provision.teds.codec import security
 from tests.bench import Board, MemoryLink, make_station, talk
@@ -358,6 +358,15 @@ def test_a_rotation_by_another_station_is_told_never_healed_by_itself(station: S
         run(station, board)
     assert held(station, board) == [("active", 1)]
     assert run(station, board, rotate=True).epoch == 2
+
+
+def test_a_copy_with_the_uuid_of_a_known_node_is_named_as_such(station: Station, board: Board) -> None:
+    """Another board under the same UUID knows no key of ours: it is no reason to rotate the key."""
+    whitelist(station, board)
+    run(station, board)
+    copy = Board(uuid=board.uuid)
+    with talk(copy) as node, pytest.raises(KeyMismatchError, match="is known with key"):
+        require_session(station, node)
 
 
 def test_a_lost_store_is_healed_by_a_tap_where_identity_and_ca_were_kept(station: Station, board: Board) -> None:

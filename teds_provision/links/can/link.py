@@ -59,7 +59,8 @@ def conflict(node: int) -> AddressConflictError:
     """Return the error for two nodes under one address."""
     return AddressConflictError(
         f"Two nodes answer at CAN address 0x{node:02X}.",
-        hint="Tap one of them, or connect it alone, then run: teds-provision address UUID NEW.",
+        hint="If they have one UUID, disconnect the copy (a virtual one: make it again with --new-uuid)."
+        " Otherwise tap one of them, or connect it alone, then run: teds-provision address UUID NEW.",
     )
 
 
