@@ -109,3 +109,60 @@ print(decode(compose(200, {{"BatchNo": 7}})).get("BatchNo"))
 """
     done = run(copy, "-c", code)
     assert done.stdout.splitlines() == ["['1', '2']", "None", "7"], done.stderr[-2000:]
+
+
+MEASURED = """
+import json, subprocess, sys, threading, time
+from pathlib import Path
+from teds_provision.links import open_place
+from teds_provision.measure.blocks import SetPointCommand
+from teds_provision.measure.buses import Buses
+from teds_provision.measure.request import MeasurementRequest
+from teds_provision.measure.runner import Watcher
+from teds_provision.measure.running.measurement_job import MeasurementJob
+from teds_provision.station.store import KeptMeasurement
+from tests.bench import make_station
+from tests.measure.hall import provisioned
+
+folder = Path(sys.argv[1])
+station = make_station(folder / "home")
+uuid = bytes.fromhex(provisioned(station, folder / "node", "gripper", "grip"))
+words = [sys.executable, "-m", "tests.line_node", str(folder / "node")]
+with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as node:
+    try:
+        port = open_place(f"line:127.0.0.1:{node.stdout.readline().strip()}")
+        stop, driven = threading.Event(), threading.Event()
+        kept = KeptMeasurement("", uuids=(uuid,), sinks=(str(folder / "run.jsonl"),), actuators=True)
+        job = MeasurementJob(station, kept, request=MeasurementRequest(timeout=60.0))
+        def drive(_block):  # set points until the node has moved by one, and then an end
+            job.measurement.command(SetPointCommand(uuid.hex(), 1, 0.02, time.monotonic()))
+        def hear():
+            for line in node.stdout:
+                if line.startswith("driven"):
+                    stop.set()
+        threading.Thread(target=hear, daemon=True).start()
+        with Buses([port]) as buses:
+            ended = job.run(buses, stop, watcher=Watcher(block=drive), duration=60.0)
+        port.close()
+    finally:
+        node.terminate()
+station.close()
+rows = [json.loads(line) for line in (folder / "run.jsonl").read_text().splitlines()]
+[report] = ended.nodes
+print(json.dumps({
+    "error": str(ended.error or ""),
+    "driven": stop.is_set(),
+    "values": sum("value" in row for row in rows) > 0,
+    "bad": sum(stream["bad"] for stream in report["streams"]),
+}))
+"""
+
+
+def test_a_third_link_that_streams_measures(copy: Path, tmp_path: Path) -> None:
+    """No file of `measure` or `ncap` was touched for it."""
+    page = (ROOT / "docs" / "extending.md").read_text()
+    [links] = re.findall(r"^## A link that streams\n(.*?)^## ", page, re.M | re.S)
+    assert {name.split("/")[1] for _, name, *_ in BLOCK.findall(links)} == {"links"}
+    done = run(copy, "-c", MEASURED, tmp_path)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert json.loads(done.stdout) == {"error": "", "driven": True, "values": True, "bad": 0}

@@ -1,6 +1,7 @@
 """Measuring and driving over a link: :class:`MeasuringLink`, which every port with ``capabilities.streams`` is.
 
-A link that streams derives its port from it. Nothing above this package asks which link it is.
+A link that streams derives its port from it. Nothing above this package asks which link it is (docs/extending.md,
+"A link that streams").
 """
 
 from __future__ import annotations
