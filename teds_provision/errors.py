@@ -128,6 +128,12 @@ class RegistryError(LinkError):
     code = "registry"
 
 
+class BoardLostError(LinkError):
+    """A board did not come back after the restart with new firmware."""
+
+    code = "lost"
+
+
 class UnprovenError(LinkError):
     """A key of the node is held here and no session came about, so nothing that was read counts."""
 
@@ -193,6 +199,30 @@ class RosterExpiredError(PolicyError):
     """The roster is older than the owner's CA allows."""
 
     code = "roster-expired"
+
+
+class WrongImageError(PolicyError):
+    """A firmware image does not name the board that it is for."""
+
+    code = "wrong-image"
+
+
+class NoUpdateError(PolicyError):
+    """A board takes no firmware over its session."""
+
+    code = "no-update"
+
+
+class DowngradeError(PolicyError):
+    """A firmware image is older than what runs."""
+
+    code = "downgrade"
+
+
+class RevertedError(PolicyError):
+    """A new firmware image did not prove itself, and the board runs its old one again."""
+
+    code = "reverted"
 
 
 class NodeRefusedError(PolicyError):

@@ -27,15 +27,16 @@ ARROWS = {
     "sanitize": set(),
     "lazy": set(),
     "limits": set(),
+    "firmware_image": set(),
     "teds": set(),
     "protocol": {"teds"},
     "links": {"protocol", "teds"},
     "vault": {"protocol", "teds"},
     "station": {"vault", "protocol", "teds"},
-    "node": {"links", "protocol", "teds"},
+    "node": {"links", "protocol", "teds", "firmware_image"},
     "trace": {"links", "protocol", "teds"},
     "talk": _BELOW_TALK,
-    "steps": _BELOW_TALK | {"talk"},
+    "steps": _BELOW_TALK | {"talk", "firmware_image"},
     "handover": _BELOW_TALK | {"talk", "steps"},
     "plant": _BELOW_TALK | {"talk", "steps", "handover"},
     "measure": _BELOW_TALK | {"talk", "steps", "handover"},
@@ -48,13 +49,14 @@ ARROWS = {
     "demo": _BELOW_TALK | {"talk", "steps", "handover", "plant", "measure", "client"},
     "cli": _BELOW_TALK
     | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure", "check", "ncap", "client", "api"}
-    | {"trace", "plant", "describe"},
+    | {"trace", "plant", "describe", "firmware_image"},
     "__main__": {"cli"},
 }
 # Too slow to load before they are needed: --help, --version and a pure decode must not wait for them.
 HEAVY = {"nfc", "ndef", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11"}
 HEAVY |= {"mcap", "cyclonedds", "paho", "starlette", "uvicorn", "websockets"}
 HEAVY |= {"bleak", "bumble", "dbus_fast", "psycopg", "pyarrow", "pandas", "cantools", "canopen", "lxml", "signxml"}
+HEAVY |= {"imgtool", "smp", "cbor2", "pydantic"}
 PURE = ("protocol", "teds")
 IO = {"socket", "sqlite3", "subprocess", "threading", "time", "click", "serial"}
 

@@ -119,6 +119,10 @@ def _name(_ctx: click.Context, _parameter: click.Parameter, text: str) -> str:
     metavar="OCTETS",
     help="Maximum frame length.",
 )
+@click.option("--firmware", type=FileToRead(), metavar="IMAGE", help="MCUboot image that it runs; with --firmware-key.")
+@click.option(
+    "--firmware-key", type=FileToRead(), metavar="PEM", help="Owner's public key, which its boot loader checks."
+)
 @pass_app
 def create(
     app: App,
@@ -131,6 +135,8 @@ def create(
     wrapped: str | None,
     message: str | None,
     max_message: int,
+    firmware: Path | None,
+    firmware_key: Path | None,
 ) -> None:
     """Create a virtual node in DIR, in factory state, with its own key.
 
@@ -150,6 +156,8 @@ def create(
     if new_uuid and (uuid is not None or teds is None):
         raise UsageError("--new-uuid replaces the UUID in a file.", hint="Give it with --teds FILE and without --uuid.")
     uuid = _free_uuid(app, folder, uuid, teds, new_uuid)
+    if (firmware is None) != (firmware_key is None):
+        raise UsageError("--firmware and --firmware-key belong together.", hint="The boot loader checks each image.")
     sensor = node_room.wrapped.reading.describe(wrapped, message) if wrapped is not None else None
     for note in sensor.notes if sensor is not None else ():
         app.note(note)
@@ -163,6 +171,9 @@ def create(
         folders=teds_room.profile.default_folders(app.home),
         sensor=sensor,
     )
+    image = None
+    if firmware is not None and firmware_key is not None:
+        image = node_room.firmware.boot_loader.ImageSlots.create(folder, firmware, firmware_key).running
     flash = made.load()  # what lies there: the same command once more finds the node that it made
     print_of_key = protocol.keys.fingerprint(flash.node_key)
     channels: list[dict[str, object]] = [
@@ -185,10 +196,12 @@ def create(
             "can_address": flash.can_address,
             "channels": channels,
             "origin": origin.to_json() if origin is not None else None,
+            "firmware": {"version": image.version_text, "image": image.digest.hex()} if image is not None else None,
         },
         f"Node {flash.uuid.hex()} in {folder}, key {print_of_key[:16]}, CAN address 0x{flash.can_address:02x}"
         + (f", {len(channels)} channel{'' if len(channels) == 1 else 's'}" if channels else "")
-        + (f", wraps {origin.text}." if origin is not None else "."),
+        + (f", wraps {origin.text}" if origin is not None else "")
+        + (f", firmware {image.version_text}." if image is not None else "."),
     )
 
 
@@ -493,6 +506,7 @@ def _servers(
             tapped = node.in_factory_state if nfc is None else lambda: False
             bus.add(node, counts_as_tapped=tapped, measuring=node)
             node.announces_presses_over(functools.partial(bus.announce_press, node))
+            node.when_restarted(functools.partial(bus.restarted, node))
             node.streams_over(functools.partial(_send, bus, node))
         servers.append(bus)
     return servers

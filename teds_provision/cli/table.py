@@ -46,6 +46,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "read": Entry("build", "read", "Read every TEDS of a node."),
         "reset": Entry("at_node", "reset", "Reset a node to factory state and keep its signed receipt."),
         "address": Entry("at_node", "address", "Change a node's CAN address."),
+        "update": Entry("update", "update", "Install new firmware over the session; it must prove itself to stay."),
         "label": Entry("nodes", "label", "Make a label with QR code, UUID and fingerprint."),
         "log": Entry("log", "log", "Show the audit log and check its hash chain."),
         "trace": Entry("log", "trace", "Show what --trace recorded."),

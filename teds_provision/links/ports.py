@@ -78,7 +78,7 @@ class Capabilities:
     starts them all. ``connectionless``: a question to one node, or to all, needs neither a tap nor a connection.
     ``shared``: each station, and each of its processes, has a source address of its own (:class:`SharedBus`).
     ``many``: several nodes are there at once, and may be talked to from one thread each, ``max_parallel`` of them at a
-    time.
+    time. ``octets_a_second`` is about how fast a long transfer goes, for an estimate.
     """
 
     tapped: bool = False
@@ -89,14 +89,22 @@ class Capabilities:
     shared: bool = False
     many: bool = False
     max_parallel: int = 1
+    octets_a_second: int = 2_000
 
 
 NFC = Capabilities(tapped=True)
 CAN = Capabilities(
-    wired=True, streams=True, triggers=True, connectionless=True, shared=True, many=True, max_parallel=24
+    wired=True,
+    streams=True,
+    triggers=True,
+    connectionless=True,
+    shared=True,
+    many=True,
+    max_parallel=24,
+    octets_a_second=24_000,
 )
 """While most of 24 nodes calculate, a bus is never idle at 500 kbit/s."""
-BLE = Capabilities(streams=True, many=True)
+BLE = Capabilities(streams=True, many=True, octets_a_second=8_000)
 """One node after the other: an adapter holds few connections (notes in docs/hardware.md)."""
 
 
@@ -230,6 +238,14 @@ class PacedLink(Protocol):
     """A link on which a reply can be asked for with a ``gap`` (ms) between its frames, so that data find room there."""
 
     gap: int
+
+
+@runtime_checkable
+class SharedBusLink(Protocol):
+    """A link on which a long transfer has to leave room for the streams of other nodes (CAN)."""
+
+    def wait_for_air(self) -> bool:
+        """Wait until the next message of a long transfer may leave; True if streams run, so that it should be short."""
 
 
 @runtime_checkable

@@ -7,6 +7,7 @@ from teds_provision.lazy import lazy
 if TYPE_CHECKING:
     from teds_provision.node import (
         can,
+        firmware,
         flash_file,
         handler,
         hardware,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
+from teds_provision.errors import NodeSilentError, TedsProvisionError
 from teds_provision.node.can.endpoint import BUS
+from teds_provision.node.firmware.boot_loader import ImageSlots
+from teds_provision.node.firmware.manager import ImageManager, ManagedFirmware
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import Board
 from teds_provision.node.hardware.clock import NANOSECONDS
@@ -18,6 +22,7 @@ from teds_provision.node.realtime_loop import RealtimeLoop
 from teds_provision.node.reported_firmware import ReportedFirmware
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, verify
+from teds_provision.protocol.messages.firmware import Firmware
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.operation.hardware import port_of
 from teds_provision.protocol.operation.streams import DataFrame
@@ -41,6 +46,9 @@ _TELL_EVERY: Final = 10.0
 _EVENTS: Final = 0.005
 """Seconds between two looks at event sensors."""
 _SIMULATION_WAITS: Final = 0.5
+_TRIAL_SECONDS: Final = 600.0
+"""An image that was not confirmed by then has failed: the board restarts, and the boot loader reverts it."""
+_log = logging.getLogger(__name__)
 
 SendData = Callable[[DataFrame], None]
 
@@ -155,27 +163,86 @@ class VirtualNode:
         self.flash_file = FlashFile(folder, delay=self._delays.flash, exclusive=exclusive)
         self.board = board(self.flash_file)
         self._core, self._realtime_loop = _Core(), pulse
-        report = self.flash_file.firmware
         self._wire = threading.Lock()
         self._sampled = 0
         self._told_missed, self._tell_at = 0, 0.0
         self._buses: dict[str, SendData] = {}
         self._press_announcers: list[Callable[[], None]] = []
         self._one_time_at = time.monotonic() + self._delays.crypto
-        self.tim = Tim(
+        self._clock, self._has_can, self._located = clock, has_can, located
+        self._slots: ImageSlots | None = None
+        self.manager: ImageManager | None = None
+        self._restarted: list[Callable[[], None]] = []
+        self._off = False
+        if ImageSlots.has(folder):
+            self._slots = ImageSlots(folder)
+            self.manager = ImageManager(self._slots, self._restart_soon)
+        self.tim = self._start()
+        if self.board is not None:
+            self.board.clock.due, self.board.clock.guard = self._simulated, self._core.interrupt
+
+    def _start(self) -> Tim:
+        """Start the board: the boot loader chooses the image, and what lay in RAM is gone."""
+        if self._slots is not None:
+            self._slots.start()
+            self._end_trial_in_time(self._slots)
+        return Tim(
             _SlowKey(self.flash_file.key, self._work),
             _Flash(self.flash_file, self._core),
-            clock,
+            self._clock,
             max_message=self.flash_file.max_message,
             one_time=self._one_time,
             verify=self._verify,
             hardware=self.board,
             quick_points=self._delays.crypto <= _QUICK,
-            has_can=has_can,
-            firmware=ReportedFirmware(report, located) if report is not None else None,
+            has_can=self._has_can,
+            firmware=self._firmware(),
+            manager=self.manager,
         )
-        if self.board is not None:
-            self.board.clock.due, self.board.clock.guard = self._simulated, self._core.interrupt
+
+    def _firmware(self) -> Firmware | None:
+        """Return what reports the firmware: the image that runs, else the description of the node."""
+        if self.manager is not None:
+            return ManagedFirmware(self.manager, self._located)
+        report = self.flash_file.firmware
+        return ReportedFirmware(report, self._located) if report is not None else None
+
+    def _end_trial_in_time(self, slots: ImageSlots) -> None:
+        """Restart a board whose image is still on trial after ten minutes."""
+        if not slots.on_trial:
+            return
+        image = slots.running
+
+        def look() -> None:
+            if slots.on_trial and slots.running is image:
+                self.restart()
+
+        timer = threading.Timer(_TRIAL_SECONDS, look)
+        timer.daemon = True
+        timer.start()
+
+    def _restart_soon(self) -> None:
+        """Restart when the command that asks for it is over."""
+        threading.Thread(target=self.restart, name="restart", daemon=True).start()
+
+    def restart(self) -> None:
+        """Restart the board: sessions and all that lay in RAM are gone; its links are told.
+
+        A board whose only image does not verify stays silent.
+        """
+        with self._core.command():
+            try:
+                self.tim = self._start()
+            except TedsProvisionError as error:
+                _log.error("The board does not start: %s", error.message)
+                self._off = True
+        for restarted in self._restarted:
+            restarted()
+        self._wake()
+
+    def when_restarted(self, restarted: Callable[[], None]) -> None:
+        """Have a link called after each restart: its conversations are over."""
+        self._restarted.append(restarted)
 
     # -- what links call -------------------------------------------------------------------------------------------
 
@@ -198,6 +265,8 @@ class VirtualNode:
         simulated = self.board is not None and not self.board.clock.runs_by_itself
         at = None if simulated else received  # a simulation's tick does not advance while a command runs
         with self._core.command():
+            if self._off:
+                raise NodeSilentError("The board does not start.")
             port = port_of(link)._replace(fd=fd, mtu=mtu, hears=hears)
             reply = self.tim.handle(frame, link=link, tapped=tapped, port=port, received=at)
         with self._wire:
@@ -269,6 +338,8 @@ class VirtualNode:
 
     def reset_by_hand(self) -> None:
         """Hold the button 5 s."""
+        if self.manager is not None and self.manager.on_trial:
+            self.restart()  # an image on trial changes nothing that is stored
         with self._core.command():
             self.tim.reset_by_hand()
 

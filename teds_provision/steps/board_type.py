@@ -41,6 +41,8 @@ from teds_provision.teds.sheet import Channel, Sheet
 from teds_provision.teds.units import PRODUCT, name_of_units, units_of
 
 _LEASE: Final = 5
+_TRIED: Final = 8
+"""Sensors that are asked for a valid value, one after the other: a probe may be unplugged."""
 _ROOM: Final = 180  # octets of data sets in one reply, so that it fits any node's maxMessage
 
 
@@ -361,6 +363,38 @@ def _read(node: Conversation, sheet: Sheet, sensors: list[Channel], digest: byte
                 at += one.octets
             for number in part:
                 yield _to_json(readers[number], raws, valid=reply.valid)
+    finally:
+        node.request(idle(0), "to let go")
+
+
+def require_working_hardware(node: Conversation, image: Image) -> None:
+    """Have new firmware show, in its session, that it serves each channel of ``image``, and one sensor one valid value.
+
+    Sensors that another session claims are left alone; nothing stays claimed. Raises WrongBoardError with the channel
+    that it does not serve, BadDataError if no free sensor gives a valid value; NodeRefusedError, LinkError,
+    SessionLostError.
+    """
+    sheet = Sheet.from_image(Image(image.uuid, image.unsigned_blocks()))
+    digest = hashlib.sha256(image.security or b"").digest()
+    served = [channel for channel in sheet.channels if _bears(node, channel, digest)]
+    if not served:
+        return
+    told = OperationReply.decode(node.request(OPERATION, "to tell its mode")).channels
+    taken = {number for number, (state, _) in told.items() if state & ChannelState.CLAIMED_BY_OTHER}
+    free = [channel for channel in served if not channel.actuator and channel.number not in taken]
+    if free and not any(_gives_value(node, channel, digest) for channel in free[:_TRIED]):
+        raise BadDataError("No sensor of the board gives a valid value.")
+
+
+def _gives_value(node: Conversation, channel: Channel, digest: bytes) -> bool:
+    """Return True if a sensor gives a valid value, calibrated or not; a faulty one gives none."""
+    if channel.sample is None:
+        return False
+    try:
+        operate(node, channel.number, digest, lease=_LEASE)
+        return SampleReply.decode(node.request(sample([channel.number]), "to sample"), channel.sample.octets).valid
+    except NodeRefusedError:
+        return False
     finally:
         node.request(idle(0), "to let go")
 

@@ -87,7 +87,7 @@ def _met_at(
             raise
         raise _no_link(station, uuid, error) from error
     try:
-        _require_no_measurement(station, port, uuid)
+        avoid_measuring_source(station, port, uuid)
         before()
         address = likely_address(station, uuid)
         contact = port.find(wanted, seconds=links.timeout, notice=reporter.notice, address=address)
@@ -169,7 +169,7 @@ def likely_address(station: Station, uuid: bytes) -> int:
     return known.can_address if known is not None and known.can_address else default_can_address(uuid)
 
 
-def _require_no_measurement(station: Station, port: Port, uuid: bytes) -> None:
+def avoid_measuring_source(station: Station, port: Port, uuid: bytes) -> None:
     """Avoid the source address from which a process of this station measures the node.
 
     A session belongs to a pair of addresses: another one from here would end it. Without a named address the next free

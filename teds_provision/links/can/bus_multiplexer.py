@@ -32,6 +32,7 @@ from teds_provision.links.can.isotp import (
     flow,
     read_single,
 )
+from teds_provision.links.can.transfer_pace import TransferPace
 from teds_provision.protocol.announce import is_announce
 
 # Who reads a bus: a loop of its own, or the thread that waits for a reply and so need not be woken by another.
@@ -441,6 +442,7 @@ class BusMultiplexer:
         self.spec = bus.spec
         self.own = bus.spec.source
         self.conflicts = AddressConflicts(self.own)
+        self.transfer_pace = TransferPace(bus.spec)
         self._failure: LinkError | None = None
         self._listeners: tuple[Listener, ...] = ()
         self._asked: tuple[PendingBroadcast, ...] = ()
@@ -502,6 +504,7 @@ class BusMultiplexer:
     def send(self, frame: Frame) -> None:
         """Put one frame on the bus; raises LinkError."""
         self.check()
+        self.transfer_pace.count(frame)
         with self._sending:
             self._bus.send(frame)
 
@@ -565,6 +568,7 @@ class BusMultiplexer:
 
     def _route(self, frame: Frame) -> None:
         self.conflicts.heard(frame)
+        self.transfer_pace.count(frame)
         if is_announce(frame.identifier):
             node = frame.identifier & 0xFF
             self._announced[node] = time.monotonic()

@@ -143,6 +143,10 @@ class CanLink:
         """Send the last frame once more under its transaction; see ``ResendLink.again``."""
         return self._ask(frame, self._last, tries=TRIES, seconds=self._reply_seconds)
 
+    def wait_for_air(self) -> bool:
+        """Wait until a long transfer may go on; see ``SharedBusLink.wait_for_air``."""
+        return self._bus().transfer_pace.wait()
+
     def close(self) -> None:
         """Nothing to leave behind on CAN."""
 

@@ -150,6 +150,13 @@ class CanEndpoint:
                 line.pairs.clear()
                 line.turns.put(line.begin_anew)
 
+    def restart(self) -> None:
+        """Begin again as after a start of the board: at the durable address, without sessions."""
+        self.address = self.handler.can_address()
+        self.claim = AddressClaim(self.claim.crc)
+        self._presses = ButtonPresses()
+        self.lose_lines()
+
     def lose_lines(self) -> None:
         """Drop sessions and stored replies: the bus is gone."""
         lines, self.lines = self.lines, {}

@@ -92,6 +92,12 @@ class EndpointTable:
             if seat is not speaker and not (speaker is None and own):
                 self._contested(seat, announce)
 
+    def announce_again(self, seat: CanEndpoint) -> None:
+        """Schedule the Announce of an endpoint that has started again, maybe at another address."""
+        self.find()
+        seat.claim.start(time.monotonic())
+        self._announce_when_due(seat)
+
     def _announce_when_due(self, seat: CanEndpoint) -> None:
         due = seat.claim.due(time.monotonic())
         if due is None:
@@ -249,6 +255,16 @@ class CanServer:
             self._addresses.speaks(seat, identifier)
         with self._sending:
             bus.send(Frame(identifier, data, fd))
+
+    def restarted(self, handler: NodeHandler) -> None:
+        """Begin again with a node that has restarted."""
+        with self._lock:
+            seat = self._seat_of.get(id(handler))
+            if seat is None or self._stop.is_set():
+                return
+            self._moves(seat)
+            seat.restart()
+            self._addresses.announce_again(seat)
 
     def announce_press(self, handler: NodeHandler) -> None:
         """Announce at once that a node's button was pressed."""

@@ -36,6 +36,7 @@ from teds_provision.protocol.operation.hardware import Hardware, SessionPort, po
 from teds_provision.protocol.operation.role import InnerCommand, OperationRole
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.protocol.session import LAST_COUNTER, NodeSession, OneTime
+from teds_provision.protocol.tim.manage import ManageFilter, Manager
 from teds_provision.protocol.tim.node_agreement import AgreementSlot
 from teds_provision.protocol.tim.node_sessions import Sessions
 from teds_provision.protocol.tim.permission import Origin, Permission, of_teds
@@ -53,7 +54,8 @@ class Tim:
     from the first moment after a start; ``one_time`` makes the key pair of one Open or one Request (a board may have
     one ready), ``verify`` checks a signature.
     ``sessions`` and ``streams`` are its room for them; ``hardware`` is what it measures and acts with, None: nothing.
-    ``firmware`` reports what runs on it and makes it blink, None: it reports nothing, as nodes before 128.21.
+    ``firmware`` reports what runs on it and makes it blink, None: it reports nothing, as nodes before 128.21;
+    ``manager`` is the SMP server behind 128.23, None: it takes no firmware.
     ``quick_points``: its point arithmetic holds no Sealed frame up by more than 5 ms. Without CAN (``has_can``) it
     reports the address 0 and does not know 128.10.
     """
@@ -72,6 +74,7 @@ class Tim:
     quick_points: bool = True
     has_can: bool = True
     firmware: Firmware | None = None
+    manager: Manager | None = None
 
     def __post_init__(self) -> None:
         self._flash = self.memory.load()
@@ -99,6 +102,15 @@ class Tim:
                 max_message=self.max_message,
                 streams=self.streams,
             )
+        self._manage: ManageFilter | None = None
+        if self.manager is not None:
+            self._manage = ManageFilter(
+                self.manager,
+                self.clock,
+                self.max_message,
+                claimed=lambda: self._role is not None and bool(self._role.claims.sessions()),
+                staged_elsewhere=self._staging.require,
+            )
         self._permission = Permission(
             lambda: self._flash.state == NodeState.FACTORY,
             self._sessions.any_on,
@@ -107,6 +119,7 @@ class Tim:
             self.quick_points,
             self.has_can,
             self.firmware is not None,
+            self._manage,
         )
         self._security: dict[int, Callable[[bytes, Origin], bytes]] = {
             Function.REQUEST: self._request,
@@ -121,6 +134,7 @@ class Tim:
             Function.LIST: self._list,
             Function.ABOUT: self._about,
             Function.LOCATE: self._locate,
+            Function.MANAGE: self._manage_packet,
         }
 
     # -- what links call -------------------------------------------------------------------------------------------
@@ -177,6 +191,8 @@ class Tim:
         session = self._sessions.on(link)
         if self._role is not None and session is not None:
             self._role.streams.reply_left(session)
+        if self._manage is not None:
+            self._manage.reply_left(link)
 
     def poll(self) -> float | None:
         """Take samples, run leases and dead-men; gives seconds until one is due again, None: none is known.
@@ -329,6 +345,12 @@ class Tim:
         self.firmware.locate(payload[0])
         return b""
 
+    def _manage_packet(self, payload: bytes, origin: Origin) -> bytes:
+        if self._manage is None:
+            raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
+        assert origin.session is not None
+        return self._manage.run(payload, origin.session, origin.link)
+
     # -- sessions --------------------------------------------------------------------------------------------------
 
     def _sealed(self, payload: bytes, origin: Origin) -> bytes:
@@ -347,6 +369,8 @@ class Tim:
 
     def _session_ended(self, session: NodeSession) -> None:
         self._staging.end(session)
+        if self._manage is not None:
+            self._manage.session_ended(session)
         if self._role is not None:
             self._role.session_ended(session)
 

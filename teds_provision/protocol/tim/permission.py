@@ -11,6 +11,7 @@ from typing import Final
 
 from teds_provision.protocol.messages.frames import (
     COMMON,
+    EITHER,
     SECURITY,
     Command,
     CommandRefusedError,
@@ -18,9 +19,11 @@ from teds_provision.protocol.messages.frames import (
     Reason,
     TedsFunction,
 )
+from teds_provision.protocol.operation.commands import OPERATE_FUNCTION
 from teds_provision.protocol.operation.hardware import SessionPort
 from teds_provision.protocol.operation.role import OperationRole
 from teds_provision.protocol.session import OPEN_OCTETS, NodeSession
+from teds_provision.protocol.tim.manage import ManageFilter
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,10 @@ _PLAIN_ALONE: Final = frozenset({Function.OPEN, Function.SEALED})
 _CHANGES: Final = frozenset(
     {(COMMON, TedsFunction.WRITE), (COMMON, TedsFunction.UPDATE), (SECURITY, Function.SET_CAN_ADDRESS)}
 )
+_STORED: Final = _CHANGES | {(SECURITY, function) for function in (Function.REQUEST, Function.CONFIRM, Function.RESET)}
+"""Commands that change what is stored: refused while the running image is on trial."""
+_DURING_UPLOAD: Final = frozenset({(COMMON, TedsFunction.WRITE), (EITHER, OPERATE_FUNCTION)})
+"""Commands that an upload of any session delays."""
 _STRANGER_SECONDS: Final = 1.0
 """While a stream runs, plain Read and List are answered once in so many seconds."""
 
@@ -68,6 +75,7 @@ class Permission:
     quick_points: bool
     has_can: bool = True
     has_firmware: bool = True
+    manage: ManageFilter | None = None
     _stranger_at: float | None = None
 
     def check(self, command: Command, origin: Origin) -> None:
@@ -97,6 +105,7 @@ class Permission:
                 self._hold_strangers_back()
         elif not self._measures(command) and not of_teds(command):
             raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
+        self._spare_firmware(command)
         self._change(command, origin)
 
     def _plain_security(self, function: Function, payload: bytes, origin: Origin) -> None:
@@ -123,6 +132,14 @@ class Permission:
 
     def _measures(self, command: Command) -> bool:
         return self.role is not None and self.role.knows(command)
+
+    def _spare_firmware(self, command: Command) -> None:
+        """Keep what an image on trial was given, and the flash that an upload writes."""
+        number = (command.command_class, command.function)
+        if self.manage is None:
+            return
+        if (number in _STORED and self.manage.on_trial) or (number in _DURING_UPLOAD and self.manage.uploading):
+            raise CommandRefusedError(Reason.BUSY)
 
     def _change(self, command: Command, origin: Origin) -> None:
         """Refuse changes of datasheet and address under a claim."""

@@ -1,0 +1,266 @@
+"""Firmware update: what an update proves before it keeps an image, what it refuses, and every way to be interrupted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import (
+    BoardLostError,
+    DowngradeError,
+    NodeSilentError,
+    PolicyError,
+    RevertedError,
+    WrongImageError,
+)
+from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.station.station import Station
+from teds_provision.teds.image import SECURITY
+from tests.bench import PASSPHRASE
+
+from .update_bench import Owner, StationKilled, UpdateBench
+
+
+@pytest.fixture(scope="module")
+def owner(tmp_path_factory: pytest.TempPathFactory) -> Owner:
+    return Owner(tmp_path_factory.mktemp("owner"))
+
+
+@pytest.fixture
+def bench(owner: Owner, tmp_path: Path) -> Iterator[UpdateBench]:
+    bench = UpdateBench.copy_of(owner, tmp_path)
+    yield bench
+    bench.close()
+
+
+def test_a_new_image_is_proven_kept_and_nothing_else_changes(bench: UpdateBench, owner: Owner) -> None:
+    flash = bench.node.tim.flash
+    done = bench.update(owner.new)
+    assert (done.result, done.before, done.octets, done.error) == ("updated", "1.0.0", len(owner.new.octets), None)
+    assert bench.runs == ("1.1.0", False, False)
+    assert bench.node.tim.flash == flash
+    exchanges = bench.exchanges
+    again = bench.update(owner.new)
+    assert (again.result, again.octets) == ("already", 0)
+    assert bench.exchanges - exchanges < 12
+    assert [entry.outcome for entry in bench.station.audit_log.entries() if entry.act == "update"] == ["updated"]
+
+
+@pytest.mark.parametrize(
+    ("board", "refused"),
+    [("other/board", True), (None, True), ("virtual", False), ("virtual/finger", False), ("finger", True)],
+)
+def test_an_image_for_another_board_needs_a_person(
+    bench: UpdateBench, owner: Owner, board: str | None, refused: bool
+) -> None:
+    image = owner.image("1.1.1", counter=1, board=board)
+    done = bench.update(image)
+    assert (done.result, type(done.error)) == (("refused", WrongImageError) if refused else ("updated", type(None)))
+    if refused:
+        assert bench.runs == ("1.0.0", False, False)
+        assert bench.update(image, other_board=True).result == "updated"
+
+
+def test_an_older_image_needs_a_word_and_the_counter_may_still_stop_it(bench: UpdateBench, owner: Owner) -> None:
+    assert bench.update(owner.image("2.0.0", counter=2)).result == "updated"
+    older = owner.image("1.9.0", counter=2)
+    done = bench.update(older)
+    assert (done.result, type(done.error), done.octets) == ("refused", DowngradeError, 0)
+    assert bench.update(older, allow_downgrade=True).result == "updated"
+    done = bench.update(owner.image("1.8.0", counter=1), allow_downgrade=True)
+    assert (done.result, type(done.error)) == ("reverted", RevertedError)
+    assert bench.runs == ("1.9.0", False, False)
+
+
+def test_another_owners_image_never_starts(bench: UpdateBench, owner: Owner) -> None:
+    done = bench.update(owner.image("6.0.0", owner.rival, counter=9))
+    assert (done.result, type(done.error)) == ("reverted", RevertedError)
+    assert "owner's key" in done.error.hint if done.error else False
+    assert bench.runs == ("1.0.0", False, False)
+    assert bench.update(owner.new).result == "updated"
+
+
+def test_another_image_on_trial_or_pending_is_left_alone(bench: UpdateBench, owner: Owner) -> None:
+    other = owner.image("1.0.5", counter=1)
+    slots = bench.node._slots
+    assert slots is not None
+    slots.write(0, other.octets)
+    assert slots.start_next(other.digest)
+    done = bench.update(owner.new)
+    assert (done.result, type(done.error)) == ("refused", PolicyError)
+    bench.node.restart()
+    assert bench.runs == ("1.0.5", True, False)
+    done = bench.update(owner.new)
+    assert (done.result, type(done.error)) == ("refused", PolicyError)
+    assert bench.runs == ("1.0.5", True, False)
+    assert bench.update(other).result == "updated", "the update that it belongs to goes on"
+
+
+def test_a_board_that_never_returns_is_lost_and_the_same_call_goes_on_later(bench: UpdateBench, owner: Owner) -> None:
+    bench.node.when_restarted(lambda: setattr(bench, "present", False))
+    done = bench.update(owner.new, wait=0.5)
+    assert (done.result, type(done.error)) == ("lost", BoardLostError)
+    bench.present = True
+    assert bench.runs == ("1.1.0", True, False)
+    assert bench.update(owner.new).result == "updated"
+    assert bench.runs == ("1.1.0", False, False)
+
+
+def test_a_board_that_lost_power_on_trial_runs_its_old_image_and_takes_the_new_one_again(
+    bench: UpdateBench, owner: Owner
+) -> None:
+    bench.node.when_restarted(bench.power_on)
+    done = bench.update(owner.new)
+    assert (done.result, type(done.error)) == ("reverted", RevertedError)
+    assert bench.runs == ("1.0.0", False, False)
+    done = bench.update(owner.new)
+    assert (done.result, done.octets) == ("updated", 0), "the image is in the other slot already"
+
+
+@pytest.mark.parametrize("sabotage", ["datasheet", "key", "values", "confirms itself"])
+def test_an_image_that_does_not_prove_itself_is_reverted(bench: UpdateBench, owner: Owner, sabotage: str) -> None:
+    node, flash, key = bench.node, bench.node.tim.flash, bench.node.tim.key
+    board, slots = node.board, node._slots
+    assert board is not None
+    assert slots is not None
+    read = board.read
+
+    def spoil() -> None:
+        """Do what the new image does wrong, and undo it when the old one runs."""
+        new = slots.running.version_text == "1.1.0"
+        if sabotage == "datasheet":
+            other = {**flash.blocks, SECURITY: flash.blocks[SECURITY][:-2] + b"xx"}
+            node.tim._flash = replace(flash, blocks=other) if new else flash
+        elif sabotage == "key":
+            node.tim.key = SoftwareKey.generate() if new else key
+        elif sabotage == "values":
+            mute = lambda channel, tick: (read(channel, tick)[0], False)  # noqa: E731
+            board.read = mute if new else read  # type: ignore[method-assign]
+        elif new:
+            slots.confirm()
+
+    bench.node.when_restarted(spoil)
+    done = bench.update(owner.new)
+    if sabotage == "confirms itself":
+        assert (done.result, type(done.error)) == ("refused", PolicyError)
+        assert "keeps the new image" in str(done.error)
+        return
+    assert (done.result, type(done.error)) == ("reverted", RevertedError)
+    assert bench.runs == ("1.0.0", False, False)
+
+
+# -- interruptions: at every exchange, at either end, before and after it ----------------------------------------------
+
+
+def _request_lost(bench: UpdateBench, at: int) -> None:
+    def cut(number: int) -> None:
+        if number == at:
+            raise NodeSilentError("The request was lost.")
+
+    bench.cut = cut
+
+
+def _reply_lost(bench: UpdateBench, at: int) -> None:
+    def answered(number: int) -> None:
+        if number == at:
+            raise NodeSilentError("The reply was lost.")
+
+    bench.answered = answered
+
+
+def _station_killed(bench: UpdateBench, at: int) -> None:
+    def cut(number: int) -> None:
+        if number == at:
+            raise StationKilled
+
+    bench.cut = cut
+
+
+def _station_killed_after(bench: UpdateBench, at: int) -> None:
+    def answered(number: int) -> None:
+        if number == at:
+            raise StationKilled
+
+    bench.answered = answered
+
+
+def _node_off(bench: UpdateBench, at: int) -> None:
+    def cut(number: int) -> None:
+        if number == at:
+            bench.power_on()
+
+    bench.cut = cut
+
+
+def _node_off_after(bench: UpdateBench, at: int) -> None:
+    def answered(number: int) -> None:
+        if number == at:
+            bench.power_on()
+            raise NodeSilentError("The board lost power with its reply.")
+
+    bench.answered = answered
+
+
+INTERRUPTIONS = (
+    _request_lost,
+    _reply_lost,
+    _station_killed,
+    _station_killed_after,
+    _node_off,
+    _node_off_after,
+)
+
+
+def exchanges_of(owner: Owner, folder: Path) -> int:
+    """How many exchanges an update without interruption takes."""
+    bench = UpdateBench.copy_of(owner, folder)
+    assert bench.update(owner.long).result == "updated"
+    bench.close()
+    return bench.exchanges
+
+
+def interrupted(owner: Owner, folder: Path, interruption: Callable[[UpdateBench, int], None], at: int) -> None:
+    """Interrupt an update, look at what is left, and run the same call again until it ends well."""
+    bench = UpdateBench.copy_of(owner, folder)
+    flash, old, new = bench.node.tim.flash, "1.0.0", owner.long
+    interruption(bench, at)
+    first = "killed"
+    with suppress(StationKilled):
+        first = bench.update(new, wait=2.0).result
+    bench.cut = bench.answered = lambda number: None
+    assert bench.node.tim.flash == flash, "key, datasheet, address, epoch and sequence"
+    assert bench.runs[0] in (old, new.version_text)
+    assert first != "updated" or bench.runs == (new.version_text, False, False)
+    bench.station.close()
+    bench.station = Station.open(folder / "home", ask=lambda prompt, confirm: PASSPHRASE)
+    again = [bench.update(new, wait=2.0)]
+    if again[0].result == "reverted":  # power failed on trial, and nothing had been told
+        again.append(bench.update(new, wait=2.0))
+    assert again[-1].result in ("updated", "already"), (again, first)
+    assert bench.runs == (new.version_text, False, False)
+    assert bench.node.tim.flash == flash
+    bench.node.restart()
+    assert bench.runs == (new.version_text, False, False), "it stays over a restart"
+    bench.close()
+
+
+@pytest.mark.parametrize("interruption", INTERRUPTIONS, ids=lambda how: how.__name__.strip("_"))
+def test_an_update_that_is_interrupted_resumes(
+    owner: Owner, tmp_path: Path, interruption: Callable[[UpdateBench, int], None]
+) -> None:
+    last = exchanges_of(owner, tmp_path)
+    for at in range(2 + INTERRUPTIONS.index(interruption), last + 1, 9):
+        interrupted(owner, tmp_path / str(at), interruption, at)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("interruption", INTERRUPTIONS, ids=lambda how: how.__name__.strip("_"))
+def test_an_update_resumes_after_an_interruption_at_any_exchange(
+    owner: Owner, tmp_path: Path, interruption: Callable[[UpdateBench, int], None]
+) -> None:
+    for at in range(1, exchanges_of(owner, tmp_path) + 1):
+        interrupted(owner, tmp_path / str(at), interruption, at)

@@ -1,0 +1,97 @@
+"""Image files: what imgtool signed is read; anything else is refused by name, whatever was done to it."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError
+from teds_provision.firmware_image import (
+    FirmwareImage,
+    load_firmware_image,
+    load_key,
+    public_pem,
+    read_firmware_image,
+    read_key,
+)
+
+from .firmware_images import make_key, sign
+
+
+@pytest.fixture(scope="module")
+def owner(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_key(tmp_path_factory.mktemp("owner") / "owner.pem")
+
+
+@pytest.fixture(scope="module")
+def image(owner: Path) -> FirmwareImage:
+    return load_firmware_image(sign(owner.parent, "1.2.3+45", owner, counter=7), owner)
+
+
+def test_an_image_names_its_version_board_counter_and_digest(image: FirmwareImage, owner: Path) -> None:
+    assert (image.version, image.version_text) == ((1, 2, 3, 45), "1.2.3+45")
+    assert (image.board, image.security_counter, image.signed) == ("virtual/finger", 7, True)
+    assert image.digest != hashlib.sha256(image.octets).digest(), "MCUboot's digest is not that of the file"
+    bare = load_firmware_image(sign(owner.parent, "2.0.0", owner, board=None))
+    assert (bare.version_text, bare.board, bare.security_counter, bare.signed) == ("2.0.0", None, None, False)
+
+
+def test_the_public_half_of_the_owners_key_is_enough(image: FirmwareImage, owner: Path) -> None:
+    public = public_pem(load_key(owner))
+    assert b"PRIVATE" not in public
+    assert read_firmware_image(image.octets, read_key(public)) == image
+
+
+def test_only_the_owners_signature_counts(image: FirmwareImage, owner: Path) -> None:
+    rival = make_key(owner.parent / "rival.pem")
+    with pytest.raises(NotAuthenticError, match="not signed with this key"):
+        read_firmware_image(image.octets, load_key(rival))
+    unsigned = sign(owner.parent, "3.0.0", None)
+    assert load_firmware_image(unsigned).version_text == "3.0.0", "the board decides, if no key is given"
+    with pytest.raises(NotAuthenticError, match="not signed with this key"):
+        load_firmware_image(unsigned, owner)
+
+
+def test_a_padded_image_is_refused_because_its_trailer_steers_the_boot_loader(
+    owner: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number, more in enumerate((("--pad",), ("--pad", "--confirm"))):
+        padded = sign(owner.parent, f"4.0.{number}", owner, more=more)
+        with pytest.raises(BadDataError, match="is padded"):
+            load_firmware_image(padded, owner)
+    whole = sign(owner.parent, "4.1.0", owner).read_bytes()
+    for tail in (b"x", bytes(100)):
+        with pytest.raises(BadDataError, match="is padded"):
+            read_firmware_image(whole + tail)
+    assert capsys.readouterr() == ("", ""), "imgtool's warnings do not reach our stdout"
+
+
+@given(st.data())
+def test_an_image_that_was_cut_or_changed_is_none(image: FirmwareImage, data: st.DataObject) -> None:
+    octets = bytearray(image.octets)
+    if data.draw(st.booleans(), label="cut"):
+        del octets[data.draw(st.integers(0, len(octets) - 1)) :]
+    else:
+        octets[data.draw(st.integers(0, len(octets) - 1))] ^= data.draw(st.integers(1, 255))
+    try:
+        found = read_firmware_image(bytes(octets))
+    except BadDataError:
+        return
+    assert found.digest == image.digest, "outside what the digest covers: the signature, or the hash of the key"
+    assert found.version == image.version
+
+
+def test_what_is_no_key_and_no_file_is_named(tmp_path: Path, owner: Path) -> None:
+    with pytest.raises(NotFoundError):
+        load_firmware_image(tmp_path / "none.bin")
+    for octets in (b"", b"-----BEGIN PUBLIC KEY-----\nAAAA\n-----END PUBLIC KEY-----\n", b"\xff" * 40):
+        with pytest.raises(BadDataError, match="not a firmware key"):
+            read_key(octets)
+    wrong = tmp_path / "wrong.bin"
+    wrong.write_bytes(b"no image")
+    with pytest.raises(BadDataError, match=r"wrong\.bin: This is not a whole MCUboot image"):
+        load_firmware_image(wrong, owner)
