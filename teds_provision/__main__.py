@@ -6,8 +6,6 @@ import sys
 
 from teds_provision import __version__
 
-_REMEDY = f"Install it: {sys.executable} -m pip install teds-provision"
-
 
 def main() -> None:
     """Run the command line and exit with the codes of the contract."""
@@ -22,7 +20,10 @@ def main() -> None:
         code = command_line.run(sys.argv[1:])
         sys.exit(stdout.ended(code, output, as_json=command_line.wants_json(sys.argv[1:])))
     except ModuleNotFoundError as error:  # click: without it there is no command line that could report it
-        print(f"Error: The installation is incomplete: {error.name} missing.\n  → {_REMEDY}", file=sys.stderr)
+        from teds_provision.lazy import install_command, package_of
+
+        cure = install_command(package_of((error.name or "").partition(".")[0]))
+        print(f"Error: The installation is incomplete: {error.name} missing.\n  → Install it: {cure}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:  # while Python was still importing, or already leaving
         sys.exit(130)

@@ -16,11 +16,12 @@ This module is below every room and imports nothing of ours.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 _NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
 
@@ -71,12 +72,15 @@ def late(module: str) -> object:
 
 
 if TYPE_CHECKING:
+    import json
     import pathlib
     import shlex
     import tomllib
-    from importlib import util
+    from importlib import metadata, util
+    from urllib import request as urllib
 else:
-    pathlib, shlex, tomllib, util = late("pathlib"), late("shlex"), late("tomllib"), late("importlib.util")
+    json, pathlib, shlex, tomllib = late("json"), late("pathlib"), late("shlex"), late("tomllib")
+    metadata, util, urllib = late("importlib.metadata"), late("importlib.util"), late("urllib.request")
 
 _TOOL: Final = "teds-provision"
 REQUIRED: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
@@ -128,7 +132,7 @@ def install_command(*requirements: str) -> str:
     extra of the tool itself from version 1.5 on; an environment of uv's has no pip.
     """
     prefix = pathlib.Path(sys.prefix)
-    quoted = " ".join(map(shlex.quote, requirements))
+    quoted = " ".join(word for requirement in requirements for word in map(shlex.quote, _as_it_came(requirement)))
     if (prefix / "uv-receipt.toml").is_file():
         return _uv_tool(prefix / "uv-receipt.toml", requirements)
     if "pipx" in prefix.parts and "venvs" in prefix.parts:
@@ -136,6 +140,35 @@ def install_command(*requirements: str) -> str:
     if util.find_spec("pip") is None:
         return f"uv pip install --python {shlex.quote(sys.executable)} {quoted}"
     return f"{shlex.quote(sys.executable)} -m pip install {quoted}"
+
+
+def _as_it_came(requirement: str) -> list[str]:
+    """Return the words of pip for a requirement; an extra of ours comes from where this installation came from.
+
+    A package index has the tool only once it is released, so an installation from a folder, a file or a repository
+    (PEP 610, direct_url.json) names that one; if it is gone, the packages of the extra are named.
+    """
+    if not requirement.startswith(f"{_TOOL}["):
+        return [requirement]
+    extra = requirement[len(_TOOL) + 1 : -1]
+    try:
+        own = metadata.distribution(_TOOL)
+        came: Any = json.loads(own.read_text("direct_url.json") or "{}")
+        url = str(came.get("url", ""))
+    except (metadata.PackageNotFoundError, ValueError, AttributeError):
+        return [requirement]
+    if not url:
+        return [requirement]
+    if "vcs_info" in came:
+        commit = came["vcs_info"].get("commit_id", "")
+        return [f"{requirement} @ {came['vcs_info'].get('vcs', 'git')}+{url}{'@' if commit else ''}{commit}"]
+    path = pathlib.Path(urllib.url2pathname(url.removeprefix("file://"))) if url.startswith("file://") else None
+    if path is not None and not path.exists():
+        marked = re.compile(rf"\s*;\s*.*extra\s*==\s*['\"]{re.escape(extra)}['\"].*")
+        return [marked.sub("", text) for text in own.requires or () if marked.search(text)] or [requirement]
+    if path is not None and came.get("dir_info", {}).get("editable"):
+        return ["--editable", f"{path}[{extra}]"]
+    return [f"{requirement} @ {url}"]
 
 
 def _uv_tool(receipt: pathlib.Path, requirements: tuple[str, ...]) -> str:

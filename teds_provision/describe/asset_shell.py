@@ -57,7 +57,7 @@ def asset_shell(node: DescribedNode) -> str:
     except ImportError as error:
         raise UsageError(
             "An Asset Administration Shell needs the package basyx-python-sdk.",
-            hint=f"Install it: {how_to_install('aas')}",
+            hint=how_to_install("aas"),
         ) from error
     uuid = node.uuid.hex()
     shells = _Shells(model)

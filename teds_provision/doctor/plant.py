@@ -7,6 +7,7 @@ from datetime import UTC, datetime, timedelta
 from importlib.util import find_spec
 
 from teds_provision.doctor.checks import Finding, System, check
+from teds_provision.lazy import install_command
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Roster, open_roster
 from teds_provision.station.store import Store
@@ -36,7 +37,7 @@ def registry(system: System) -> Iterator[Finding]:
         now, roster = datetime.now(UTC), open_roster(row.octets, facts.ca)
         yield _roster(roster, now)
         if record.url is not None and record.url.startswith("postgres") and find_spec("psycopg") is None:
-            yield Finding("registry", "failed", "psycopg is missing.", "pip install 'teds-provision[registry]'")
+            yield Finding("registry", "failed", "psycopg is missing.", install_command("teds-provision[registry]"))
         synced = datetime.fromisoformat(record.synced) if record.synced is not None else None
         if synced is None or now - synced > _LATE:
             yield Finding("registry", "warning", f"The last sync was {record.synced or 'never'}.", _SYNC)

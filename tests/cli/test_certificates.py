@@ -106,7 +106,7 @@ def test_without_the_extra_its_install_command_is_named(home: Path, monkeypatch:
     refused = call(home, "--json", "show", EXAMPLES / "angle.xml")
     assert refused.code == 2
     assert "needs lxml" in refused.json["error"]["message"]
-    assert "teds-provision[bench]" in refused.json["error"]["hint"]
+    assert "[bench]" in refused.json["error"]["hint"]
 
 
 def test_a_fit_is_written_as_a_certificate_that_calibrates(home: Path, tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import json
 import re
 import subprocess
 import sys
@@ -113,12 +115,49 @@ def test_why_where_and_how_long_is_said_before_anybody_is_asked(tmp_path: Path) 
 def test_the_cure_for_a_missing_package_fits_where_the_program_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    came_from(monkeypatch, None)
     assert how_to_install("plot") == f"Install it: {sys.executable} -m pip install 'teds-provision[plot]'"
     monkeypatch.setattr(sys, "prefix", "/home/anna/.local/share/pipx/venvs/teds-provision")
     assert how_to_install("label") == "Install it: pipx runpip teds-provision install 'teds-provision[label]'"
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     monkeypatch.setattr(lazy, "util", SimpleNamespace(find_spec=lambda _name: None))
     assert how_to_install("ble") == f"Install it: uv pip install --python {sys.executable} 'teds-provision[ble]'"
+
+
+def came_from(monkeypatch: pytest.MonkeyPatch, url: dict[str, object] | None) -> None:
+    """Have this installation's direct_url.json (PEP 610) be ``url``; None: it came from a package index."""
+    real = importlib.metadata.distribution("teds-provision")
+    own = SimpleNamespace(read_text=lambda name: None if url is None else json.dumps(url), requires=real.requires)
+    monkeypatch.setattr(lazy, "metadata", SimpleNamespace(distribution=lambda name: own, PackageNotFoundError=KeyError))
+
+
+def test_an_extra_is_installed_from_where_the_program_came(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only an installation from a package index names one: before its first release no index has the package."""
+    pip, here = f"{sys.executable} -m pip install", tmp_path.as_uri()
+    for url, words in (
+        ({"url": here, "dir_info": {"editable": True}}, f"--editable '{tmp_path}[label]'"),
+        ({"url": here, "dir_info": {}}, f"'teds-provision[label] @ {here}'"),
+        (
+            {"url": "https://example.org/it", "vcs_info": {"vcs": "git", "commit_id": "abc"}},
+            "'teds-provision[label] @ git+https://example.org/it@abc'",
+        ),
+        (
+            {"url": "https://example.org/it.whl", "archive_info": {}},
+            "'teds-provision[label] @ https://example.org/it.whl'",
+        ),
+    ):
+        came_from(monkeypatch, url)
+        assert lazy.install_command("teds-provision[label]") == f"{pip} {words}"
+    came_from(monkeypatch, {"url": f"{here}/gone.whl", "archive_info": {}})
+    gone = lazy.install_command("teds-provision[label]")
+    assert "segno" in gone
+    assert "teds-provision[" not in gone
+
+
+def test_no_page_installs_an_extra_from_an_index() -> None:
+    """Until there is a release; RELEASING.md names this test."""
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "man").glob("*"))]
+    assert [page.name for page in pages if "install 'teds-provision[" in page.read_text(encoding="utf-8")] == []
 
 
 @pytest.mark.parametrize(

@@ -311,7 +311,7 @@ def test_describing_needs_the_extra_and_nothing_else_loads_it() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "needs the package cantools" in done.stdout
-    assert "teds-provision[bench]" in done.stdout
+    assert "[bench]" in done.stdout
 
 
 def test_a_certificate_of_a_wrapped_sensor_corrects_what_its_frames_indicate() -> None:

@@ -112,7 +112,8 @@ except TedsProvisionError as error:
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path).stdout
     assert "matplotlib" in told
     assert told.startswith("1 ")
-    assert f"{sys.executable} -m pip install 'teds-provision[plot]'" in told
+    assert f"{sys.executable} -m pip install " in told
+    assert "[plot]" in told
 
 
 def test_a_picture_names_the_node(tmp_path: Path) -> None:

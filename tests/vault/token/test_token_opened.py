@@ -94,7 +94,8 @@ def test_without_the_package_the_cure_is_named(home, store_id, uri, uris):
     )
     done = in_new_process(uris, code, str(home), uri)
     assert done.stdout.strip().startswith("7 Install it: "), done.stderr
-    assert done.stdout.strip().endswith(" -m pip install 'teds-provision[pkcs11]'")
+    assert " -m pip install " in done.stdout
+    assert "[pkcs11]" in done.stdout
 
 
 def test_importing_the_vault_loads_no_token_library():
