@@ -426,6 +426,15 @@ class Name(TypedDict):
     topic: str
 
 
+class Simulation(TypedDict):
+    """The simulation that feeds a virtual transducer."""
+
+    by: Annotated[str, Meta(description="page, ncap (the Unix socket) or api:TOKEN")]
+    since: float
+    lines: int
+    skipped: int
+
+
 class Virtual(TypedDict):
     """A virtual transducer of this station."""
 
@@ -435,6 +444,7 @@ class Virtual(TypedDict):
     state: Literal["starting", "running", "ended"]
     why: NotRequired[str]
     channels: int
+    simulation: Annotated[Simulation | None, Meta(description="who feeds it now, if its source is simulation")]
 
 
 class Profile(TypedDict):

@@ -154,7 +154,9 @@ class NewVirtual:
     """POST /virtual."""
 
     name: str | None = None
-    source: Annotated[str, Meta(description="noise (default), sine:S, ramp:S, file:/P or unix:/P")] | None = None
+    source: (
+        Annotated[str, Meta(description="noise (default), sine:S, ramp:S, simulation, file:/P or unix:/P")] | None
+    ) = None
     content: Annotated[str, Meta(description="a datasheet in XML or JSON")] | None = None
     format: Annotated[str, Meta(description="ignored: the content shows what it is")] | None = None
     profile: ProfileName | None = None

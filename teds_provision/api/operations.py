@@ -149,7 +149,9 @@ def document() -> dict[str, Any]:
         "info": {
             "title": "teds-provision: a base station",
             "version": __version__,
-            "description": "Values are in the SI unit of the datasheet, times in unix seconds unless they are texts.",
+            "description": "Values are in the SI unit of the datasheet, times in unix seconds unless they are texts. "
+            "/live (values and events) and /virtual/{name}/source (a simulation feeds its virtual transducer) are "
+            "WebSockets: docs/ncap.md.",
         },
         "servers": [{"url": API}],
         "security": [{"token": []}, {"browser": []}],

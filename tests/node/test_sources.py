@@ -83,7 +83,8 @@ def test_a_source_that_cannot_be_names_the_cure(text: str, error: type[TedsProvi
 
 
 def test_every_source_of_the_contract_is_there() -> None:
-    assert set(SOURCES) == {"noise", "sine", "ramp", "file", "-", "unix", "exec"}
+    of_the_service = {"simulation"}
+    assert set(SOURCES) - of_the_service == {"noise", "sine", "ramp", "file", "-", "unix", "exec"}
 
 
 def test_a_file_is_played_back_and_nothing_is_valid_behind_it(tmp_path: Path) -> None:
@@ -169,6 +170,21 @@ def test_a_line_that_is_none_changes_nothing_and_is_counted(line: bytes) -> None
     assert source.at(1, 1.0) == Reading(value=1.0)
     source.feed_line(b'{"t": 1, "value": {"angle": 2}}')
     assert source.at(1, 1.0) == Reading(value=2.0)
+
+
+def test_a_channel_of_a_simulation_without_a_value_is_invalid_alone(tmp_path: Path) -> None:
+    source, clock = make_source(f"simulation:{tmp_path / 'x'}", PLACES, print), Clock()
+    assert isinstance(source, LineSource)
+    source.begin(clock)
+    assert not clock.own, "it needs no times"
+    assert source.at(1, 0.0) is None
+    assert source.feed_line(b'{"value": {"angle": 12.5}}') == ""
+    assert (source.at(1, 0.0), source.at(2, 0.0)) == (Reading(value=12.5), Reading(missing=True))
+    assert source.feed_line(b'{"value": {"angle": null, "force": 3}}') == ""
+    assert (source.at(1, 0.0), source.at(2, 0.0)) == (Reading(missing=True), Reading(value=3.0))
+    assert "no number" in source.feed_line(b'{"value": {"angle": NaN}}')
+    source.end()
+    assert source.at(2, 0.0) is None
 
 
 @given(st.binary(max_size=60))

@@ -17,19 +17,20 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Container
-from contextlib import suppress
+from collections.abc import Container, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.errors import KnownUuidError, NotFoundError, UsageError
+from teds_provision.errors import KnownUuidError, NodeBusyError, NotFoundError, StoreError, UsageError
 from teds_provision.files import write_whole
 from teds_provision.handover.life import DECOMMISSIONED
 from teds_provision.links.opening import with_source
 from teds_provision.links.ports import free_port
 from teds_provision.ncap.live import Live
+from teds_provision.ncap.nodes.simulation import SIMULATION, SOCKET, Feed
 from teds_provision.ncap.settings import own_source
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.node_template import create
@@ -48,7 +49,7 @@ FOLDER: Final = "virtual"
 _FACTS: Final = "virtual.json"
 _LOG: Final = "log"
 _CALIBRATION: Final = "calibration.toml"
-_SOURCES: Final = re.compile(r"noise\Z|(sine|ramp):[0-9.]+\Z|unix:/[^\0]+\Z|file:/[^\0]+\Z")
+_SOURCES: Final = re.compile(r"(noise|simulation)\Z|(sine|ramp):[0-9.]+\Z|unix:/[^\0]+\Z|file:/[^\0]+\Z")
 _LONGEST_PERIOD: Final = 86_400.0
 _AGAIN, _LONGEST = 1.0, 30.0
 _ENDING: Final = 5.0
@@ -69,10 +70,12 @@ class Virtual:
     why: str = ""
     process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
     kept: bool = False
+    feed: Feed | None = field(default=None, repr=False)
 
     def as_json(self) -> dict[str, Any]:
         """api.md, `/virtual`."""
-        return {name: getattr(self, name) for name in ("uuid", "name", "source", "state", "why", "channels")}
+        facts = {name: getattr(self, name) for name in ("uuid", "name", "source", "state", "why", "channels")}
+        return {**facts, "simulation": self.feed.as_json() if self.feed is not None else None}
 
 
 class Virtuals:
@@ -235,6 +238,46 @@ class Virtuals:
         """Return the TEDS that one was made with, under its own UUID and name."""
         return FlashFile(self._virtual_of(uuid).folder).hardware
 
+    # -- simulations -------------------------------------------------------------------------------------------------
+
+    def find(self, text: str) -> Virtual:
+        """Return the one that a UUID or a name means; raises NotFoundError."""
+        with self._guard:
+            found = self._all.get(text.lower())
+            named = [virtual for virtual in self._all.values() if virtual.name == text]
+        if found is None and len(named) != 1:
+            raise NotFoundError(
+                f"No virtual transducer of this station is called {text[:40]!r}.", hint="GET /virtual lists them."
+            )
+        return found if found is not None else named[0]
+
+    def begin_feed(self, virtual: Virtual, feed: Feed) -> None:
+        """Let a simulation feed one; raises UsageError (another source), NodeBusyError (another simulation does)."""
+        if virtual.source != SIMULATION:
+            raise UsageError(
+                f"{virtual.name or virtual.uuid} has the source {virtual.source}, so it takes no values.",
+                hint=f'Create one with "source": "{SIMULATION}".',
+            )
+        with self._guard:
+            if virtual.feed is not None:
+                raise NodeBusyError(
+                    f"{virtual.name or virtual.uuid} is already fed by {virtual.feed.by}.", hint="End that one first."
+                )
+            virtual.feed = feed
+        self._live.event("virtual", uuid=virtual.uuid, state="fed", by=feed.by)
+        with suppress(StoreError):
+            self._station.audit("virtual", bytes.fromhex(virtual.uuid), "simulation connected", by=feed.by)
+
+    def end_feed(self, virtual: Virtual, feed: Feed) -> None:
+        """Let another simulation feed it; the place is free before anything else is done."""
+        with self._guard:
+            if virtual.feed is feed:
+                virtual.feed = None
+        self._live.event("virtual", uuid=virtual.uuid, state="not fed", by=feed.by)
+        facts = {name: value for name, value in feed.as_json().items() if name != "since"}
+        with suppress(StoreError):
+            self._station.audit("virtual", bytes.fromhex(virtual.uuid), "simulation disconnected", **facts)
+
     def forget(self, uuid: str) -> Virtual:
         """Remove one from the station; it still runs until :meth:`end`; raises NotFoundError."""
         one, octets, station = self._virtual_of(uuid), bytes.fromhex(uuid), self._station
@@ -252,6 +295,9 @@ class Virtuals:
 
     def end(self, virtual: Virtual) -> None:
         """End the process of one that was forgotten, and its key with it."""
+        feed = virtual.feed
+        if feed is not None:
+            feed.end()
         _end(virtual.process)
         shutil.rmtree(virtual.folder, ignore_errors=True)
         self._live.event("virtual", state="removed", uuid=virtual.uuid)
@@ -271,14 +317,17 @@ class Virtuals:
         log = virtual.folder / _LOG
         while not self._stop.is_set() and virtual.uuid in self._all:
             words = [sys.executable, "-m", "teds_provision", "--json", "node", "run", str(virtual.folder)]
-            words += ["--can", self.bus, "--source", virtual.source]
+            words += ["--can", self.bus]
             daemon = os.getpid()
-            with log.open("wb") as errors:
+            with log.open("wb") as errors, opened_folder(virtual.folder) as folder:
+                fed = virtual.source == SIMULATION
+                words += ["--source", f"{SIMULATION}:{short_path(folder)}" if fed else virtual.source]
                 process = virtual.process = subprocess.Popen(
                     words,
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.PIPE,
                     stderr=errors,
+                    pass_fds=(folder,) if fed else (),
                     process_group=0,  # Ctrl-C is for the daemon, which ends its nodes in order
                     preexec_fn=lambda: _die_with(daemon),  # noqa: PLW1509, B023 - two calls of the system, nothing else
                 )
@@ -309,6 +358,21 @@ class Virtuals:
         self._live.event("virtual", uuid=virtual.uuid, state=state, why=why)
 
 
+@contextmanager
+def opened_folder(folder: Path) -> Iterator[int]:
+    """Give the descriptor of a folder for the block."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def short_path(folder: int) -> str:
+    """Return the socket in an opened folder: a socket's path has 107 octets at most, that of a home may have more."""
+    return f"/proc/self/fd/{folder}/{SOCKET}"
+
+
 def ideal_calibration(sheet: Sheet) -> str:
     """Return straight lines over the whole raw range, for channels without values otherwise: these were not measured.
 
@@ -334,7 +398,8 @@ def _check_source(text: str) -> None:
     kind, _, rest = text.partition(":")
     if not _SOURCES.match(text):
         raise UsageError(
-            f"{text!r} is not a valid source.", hint="Use noise, sine:SECONDS, ramp:SECONDS, file:/PATH or unix:/PATH."
+            f"{text!r} is not a valid source.",
+            hint="Use noise, sine:SECONDS, ramp:SECONDS, simulation, file:/PATH or unix:/PATH.",
         )
     if kind in ("sine", "ramp") and seconds_of(rest, kind) > _LONGEST_PERIOD:
         raise UsageError(f"{text!r} is longer than a day.", hint=f"Give seconds, such as {kind}:2.")

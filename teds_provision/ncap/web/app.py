@@ -21,7 +21,7 @@ from teds_provision.api.operations import API
 from teds_provision.errors import NotFoundError, StoreError, TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.live import LiveClient
-from teds_provision.ncap.web import metrics, wot
+from teds_provision.ncap.web import metrics, simulation, wot
 from teds_provision.ncap.web.answers import ASKED, answer_bug, answer_error, answer_refusal, changing
 from teds_provision.ncap.web.clause12 import Clause12
 from teds_provision.ncap.web.guard import CALLER, SAFE, Caller, RequestRefusedError
@@ -48,6 +48,7 @@ def build(daemon: Daemon) -> Starlette:
             routes=[
                 *Resources(daemon).routes(),
                 WebSocketRoute("/live", _live(daemon)),
+                WebSocketRoute("/virtual/{name}/source", simulation.feeding(daemon, _watched(daemon))),
                 Route("/{rest:path}", _nothing),
             ],
         ),
@@ -180,6 +181,15 @@ def _live(daemon: Daemon) -> Callable[[WebSocket], Awaitable[None]]:
                 task.cancel()
 
     return live
+
+
+def _watched(daemon: Daemon) -> simulation.Watch:
+    """Return what ends the connection of a simulation whose token is invalid."""
+
+    async def watch(socket: WebSocket, caller: Caller, leaving: asyncio.Event) -> None:
+        await _end_in_time(socket, daemon.tokens, caller, leaving)
+
+    return watch
 
 
 async def _end_in_time(socket: WebSocket, tokens: Tokens, caller: Caller, leaving: asyncio.Event) -> None:

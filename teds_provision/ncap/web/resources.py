@@ -388,7 +388,7 @@ class Resources:
             # An error about a file quotes a piece of it: no token reads this user's files.
             raise PolicyError(
                 "A file or socket can only be named as a source on the station's own machine.",
-                hint="Use noise, sine:S or ramp:S.",
+                hint="Use noise, sine:S, ramp:S or simulation.",
             )
 
         def make() -> dict[str, Any]:

@@ -29,6 +29,8 @@ HEAD: Final = 10.0
 """Seconds that the head of a request may take."""
 BODY: Final = 30.0
 """Seconds that its body may take: 1 MiB at most."""
+LONGEST_MESSAGE: Final = 1 << 16
+"""Octets of a WebSocket message: lines of a simulation."""
 
 
 class HttpConnection(H11Protocol):
@@ -153,7 +155,7 @@ class Servers:
             proxy_headers=False,
             http=HttpConnection,
             ws="websockets-sansio",
-            ws_max_size=4096,
+            ws_max_size=LONGEST_MESSAGE,
             ws_per_message_deflate=False,
             timeout_keep_alive=30,
             limit_concurrency=4 * MOST,  # of requests; one of which the connection was ended counts for a moment more

@@ -18,9 +18,10 @@ SOURCES: Final[dict[str, Maker]] = {
     "file": recorded.make,
     "-": lines.make_stream,
     "unix": lines.make_socket,
+    "simulation": lines.make_simulation,
     "exec": command.make,
 }
-ONE_NODE_ONLY: Final = frozenset({"-", "unix"})
+ONE_NODE_ONLY: Final = frozenset({"-", "unix", "simulation"})
 """Sources of which there is one, so that several nodes of a process cannot share them."""
 
 

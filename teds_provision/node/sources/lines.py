@@ -41,6 +41,7 @@ class LineSource:
         self._drive: SimulationClock | None = None
         self._last: float | None = None
         self._offset = 0.0
+        self.latest: Mapping[int, Reading | None] = {}  # those of the last line that was taken
         self.dropped = 0
 
     def at(self, channel: int, seconds: float) -> Reading | None:
@@ -53,13 +54,14 @@ class LineSource:
         if self._needs_time:
             drive.own_clock()
 
-    def feed_line(self, line: bytes) -> None:
-        """Take one line."""
+    def feed_line(self, line: bytes) -> str:
+        """Take one line; return why it was skipped, "" if it was not."""
         problem = self._taken(line)
         if problem:
             self.dropped += 1
             if self.dropped == 1 or self.dropped % _TELL_EVERY == 0:
                 self._tell(f"A line of the source was skipped ({self.dropped} so far): {problem}.")
+        return problem
 
     def end(self) -> None:
         """End the source: no value is valid any more, the node stays."""
@@ -100,6 +102,7 @@ class LineSource:
         assert self._drive is not None
 
         def change() -> None:
+            self.latest = readings
             self._readings = {**self._readings, **readings}
 
         if time is None and not self._needs_time and self._last is None:
@@ -128,7 +131,7 @@ def _finite(number: float) -> bool:
         return False
 
 
-def feed(read: Callable[[], bytes], take: Callable[[bytes], None]) -> None:
+def feed(read: Callable[[], bytes], take: Callable[[bytes], object]) -> None:
     """Cut what is read into lines until nothing comes any more; one beyond 1 MiB is refused."""
     held = b""
     while octets := read():
@@ -174,8 +177,8 @@ class StandardInput(LineSource):
 class UnixSocket(LineSource):
     """Lines from a client of a Unix socket (mode 0600), one simulation after the other."""
 
-    def __init__(self, places: Sequence[SourceChannel], tell: Tell, path: Path) -> None:
-        super().__init__(places, tell)
+    def __init__(self, places: Sequence[SourceChannel], tell: Tell, path: Path, *, needs_time: bool = True) -> None:
+        super().__init__(places, tell, needs_time=needs_time)
         self._path = path
         self._listening: socket.socket | None = None
         self._peer: socket.socket | None = None
@@ -251,6 +254,20 @@ class UnixSocket(LineSource):
         return b""
 
 
+class Simulation(UnixSocket):
+    """A Unix socket whose lines need no ``t``: without one the node's clock is the host's.
+
+    A channel without a value is invalid alone, not with its whole message.
+    """
+
+    def __init__(self, places: Sequence[SourceChannel], tell: Tell, path: Path) -> None:
+        super().__init__(places, tell, path, needs_time=False)
+
+    def at(self, channel: int, seconds: float) -> Reading | None:
+        """Return the value of the last line; None while there is no simulation."""
+        return (self._readings.get(channel) or Reading(missing=True)) if self._readings else None
+
+
 def _answers(path: Path) -> bool:
     with socket.socket(socket.AF_UNIX) as probe:
         try:
@@ -270,3 +287,10 @@ def make_socket(argument: str, places: Sequence[SourceChannel], tell: Tell) -> U
     if not argument:
         raise UsageError("unix: needs a path.", hint="Write --source unix:/tmp/hand.sock.")
     return UnixSocket(places, tell, Path(argument))
+
+
+def make_simulation(argument: str, places: Sequence[SourceChannel], tell: Tell) -> Simulation:
+    """``simulation:PATH``, as ``ncap`` uses it."""
+    if not argument:
+        raise UsageError("simulation: needs a path.", hint="Write --source simulation:/tmp/hand.sock.")
+    return Simulation(places, tell, Path(argument))

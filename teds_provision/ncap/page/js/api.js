@@ -55,9 +55,14 @@ export const paths = {
   virtual: (uuid) => at("virtual", uuid),
 };
 
-/** Address of the WebSocket. */
-export function liveAddress() {
-  const address = new URL("live", ROOT);
+function socketAt(path) {
+  const address = new URL(path, ROOT);
   address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
   return address;
 }
+
+/** Address of the WebSocket. */
+export const liveAddress = () => socketAt("live");
+
+/** Address at which a simulation feeds a virtual transducer. */
+export const sourceAddress = (uuid) => socketAt(`${at("virtual", uuid)}/source`);

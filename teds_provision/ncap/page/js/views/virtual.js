@@ -4,6 +4,7 @@ import { paths, post, remove } from "../api.js";
 import { button, chip, empty, field, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
 import { count, nameOf } from "../format.js";
 import { on, refresh, state } from "../state.js";
+import { Feed } from "./feed.js";
 
 export function virtualView(main) {
   const list = h("ul", { class: "groups" });
@@ -11,7 +12,7 @@ export function virtualView(main) {
   const type = h("select", {});
   const file = h("input", { type: "file", accept: ".xml,.json,application/xml,application/json" });
   const name = h("input", { type: "text", maxlength: "120", autocomplete: "off" });
-  const source = h("select", {}, h("option", { value: "sine:5" }, "Sine, 5 s"), h("option", { value: "ramp:5" }, "Ramp, 5 s"), h("option", { value: "noise" }, "Noise"));
+  const source = h("select", {}, h("option", { value: "sine:5" }, "Sine, 5 s"), h("option", { value: "ramp:5" }, "Ramp, 5 s"), h("option", { value: "noise" }, "Noise"), h("option", { value: "simulation" }, "Simulation: a program, or values set here"));
   const make = button("Create", { class: "main", onclick: () => make.busy(() => create()) }, "plus");
   const error = h("div", {});
   main.append(
@@ -40,7 +41,8 @@ export function virtualView(main) {
     }
     const may = state.connection === "live" && state.status?.write !== false;
     if (make.getAttribute("aria-busy") !== "true") make.disabled = !may;
-    keyed(list, state.virtual, (one) => one.uuid, card, (element, one) => element.paint(one, may));
+    for (const [uuid, element] of list.keyed ?? []) if (!state.virtual.some((one) => one.uuid === uuid)) element.feed?.end();
+    keyed(list, state.virtual, (one) => one.uuid, (one) => card(one, paint), (element, one) => element.paint(one, may));
     if (state.virtual.length) none.replaceChildren();
     else if (!none.firstChild) fill(none, empty("No virtual transducers yet.", h("p", {}, "Choose a type on this page and press Create. It appears under Nodes like a real node.")));
   }
@@ -73,15 +75,25 @@ export function virtualView(main) {
   const off = on("virtual profiles status connection nodes", paint);
   refresh("profiles", "virtual");
   paint();
-  return { end: off };
+  return {
+    end() {
+      off();
+      for (const element of list.keyed?.values() ?? []) element.feed?.end();
+    },
+  };
 }
 
-function card(one) {
+function card(one, changed) {
   const open = h("a", { href: `#/nodes/${one.uuid}` });
   const facts = h("p", { class: "facts" });
   const drop = button("Remove", { class: "quiet" }, "bad");
   const error = h("div", {});
   const element = h("li", { class: "panel group" }, h("div", { class: "panel-head" }, h("h4", {}, icon("virtual"), open), drop), facts, error);
+  if (one.source === "simulation") {
+    element.feed = new Feed(one.uuid);
+    element.feed.changed = changed;
+    element.append(element.feed.element);
+  }
   let sure = false;
   drop.addEventListener("click", () => {
     if (!sure) {
@@ -108,6 +120,7 @@ function card(one) {
     const channels = Array.isArray(now.channels) ? now.channels.length : now.channels;
     text(facts, [`source ${now.source ?? "unknown"}`, typeof channels === "number" ? count(channels, "channel") : null, now.state, now.uuid].filter(Boolean).join(" · "));
     if (drop.getAttribute("aria-busy") !== "true") drop.disabled = !may;
+    element.feed?.paint(now, may);
   };
   return element;
 }
