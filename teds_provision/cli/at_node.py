@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 from typing import TYPE_CHECKING, Any
 
@@ -10,12 +11,17 @@ import click
 from teds_provision import steps, talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
-from teds_provision.cli.rendering import reporter_for
+from teds_provision.cli.rendering import firmware_words, reporter_for
+from teds_provision.errors import UsageError
 from teds_provision.links import LinkSettings
 from teds_provision.protocol.announce import LAST_ADDRESS
+from teds_provision.protocol.messages.firmware import LOCATE_SECONDS
+from teds_provision.station.store import utc_now
 
 if TYPE_CHECKING:
+    from teds_provision.links import Notice
     from teds_provision.steps.commands import ProvenNode
+    from teds_provision.talk.progress import Reporter, StepResult
 
 
 # -- identify ----------------------------------------------------------------------------------------------------------
@@ -27,20 +33,25 @@ if TYPE_CHECKING:
 )
 @click.option("--watch", is_flag=True, help="Keep watching: one line per node.")
 @click.option("--add", is_flag=True, help="Whitelist nodes that prove their key.")
+@click.option("--locate", "locating", is_flag=True, help="Make each board blink in turn, and ask for its name.")
 @link_options
 @pass_app
-def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
+def identify(app: App, links: LinkSettings, watch: bool, add: bool, locating: bool) -> None:
     """Wait for a tap, read the node's UUID and key, and have it prove that it holds the key.
 
-    With --via can, every node on the bus is asked; --json lists several under "nodes".
+    With --via can, every node on the bus is asked; --json lists several under "nodes". A board whose button is pressed
+    meanwhile says so.
     """
+    if locating:
+        _require_a_person(app, watch)
     stop = talk.meeting.IdleStop(None)
     if watch:
         signal.signal(signal.SIGTERM, lambda *_: stop.request_stop())
     several = len(links.places) > 1
     found: list[dict[str, Any]] = []
+    reporter = reporter_for(app, several=several)
     for arrival in steps.commands.identify_at(
-        app.station(), links, reporter_for(app, several=several), add=add, watch=watch, stop=stop
+        app.station(), links, PressLines(app, reporter) if watch else reporter, add=add, watch=watch, stop=stop
     ):
         if arrival.error is not None:
             app.fail_line(arrival.error, uuid=arrival.uuid.hex(), time=arrival.time)
@@ -48,8 +59,37 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
             found.append(_to_json(arrival.result))
             if watch:
                 _emit(app, found.pop() | {"time": arrival.time})
-    if not watch:
+    if locating:
+        _locate_each(app, links, found, reporter)
+    elif not watch:
         _emit(app, found[0] if len(found) == 1 else {**found[0], "nodes": found})
+
+
+class PressLines:
+    """A reporter that prints a line of its own for each board whose button was pressed."""
+
+    def __init__(self, app: App, inner: Reporter) -> None:
+        self._app, self._inner = app, inner
+
+    def started(self, step: str) -> None:
+        """Report the start of a step."""
+        self._inner.started(step)
+
+    def finished(self, step: StepResult) -> None:
+        """Report a step that ended well."""
+        self._inner.finished(step)
+
+    def notice(self, notice: Notice) -> None:
+        """Print a press, pass on anything else."""
+        if notice.kind != "pressed" or notice.uuid is None:
+            self._inner.notice(notice)
+            return
+        line = {"uuid": notice.uuid.hex(), "pressed": True, "time": utc_now()}
+        self._app.emit(line, f"{notice.uuid.hex()}  says it was pressed")
+
+    def written(self, octets: int, total: int) -> None:
+        """So many octets of a datasheet are staged."""
+        self._inner.written(octets, total)
 
 
 def _to_json(found: ProvenNode) -> dict[str, Any]:
@@ -67,6 +107,8 @@ def _to_json(found: ProvenNode) -> dict[str, Any]:
         "can_address": identity.can_address,
         "charging": found.charging,
         "ble": found.ble,
+        "firmware": found.firmware and found.firmware.to_json(),
+        "pressed": found.pressed,
     }
 
 
@@ -79,7 +121,72 @@ def _line(found: dict[str, Any]) -> str:
     name = f"  {found['name']}" if found["name"] else ""
     tag = f"  tag {found['tag_uid']}" if found["tag_uid"] else ""
     charge = f"  {found['charging']['text']}" if found["charging"] else ""
-    return f"{found['uuid']}  key {found['fingerprint'][:16]}  {found['state']}  {listed}{name}{tag}{charge}"
+    runs = firmware_words(found["firmware"])
+    pressed = "  says it was pressed" if found["pressed"] else ""
+    told = f"{name}{tag}{charge}{runs and f'  {runs}'}{pressed}"
+    return f"{found['uuid']}  key {found['fingerprint'][:16]}  {found['state']}  {listed}{told}"
+
+
+# -- locate ------------------------------------------------------------------------------------------------------------
+
+
+_SPAN = re.compile(r"(\d+) ?(s|min)?")
+
+
+def _span(_ctx: click.Context, _parameter: click.Parameter, text: str) -> int:
+    """Read seconds: 10, 10s, 1min; at most a minute."""
+    found = _SPAN.fullmatch(text.strip())
+    seconds = int(found[1]) * (60 if found[2] == "min" else 1) if found is not None else -1
+    if not 0 <= seconds <= LOCATE_SECONDS:
+        raise click.BadParameter(f"0 to {LOCATE_SECONDS} seconds are expected, such as 10s; 0 stops.")
+    return seconds
+
+
+@command(
+    "teds-provision locate 8d4d --via can --can socketcan:can0",
+    "teds-provision locate finger-3 --for 30s --via can",
+)
+@click.argument("uuid")
+@click.option("--for", "seconds", callback=_span, default="10s", show_default=True, metavar="TIME", help="0 stops it.")
+@link_options
+@pass_app
+def locate(app: App, uuid: str, seconds: int, links: LinkSettings) -> None:
+    """Make a board blink or beep, so that you see which one it is.
+
+    A node that has a key does so in a session, a node in factory state for anyone.
+    """
+    (done,) = steps.commands.locate_at(app.station(), links, [uuid], seconds, reporter_for(app))
+    if isinstance(done, tuple):
+        raise done[1]
+    who = f"{done.name or 'Node'} ({done.uuid.hex()})"
+    app.emit(
+        {"located": [{"uuid": done.uuid.hex(), "name": done.name}]},
+        f"{who} blinks for {seconds} s." if seconds else f"{who} no longer blinks.",
+    )
+
+
+def _require_a_person(app: App, watch: bool) -> None:
+    if watch:
+        raise UsageError("--locate takes the boards that are there now, so it cannot be combined with --watch.")
+    if not app.interactive:
+        raise UsageError("--locate asks for a name for each board, so it needs a terminal.", hint="Use locate UUID.")
+
+
+def _locate_each(app: App, links: LinkSettings, found: list[dict[str, Any]], reporter: Reporter) -> None:
+    """Make each board blink, ask for its name, and keep it; an empty answer keeps the one that it has."""
+    located = []
+    uuids = [board["uuid"] for board in found]
+
+    def ask(uuid: bytes, name: str) -> str:
+        number = uuids.index(uuid.hex()) + 1
+        return app.ask_text(f"Board {number} of {len(uuids)} ({uuid.hex()}) blinks. Its name", name)
+
+    for done in steps.commands.locate_at(app.station(), links, uuids, LOCATE_SECONDS, reporter, ask_name=ask):
+        if isinstance(done, tuple):
+            app.fail_line(done[1], uuid=done[0].hex())
+        else:
+            located.append({"uuid": done.uuid.hex(), "name": done.name})
+    app.emit({"located": located}, "\n".join(f"{board['uuid']}  {board['name'] or '(no name)'}" for board in located))
 
 
 # -- agree, reset, address ---------------------------------------------------------------------------------------------

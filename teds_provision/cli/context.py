@@ -196,6 +196,12 @@ class App:
         self.live_line()
         return click.confirm(_as_question(question), err=True)
 
+    def ask_text(self, question: str, default: str) -> str:
+        """Ask for a text on the terminal; an empty answer is ``default``."""
+        self.live_line()
+        asked = _as_question(f"{question} [{default}]" if default else question)
+        return str(click.prompt(asked, default=default, err=True, show_default=False)).strip()
+
     def asks_retype(self, *, yes: bool) -> Callable[[bytes, tuple[str, ...]], None] | None:
         """Who is asked before a board becomes one of another type: a person at a terminal who answered nothing yet."""
 

@@ -16,7 +16,15 @@ import click
 from teds_provision import plant, steps, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import WholeNumber, command
-from teds_provision.cli.rendering import local_time, moment, print_json_list, print_table, shown
+from teds_provision.cli.rendering import (
+    FIRMWARE_CHANGED,
+    firmware_words,
+    local_time,
+    moment,
+    print_json_list,
+    print_table,
+    shown,
+)
 from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.station.label import label_of, write_label
 from teds_provision.steps.inventory import PAGE, STATES, inventory, search
@@ -206,6 +214,10 @@ def _remarks(node: dict[str, Any]) -> str:
     remarks = []
     if node["wrapped"]:
         remarks.append(f"wrapped: {node['wrapped']['name']} ({node['wrapped']['kind']})")
+    if node["firmware"] and node["firmware"]["changed"]:
+        remarks.append(FIRMWARE_CHANGED)
+    elif node["firmware"] and node["firmware"]["state"] in ("bad", "other", "outdated", "not-reported"):
+        remarks.append(f"firmware {node['firmware']['state']}")
     if node["revoked"]:
         remarks.append(f"revoked: {node['revoked']['why']}")
     if node["moved_to"]:
@@ -258,6 +270,7 @@ _LINES: tuple[tuple[str, Callable[[dict[str, Any]], str | list[str]]], ...] = (
     ("key", lambda node: (node["fingerprint"] or "not pinned yet")[:32]),
     ("whitelist", lambda node: f"yes, assurance {node['assurance']}" if node["whitelisted"] else "no"),
     ("verdict", _verdict),
+    ("firmware", lambda node: firmware_words(node["firmware"])),
     ("last seen", lambda node: local_time(node["last_seen"]) if node["last_seen"] else "never"),
     ("calibration", lambda node: f"due {node['due']}" if node["due"] else ""),
     ("charging", lambda node: _charge(node["charging"])),

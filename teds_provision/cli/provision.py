@@ -20,7 +20,7 @@ from teds_provision import steps as steps_room
 from teds_provision.cli.build import calibration_json, order_options
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, said_here, yes_option
-from teds_provision.cli.rendering import print_table, reporter_for
+from teds_provision.cli.rendering import firmware_words, print_table, reporter_for
 from teds_provision.errors import NotWhitelistedError, TedsProvisionError, UsageError
 from teds_provision.links import LinkSettings
 from teds_provision.sanitize import sanitize
@@ -365,6 +365,8 @@ def _print_result(
         app.warn(warning)
     units = station.shown_units.shown_units(app.station(), done.who.uuid)
     summary = station.summary.summarise(done.image, units)
+    runs = station.firmware.firmware_of(app.station(), done.who.uuid, done.firmware)
+    firmware = runs.to_json() if runs is not None else None
     result = {
         "uuid": done.who.uuid.hex(),
         "fingerprint": done.who.fingerprint,
@@ -376,12 +378,17 @@ def _print_result(
         ],
         "verdict": done.verified.verdict,
         "warnings": list(done.warnings),
+        "firmware": firmware,
         **calibration_json(done.certificate),
         **{name: value for name, value in more.items() if value is not None and name != "failure"},
     }
     if more.get("failure") is not None:
         result["error"] = more["failure"]
-    app.conclude(result, lambda console: _summary(console, done, summary, _readings(done, units), more), error)
+    app.conclude(
+        result,
+        lambda console: _summary(console, done, summary, _readings(done, units), more, firmware_words(firmware)),
+        error,
+    )
 
 
 def _tell_board(app: App, board: BoardResult, *, warn: bool = True, **line: Any) -> None:
@@ -460,6 +467,7 @@ def _summary(
     summary: NodeSummary,
     readings: Mapping[int, str],
     more: Mapping[str, object],
+    firmware: str,
 ) -> None:
     from rich.markup import escape
     from rich.table import Table
@@ -477,6 +485,8 @@ def _summary(
         facts = f"{channel.range}{calibrated}{reads}".removeprefix(", ")
         what = f"{escape(channel.name)}  {facts}".strip()
         table.add_row(f"channel {channel.number}", what)
+    if firmware:
+        table.add_row("firmware", escape(firmware))
     verdict = done.verified.verdict
     table.add_row("verdict", f"[bold {'green' if verdict == 'authentic' else 'red'}]{verdict}[/]")
     print_table(console, table)

@@ -60,6 +60,25 @@ def local_time(text: str) -> str:
         return text
 
 
+FIRMWARE_CHANGED = "firmware changed since calibration"
+
+
+def firmware_words(firmware: dict[str, Any] | None) -> str:
+    """Return a ``firmware`` of JSON in words: ``loadcell/app 1.2.3+4, outdated``; "" if nothing is known."""
+    if firmware is None:
+        return ""
+    build = f"+{firmware['build']}" if firmware["build"] else ""
+    words = (
+        "firmware not reported"
+        if firmware["version"] is None
+        else f"{firmware['text']} {firmware['version']}{build}".strip()
+    )
+    state = "" if firmware["state"] in ("unjudged", "not-reported", "good") else f", {firmware['state']}"
+    heard = "" if firmware["from"] == "session" else " (not verified)"
+    changed = f"; {FIRMWARE_CHANGED}" if firmware["changed"] else ""
+    return f"{words}{state}{heard}{changed}"
+
+
 def print_json_list(name: str, entries: Iterable[dict[str, Any]]) -> None:
     """Print one JSON object with one list to stdout as it is made: a long list takes no memory.
 

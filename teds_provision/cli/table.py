@@ -45,6 +45,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "history": Entry("build", "history", "List a node's earlier datasheets; write --from restores one."),
         "read": Entry("build", "read", "Read every TEDS of a node."),
         "reset": Entry("at_node", "reset", "Reset a node to factory state and keep its signed receipt."),
+        "locate": Entry("at_node", "locate", "Make a board blink or beep, to see which one it is."),
         "address": Entry("at_node", "address", "Change a node's CAN address."),
         "update": Entry("update", "update", "Install new firmware over the session; it must prove itself to stay."),
         "label": Entry("nodes", "label", "Make a label with QR code, UUID and fingerprint."),

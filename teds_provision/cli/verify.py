@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from teds_provision import steps
 from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import command, link_options, said_here
-from teds_provision.cli.rendering import print_table, reporter_for
+from teds_provision.cli.rendering import firmware_words, print_table, reporter_for
 from teds_provision.errors import UsageError
 from teds_provision.files import json_files
 from teds_provision.links import LinkSettings
@@ -33,9 +33,14 @@ if TYPE_CHECKING:
 @click.option(
     "--accept-calibration", metavar='"WHY"', help="Accept a calibration that the guard refuses; the reason is logged."
 )
+@click.option(
+    "--accept-firmware", is_flag=True, help="The calibration holds with the firmware that runs on the node now."
+)
 @link_options
 @pass_app
-def verify(app: App, what: tuple[str, ...], links: LinkSettings, accept_calibration: str | None) -> None:
+def verify(
+    app: App, what: tuple[str, ...], links: LinkSettings, accept_calibration: str | None, accept_firmware: bool
+) -> None:
     """Read a node or an image file and check its datasheet; a node must also sign a fresh challenge.
 
     A file is checked by itself; with --can, --nfc or --ble, a name means a node rather than a file or directory.
@@ -46,27 +51,37 @@ def verify(app: App, what: tuple[str, ...], links: LinkSettings, accept_calibrat
     """
     node = len(what) == 1 and bool(said_here("via", "nfc", "can", "ble"))
     if not node and are_files(what):
+        if accept_firmware:
+            raise UsageError("--accept-firmware applies to a node.", hint="Verify the node itself.")
         if accept_calibration is not None:
             raise UsageError("--accept-calibration applies to a single image.", hint="Verify that image by itself.")
         verify_many(app, what)
         return
     done = steps.commands.verify_at(
-        app.station(), links, what[0], reporter_for(app), accept_calibration=accept_calibration, node=node
+        app.station(),
+        links,
+        what[0],
+        reporter_for(app),
+        accept_calibration=accept_calibration,
+        accept_firmware=accept_firmware,
+        node=node,
     )
     verified = done.verified
-    result = {
+    result: dict[str, Any] = {
         "uuid": verified.uuid.hex(),
         "scope": verified.scope,
         "verdict": verified.verdict,
         "checks": [check.to_json() for check in verified.checks],
         "warnings": list(done.warnings),
     }
+    if verified.scope == "node":
+        result["firmware"] = done.firmware and done.firmware.to_json()
     for warning in done.warnings:
         app.warn(warning)
-    app.conclude(result, lambda console: _table(console, verified), done.error)
+    app.conclude(result, lambda console: _table(console, verified, result.get("firmware")), done.error)
 
 
-def _table(console: Console, verified: Verification) -> None:
+def _table(console: Console, verified: Verification, firmware: Any) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -77,6 +92,8 @@ def _table(console: Console, verified: Verification) -> None:
     print_table(console, table)
     colour = "bold green" if verified.verdict == "authentic" else "bold red"
     console.print(f"[{colour}]{verified.uuid.hex()}: {verified.verdict}[/]")
+    if runs := firmware_words(firmware):
+        console.print(escape(f"firmware: {runs}"))
 
 
 # ``verify FILES…|DIR``: one line per image, then the totals; exits with the worst image's code.

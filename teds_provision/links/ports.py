@@ -6,14 +6,14 @@ import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal, NamedTuple, Protocol, runtime_checkable
 
 from teds_provision.links.hints import BleAddress, Charging
 from teds_provision.protocol.messages.identity import Identity
 
 NoticeKind = Literal[
-    "waiting", "foreign-tag", "reader-ready", "reader-lost", "node-left", "conflict", "unfinished", "retry"
+    "waiting", "foreign-tag", "reader-ready", "reader-lost", "node-left", "conflict", "unfinished", "retry", "pressed"
 ]
 
 
@@ -261,7 +261,8 @@ class Contact:
 
     ``address`` is its CAN address, ``connection`` the number of its BLE connection. ``charging`` and ``ble`` are hints
     of its initial NFC message, as unauthenticated as the rest. ``trace`` records its messages, ``bus`` is the place of
-    the bus or the air (``can:socketcan:can0``), "" at a reader.
+    the bus or the air (``can:socketcan:can0``), "" at a reader. ``pressed`` returns True if this board alone says that
+    its button was pressed a moment ago, a hint too.
     """
 
     identity: Identity
@@ -273,6 +274,7 @@ class Contact:
     trace: Trace | None = None
     connection: int | None = None
     bus: str = ""
+    pressed: Callable[[], bool] = field(default=lambda: False, repr=False, compare=False)
 
     @property
     def line(self) -> int:

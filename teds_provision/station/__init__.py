@@ -6,6 +6,7 @@ from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
     from teds_provision.station import (
+        firmware,
         groups,
         identity,
         label,

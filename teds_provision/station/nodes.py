@@ -16,12 +16,14 @@ from teds_provision.station.store import (
     Draft,
     ExportedNode,
     ExportEligibility,
+    FirmwareRecord,
     NodeOverview,
     NodeReading,
     NodeRecord,
     Search,
     Store,
     chunks,
+    utc_now,
 )
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
@@ -200,6 +202,33 @@ class Nodes:
     def forget_reading(self, uuid: bytes) -> None:
         """Forget the reading of a node that was reset."""
         self._store.drop_reading(uuid)
+
+    # -- firmware --------------------------------------------------------------------------------------------------
+
+    def firmware(self, uuid: bytes) -> FirmwareRecord | None:
+        """Return what a node last reported of its firmware, None if nothing is known."""
+        return self.firmware_of([uuid]).get(uuid)
+
+    def firmware_of(self, uuids: Sequence[bytes]) -> dict[bytes, FirmwareRecord]:
+        """Return what a batch of nodes last reported, by UUID; what another program wrote does not count."""
+        found = self._store.firmware_of(uuids)
+        return {uuid: record for uuid, record in found.items() if self._row_macs.reported(record)}
+
+    def keep_firmware(self, uuid: bytes, report: bytes, *, in_session: bool, signed: bool = False) -> None:
+        """Keep a node's answer to About (empty: it reports none); only one in a session replaces one of a session.
+
+        ``signed``: its datasheet was signed under this firmware. An answer that is known is not written again.
+        """
+        with self._store.together():
+            before = self.firmware(uuid)
+            if before is not None and before.in_session and not in_session:
+                return
+            known = before is not None and (before.report, before.in_session) == (report, in_session)
+            at = before.at if before is not None and known else utc_now()
+            kept = before.signed if before is not None else None
+            record = FirmwareRecord(uuid, report, in_session, at, report if signed else kept)
+            if record != before:
+                self._store.put_firmware(self._row_macs.firmware(record))
 
     def drafts(self) -> list[Draft]:
         """Every image that was built and not written, by UUID."""

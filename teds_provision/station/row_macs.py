@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import StoreChangedError, VaultError
 from teds_provision.station.store import (
     ExportEligibility,
+    FirmwareRecord,
     NodeRecord,
     StationRecord,
     Store,
@@ -87,6 +88,10 @@ class RowMacs:
         """Return the MAC of the CA that a node keeps."""
         return self._mac("ca", (uuid, ca))
 
+    def firmware(self, record: FirmwareRecord) -> FirmwareRecord:
+        """Return a firmware report with its MAC; without one, and so only a hint, as long as the vault is closed."""
+        return replace(record, mac=self._mac("firmware", _firmware(record)) if self.active else None)
+
     def note(self, kind: str, name: str) -> bytes:
         """Return the MAC of an operator's decision: ``lifted`` (a ban), ``ended ca`` (trust in a CA of a bundle)."""
         return self._mac(kind, (name,))
@@ -117,6 +122,10 @@ class RowMacs:
             raise changed(
                 [f"the CA of node {uuid.hex()}"], "Restore a backup, or reset the node and agree on a new key."
             )
+
+    def reported(self, record: FirmwareRecord) -> bool:
+        """Return True if a firmware report counts: its MAC is right, or the vault is closed, or it is a hint anyway."""
+        return not self.active or not record.in_session or self._holds(record.mac, "firmware", _firmware(record))
 
     def trusted(self, record: TrustRecord) -> bool:
         """Return True if a trusted key counts: its MAC is right, or the vault is closed and it cannot be checked."""
@@ -150,6 +159,9 @@ class RowMacs:
         for uuid, marks in self._store.all_key_flags().items():
             if marks.ca is not None:
                 yield f"the CA of node {uuid.hex()}", marks.ca_mac, "ca", (uuid, marks.ca)
+        for reported in self._store.all_firmware():
+            if reported.in_session:
+                yield f"the firmware report of {reported.uuid.hex()}", reported.mac, "firmware", _firmware(reported)
         yield from self._decisions()
         yield from self._plant()
 
@@ -259,6 +271,10 @@ def _facts(facts: StationRecord) -> _Values:
 
 def _entry(entry: WhitelistEntry) -> _Values:
     return (entry.uuid, entry.fingerprint, entry.assurance, entry.name)
+
+
+def _firmware(record: FirmwareRecord) -> _Values:
+    return (record.uuid, record.report, str(int(record.in_session)), record.at, record.signed)
 
 
 def _trust(record: TrustRecord) -> _Values:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
         build,
         commands,
         datasheet_edit,
+        firmware,
         identify,
         image_manager,
         inventory,

@@ -6,7 +6,7 @@ The callers (command line, API) pass plain texts: no session, lock or link is th
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
@@ -29,12 +29,14 @@ from teds_provision.links import LINKS, LinkSettings, Notice
 from teds_provision.links.ports import MultiStationLink
 from teds_provision.protocol.datasheet import SEQUENCE_WINDOW, SignedNodeKey
 from teds_provision.protocol.messages.frames import Function, security_command
-from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.station.firmware import KnownFirmware, firmware_of
 from teds_provision.station.station import Station
 from teds_provision.station.store import DatasheetRecord, Draft
 from teds_provision.steps.agree import AgreeResult, ResetReceipt, agree, open_session, require_session, reset_node
 from teds_provision.steps.board_type import Retype, differences, is_remembered, require_board_type, shown_by
 from teds_provision.steps.build import guard, own_name, require_free_name
+from teds_provision.steps.firmware import keep_firmware, locate, read_firmware
 from teds_provision.steps.identify import IdentifiedNode, describe, identify
 from teds_provision.steps.provision import add_to_whitelist
 from teds_provision.steps.readings import keep
@@ -144,7 +146,7 @@ def read_image_file(path: Path) -> Image:
 
 @dataclass(frozen=True)
 class ProvenNode:
-    """A node that proved its key; ``identity`` is its plain Identify, a hint."""
+    """A node that proved its key; ``identity`` is its plain Identify, a hint, and so is that its button was pressed."""
 
     who: IdentifiedNode
     identity: Identity
@@ -153,6 +155,8 @@ class ProvenNode:
     name: str | None
     charging: dict[str, object] | None = None
     ble: str | None = None
+    firmware: KnownFirmware | None = None
+    pressed: bool = False
 
 
 def identify_at(
@@ -175,18 +179,20 @@ def identify_at(
         yield from watch_nodes(links, lambda node: _identified(station, node, add), reporter, stop or threading.Event())
         return
     first: TedsProvisionError | None = None
-    identified = False
+    proven: list[tuple[Conversation, ProvenNode]] = []
     with meet_everyone(links, reporter) as nodes:
         for node, found in _side_by_side(nodes, lambda node: _identified(station, node, add)):
             if isinstance(found, ProvenNode):
-                identified = True
-                yield Arrival(node.uuid, links.places[0], 0.0, found)
+                proven.append((node, found))
                 continue
             first = first or found
             if len(nodes) > 1:
                 text = f"Node {node.uuid.hex()} was not identified: {found.message}"
                 reporter.notice(Notice("unfinished", text, uuid=node.uuid))
-    if first is not None and not identified:
+        # a button counts until the last node was identified, and another one pressed with it takes its mark away
+        marked = [replace(found, pressed=node.contact.pressed()) for node, found in proven]
+    yield from (Arrival(found.who.uuid, links.places[0], 0.0, found) for found in marked)
+    if first is not None and not marked:
         raise first
 
 
@@ -214,7 +220,7 @@ def _side_by_side(
 
 def _identified(station: Station, node: Conversation, add: bool) -> ProvenNode:
     who = identify(station, node)
-    described = describe(node)
+    described, firmware = describe(node), read_firmware(node, once=True)
     entry = who.whitelisted
     if entry is None and add:
         entry = add_to_whitelist(station, node, who)
@@ -228,10 +234,12 @@ def _identified(station: Station, node: Conversation, add: bool) -> ProvenNode:
             facts["name"] = name
     with station.durable("identify"):
         station.nodes.remember(who.uuid, **facts)
+        keep_firmware(station, who.uuid, firmware)
         station.audit("identify", who.uuid, "proven", fingerprint=who.fingerprint)
     charging = node.contact.charging.to_json() if node.contact.charging else None
     ble = node.contact.ble.text if node.contact.ble else None
-    return ProvenNode(who, node.identity, entry is not None, described.channels, name, charging, ble)
+    runs = firmware_of(station, who.uuid, firmware)
+    return ProvenNode(who, node.identity, entry is not None, described.channels, name, charging, ble, runs)
 
 
 # -- agree, address ----------------------------------------------------------------------------------------------------
@@ -367,6 +375,7 @@ class VerifyReport:
     verified: Verification
     warnings: tuple[str, ...]
     error: TedsProvisionError | None
+    firmware: KnownFirmware | None = None
 
 
 def verify_at(
@@ -376,12 +385,15 @@ def verify_at(
     reporter: Reporter,
     *,
     accept_calibration: str | None = None,
+    accept_firmware: bool = False,
     node: bool = False,
 ) -> VerifyReport:
     """Check the image file, or the node, that ``what`` names; with ``node`` a node's name goes first.
 
-    ``error``: NotAuthenticError (4), UnprovenError (5), or PolicyError (6) for a calibration that would hurt.
+    ``accept_firmware``: the calibration holds with the firmware that runs now. ``error``: NotAuthenticError (4),
+    UnprovenError (5), or PolicyError (6) for a calibration that would hurt.
     """
+    firmware: KnownFirmware | None = None
     found = node_or_image(station, what, node=node)
     if isinstance(found, Image):
         image, verified = found, Verification(found.uuid, tuple(verify_image(station, found)), scope="image")
@@ -391,6 +403,7 @@ def verify_at(
             with at_node(station, links.after_agreeing(), found, reporter) as visit:
                 try:
                     looked = verify_at_node(station, visit.node, visit.who)
+                    firmware = _firmware_at(station, visit.node, accept=accept_firmware)
                 finally:
                     in_session = visit.node.sealed
             image, verified = looked.image, looked.verified
@@ -402,9 +415,79 @@ def verify_at(
             image, verified = Image(found, {}), Verification(found, (session_check("", why),))
     try:
         require_authentic(verified)
-        return VerifyReport(verified, guard(station, image, None, accept_calibration), None)
+        return VerifyReport(verified, guard(station, image, None, accept_calibration), None, firmware)
     except TedsProvisionError as error:
-        return VerifyReport(verified, (), error)
+        return VerifyReport(verified, (), error, firmware)
+
+
+def _firmware_at(station: Station, node: Conversation, *, accept: bool) -> KnownFirmware | None:
+    """Return a node's firmware; ``accept`` makes it the one that its calibration was made with, in a session only."""
+    reading = read_firmware(node)
+    if accept and reading is not None and reading.sealed:
+        with station.durable("verify"):
+            keep_firmware(station, node.uuid, reading, signed=True)
+            version = None if reading.report is None else reading.report.version_text
+            station.audit("firmware", node.uuid, "accepted", version=version)
+    return firmware_of(station, node.uuid, reading)
+
+
+@dataclass(frozen=True)
+class LocatedNode:
+    """A board that blinks."""
+
+    uuid: bytes
+    name: str | None
+
+
+def locate_at(
+    station: Station,
+    links: LinkSettings,
+    nodes: Sequence[str],
+    seconds: int,
+    reporter: Reporter,
+    *,
+    ask_name: Callable[[bytes, str], str] | None = None,
+) -> Iterator[LocatedNode | tuple[bytes, TedsProvisionError]]:
+    """Make one node after the other blink for so many seconds, 0: stop.
+
+    In a session, if its key is held; else only a node in factory state does. ``ask_name`` is called with UUID and name
+    while it blinks, and returns the name that it gets from now on (empty: it keeps the one it has). Yields an error in
+    place of a node that did not blink.
+    """
+    for text in nodes:
+        uuid = station.nodes.resolve(text)
+        try:
+            with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
+                locate_here(station, visit.node, seconds)
+                known = station.nodes.get(uuid)
+                name = known.name if known is not None else None
+                if ask_name is not None:
+                    name = _named(station, uuid, name, ask_name(uuid, name or ""))
+                    locate_here(station, visit.node, 0)
+                yield LocatedNode(uuid, name)
+        except TedsProvisionError as error:
+            yield uuid, error
+
+
+def _named(station: Station, uuid: bytes, before: str | None, name: str) -> str | None:
+    """Keep the name that a person gave a node; raises PolicyError if another node has it."""
+    if not name or name == before:
+        return before
+    require_free_name(station, uuid, name)
+    with station.durable("name"):
+        station.nodes.remember(uuid, name=name)
+        station.audit("name", uuid, "done", name=name)
+    return name
+
+
+def locate_here(station: Station, node: Conversation, seconds: int) -> None:
+    """Make a node that was met blink, in a session if it has a key; raises PolicyError, NodeRefusedError, LinkError."""
+    try:
+        if node.identity.state != NodeState.FACTORY and not node.sealed:
+            require_session(station, node)
+        locate(node, seconds)
+    except SessionLostError as lost:
+        raise lost.cause from lost
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
@@ -18,11 +19,12 @@ from teds_provision.station.station import Station
 from teds_provision.station.store import NodeOverview, Search
 
 if TYPE_CHECKING:
+    from teds_provision.station import firmware
     from teds_provision.steps import readings
     from teds_provision.steps.readings import NodeVerdict
     from teds_provision.teds.fits import Fit, Requirement
 else:  # cryptography: a list of unverified nodes needs none
-    readings = late("teds_provision.steps.readings")
+    readings, firmware = late("teds_provision.steps.readings"), late("teds_provision.station.firmware")
 
 PAGE = 256
 """Nodes that are judged together."""
@@ -63,14 +65,18 @@ def inventory(station: Station, uuids: Sequence[bytes]) -> Iterator[dict[str, An
 def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[dict[str, Any], NodeVerdict | None]]:
     """Yield the rows of :func:`inventory`, each with the whole verdict; None if no datasheet of the node was read."""
     known = station.nodes.overview(uuids)
+    demands = firmware.FirmwareDemands(station.home)
     while page := list(islice(known, PAGE)):
         listed = [overview.uuid for overview in page]
         judged = readings.verdicts_of(
             station, listed, [overview.uuid for overview in page if overview.keys and overview.moved is None]
         )
+        reported = station.nodes.firmware_of(listed)
         for overview in page:
-            found = judged.get(overview.uuid)
-            yield _described(overview, found), found
+            found, record = judged.get(overview.uuid), reported.get(overview.uuid)
+            node = _described(overview, found)
+            runs = firmware.known_firmware(record, partial(demands.of, node["profile"])) if record is not None else None
+            yield node | {"firmware": runs and runs.to_json()}, found
 
 
 def _described(known: NodeOverview, judged: NodeVerdict | None) -> dict[str, Any]:

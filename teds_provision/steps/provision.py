@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from teds_provision.errors import PolicyError, StoreError, TedsProvisionError
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.firmware import FirmwareDemands, FirmwareReading
 from teds_provision.station.shown_units import shown_units, units_of
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry
@@ -43,6 +44,7 @@ from teds_provision.steps.build import (
     prepare,
     propose,
 )
+from teds_provision.steps.firmware import read_firmware, require_firmware
 from teds_provision.steps.identify import IdentifiedNode, identify
 from teds_provision.steps.sign import SignResult, require_not_measured, sign
 from teds_provision.steps.teds_read import NodeSnapshot, take_snapshot
@@ -54,6 +56,7 @@ from teds_provision.talk.progress import DONE, NOTHING, SKIPPED, Reporter, StepR
 from teds_provision.teds.calibration.formula import sentence
 from teds_provision.teds.certificate import CertificateReference
 from teds_provision.teds.image import SECURITY, Image
+from teds_provision.teds.profile.firmware import FirmwareDemand
 
 Order = BuildOrder | PreparedOrder | Callable[["IdentifiedNode"], PreparedOrder]
 """What a node gets: as it was ordered, read already, or by its identity (which raises if it gets nothing)."""
@@ -76,6 +79,8 @@ class ProvisionResult:
     """One reading of each sensor at the end: channel, name, value and unit (SI), valid."""
     certificate: CertificateReference | None = None
     """The certificate that this run calibrated the node by."""
+    firmware: FirmwareReading | None = None
+    """The firmware that the node reported in the session of this run."""
 
 
 def verify_only(station: Station, node: Conversation, line: ProductionLine, reporter: Reporter) -> ProvisionResult:
@@ -99,11 +104,18 @@ def verify_only(station: Station, node: Conversation, line: ProductionLine, repo
                     if told:
                         require_board_type(who.uuid, told)
                 with steps.step("check") as step:
+                    firmware = read_firmware(node)
                     passed = looked.verified.verdict == "authentic" and node.sealed
                     borne = check_hardware(node, looked.image) if passed else HardwareCheck({})
                     step.result = DONE if borne.asked else SKIPPED
                 done = ProvisionResult(
-                    who, tuple(steps.done), looked.image, looked.verified, borne.warnings, borne.samples
+                    who,
+                    tuple(steps.done),
+                    looked.image,
+                    looked.verified,
+                    borne.warnings,
+                    borne.samples,
+                    firmware=firmware,
                 )
                 unit.ended(node, done)
             except (TedsProvisionError, SessionLostError) as error:
@@ -264,6 +276,9 @@ class _Run:
             shown = shown_by(self.node, {channel.number for channel in prepared.profile.channels})
             told = differences(shown, prepared.profile, prepared.calibrations or ())
             self._require_its_board(who, prepared, told)
+        demand = self._firmware_demand(who, prepared)
+        if demand is not None:  # a hint outside a session: it may refuse, never permit
+            require_firmware(who.uuid, demand, read_firmware(self.node))
         entry = self._whitelist(who)
         if self.line is not None:
             self.unit = self.line.allot_unit(self.node, who, prepared, entry)
@@ -271,6 +286,8 @@ class _Run:
         self._agree(who, entry)
         if self.onward is not None:
             self.onward(self.node)
+        firmware = read_firmware(self.node)
+        require_firmware(who.uuid, demand, firmware or FirmwareReading(None, sealed=True))
         present = take_snapshot(self.node, initial=who.security_teds)
         proposal = self._build(who, prepared, present)
         signed = self._sign(who, proposal, present)
@@ -280,8 +297,15 @@ class _Run:
         warnings = merged((*proposal.warnings, *further(present.image.blocks, proposal.image), *borne.warnings))
         certificate = certificate_brought(proposal.calibrations)
         return ProvisionResult(
-            who, tuple(self.steps.done), written.on_node, verified, warnings, borne.samples, certificate
+            who, tuple(self.steps.done), written.on_node, verified, warnings, borne.samples, certificate, firmware
         )
+
+    def _firmware_demand(self, who: IdentifiedNode, prepared: PreparedOrder) -> FirmwareDemand | None:
+        """Return what the type that this board gets, or has, demands of its firmware."""
+        if prepared.profile is not None:
+            return prepared.profile.firmware
+        known = self.station.nodes.get(who.uuid)
+        return FirmwareDemands(self.station.home).of(known.profile if known is not None else None)
 
     def _require_its_board(self, who: IdentifiedNode, prepared: PreparedOrder, told: tuple[str, ...]) -> None:
         """Ask, or refuse, if the board claims another type; only the first of the two checks asks."""

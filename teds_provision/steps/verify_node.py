@@ -11,6 +11,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now
 from teds_provision.steps import readings
 from teds_provision.steps.agree import agreed_elsewhere, proof_of_reset, session_if_keyed
+from teds_provision.steps.firmware import keep_firmware, read_firmware
 from teds_provision.steps.identify import IdentifiedNode, prove
 from teds_provision.steps.readings import NodeVerdict
 from teds_provision.steps.teds_read import read_block, read_identity, read_image
@@ -119,6 +120,7 @@ def verify_node(
     ``c`` that of the session in which the reading began.
     """
     identity = (node.proven or read_identity(node)) if node.sealed else None
+    firmware = read_firmware(node) if node.sealed else None
     possessed, vouch = possession_check(lambda: prove(node, point)), provenance_check(node, point, why)
     known = freshness_floor_of(station, node.uuid, identity)
     if vouch.result == "failed":
@@ -134,6 +136,7 @@ def verify_node(
     def record() -> None:
         with station.durable("verify"):
             readings.keep_judged(station, row, judged, image)
+            keep_firmware(station, image.uuid, firmware)
             kept = station.nodes.reading(image.uuid)
             if identity is not None or (kept is not None and not kept.in_session):
                 station.nodes.remember(image.uuid, **_facts(image, identity))

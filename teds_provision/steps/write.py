@@ -27,9 +27,11 @@ from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
 from teds_provision.protocol.messages.frames import Reason, update_teds, write_teds
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.commands import POWER, PowerFlag, PowerReply
+from teds_provision.station.firmware import FirmwareReading
 from teds_provision.station.station import Station
 from teds_provision.station.store import NodeRecord
 from teds_provision.steps.build import profile_files_digest
+from teds_provision.steps.firmware import keep_firmware, read_firmware
 from teds_provision.steps.readings import is_known, keep, keep_read
 from teds_provision.steps.sign import known_image, node_keys_of, sign
 from teds_provision.steps.teds_read import NodeSnapshot, read_block, read_identity, read_image
@@ -99,7 +101,7 @@ def write(
                 with station.durable("write", more_follows=True):
                     keep(station, node, has, by="write", known=known)
             return WriteResult(0, time.monotonic() - started, has)
-    identity = node.proven or read_identity(node)
+    identity, firmware = node.proven or read_identity(node), read_firmware(node)
     _require_newer(station, image.uuid, signed, identity, jump=jump)
     _require_charge(node, low)
     octets = 0
@@ -112,7 +114,7 @@ def write(
     node.proven = replace(identity, sequence=signed.sequence, state=NodeState.PROVISIONED)
     c = node.open_counter
     back = read_image(node)
-    _conclude(station, node, image, back, facts, c=c, octets=octets, sequence=signed.sequence)
+    _conclude(station, node, image, back, facts, c=c, octets=octets, sequence=signed.sequence, firmware=firmware)
     return WriteResult(octets, time.monotonic() - started, back)
 
 
@@ -142,6 +144,7 @@ def _conclude(
     c: bytes | None,
     octets: int,
     sequence: int,
+    firmware: FirmwareReading | None,
 ) -> None:
     """Record what was read back; raises NotAuthenticError if it is not what was written."""
     differing = [block for block in image if back.blocks.get(block) != image.blocks[block]]
@@ -159,6 +162,7 @@ def _conclude(
                 station.audit("write", image.uuid, "read-back differs", block=list(differing[0]))
             else:
                 known = station.nodes.remember(image.uuid, **facts)
+                keep_firmware(station, image.uuid, firmware, signed=True)
                 _tell_written(station, image, known, sequence)
                 # A draft that is on the node now is none any more; a newer trial stays
                 draft = station.nodes.draft(image.uuid)

@@ -11,6 +11,7 @@ from types import TracebackType
 from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, NodeSilentError, TedsProvisionError
 from teds_provision.links import Contact, Notice
 from teds_provision.links.ports import DeadlineLink, Link, NoticeSink
+from teds_provision.protocol.messages.firmware import FirmwareReport
 from teds_provision.protocol.messages.frames import (
     IDENTIFY,
     Command,
@@ -132,6 +133,8 @@ class Conversation:
         self._statics: tuple[bytes, ...] = ()
         self.open_counter: bytes | None = None
         """c of the Open of this session, 8 octets; a change shows that the node has restarted."""
+        self.reported_firmware: tuple[bytes | None, FirmwareReport | None] | None = None
+        """Last answer to About, and the c of its session (None: plain); see steps/firmware.py."""
         self._release: Callable[[], object] = _nothing
 
     def __enter__(self) -> Conversation:

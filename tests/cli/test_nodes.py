@@ -87,6 +87,7 @@ def test_json_holds_all_that_is_known_but_no_key(known: Path) -> None:
         "holders": None,
         "revoked": None,
         "wrapped": None,
+        "firmware": None,
     }
     assert len(one["fingerprint"]) == 64
     assert {key["key_id"]: key["state"] for key in one["keys"]} == {"ab" * 8: "active", "cd" * 8: "pending"}

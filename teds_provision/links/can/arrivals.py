@@ -68,6 +68,12 @@ class WatchedPort(Protocol):
         """Report other stations that use our source address."""
 
 
+def _tells_a_start(frame: Frame) -> bool:
+    """Return True for an Announce of a node that started; a pressed button is no reason to ask."""
+    announce = Announce.decode(frame.identifier, frame.data) if is_announce(frame.identifier) else None
+    return announce is not None and not announce.pressed
+
+
 class Arrivals:
     """The nodes of one bus; :meth:`round` asks everyone once and yields what is new."""
 
@@ -93,7 +99,7 @@ class Arrivals:
         bus = self._port.bus()
         if bus is not self._bus:
             self._bus = bus
-            self._listener = bus.listen(lambda frame: is_announce(frame.identifier), most=256)
+            self._listener = bus.listen(_tells_a_start, most=256)
         clashing: set[int] = set()
         address = self._port.spec.node
         for news in self._all(stop, clashing) if address is None else self._one(address, clashing):
@@ -106,6 +112,11 @@ class Arrivals:
         if not stop.is_set():
             self._say_who_left(clashing)
             self._port.report_rivals(self._notice)
+
+    def pressed(self) -> list[bytes]:
+        """Return the UUIDs of the nodes that say their button was pressed, each press once, a second later."""
+        crcs = self._bus.presses.news() if self._bus is not None else []
+        return [uuid for uuid in self._seen if uuid_crc(uuid) in crcs]
 
     def pause(self, stop: threading.Event) -> None:
         """Wait until everyone may be asked again, or a node announces itself; what a round took counts.

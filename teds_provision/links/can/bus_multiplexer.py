@@ -32,8 +32,9 @@ from teds_provision.links.can.isotp import (
     flow,
     read_single,
 )
+from teds_provision.links.can.presses import ButtonPressLog
 from teds_provision.links.can.transfer_pace import TransferPace
-from teds_provision.protocol.announce import is_announce
+from teds_provision.protocol.announce import Announce, is_announce
 
 # Who reads a bus: a loop of its own, or the thread that waits for a reply and so need not be woken by another.
 #
@@ -449,6 +450,7 @@ class BusMultiplexer:
         self._lines: dict[tuple[int, int], AddressPair] = {}
         self._clashes: dict[int, float] = {}
         self._announced: dict[int, float] = {}
+        self.presses = ButtonPressLog()
         self._lost_at = -math.inf
         self._lock = threading.Lock()
         self._sending = threading.Lock()
@@ -570,11 +572,7 @@ class BusMultiplexer:
         self.conflicts.heard(frame)
         self.transfer_pace.count(frame)
         if is_announce(frame.identifier):
-            node = frame.identifier & 0xFF
-            self._announced[node] = time.monotonic()
-            line = self._lines.get((node, self.own))
-            if line is not None and line.transaction >= 0:
-                line.events.put(ReplyEvent("announced"))
+            self._hear_announce(frame)
         ends = addresses(frame.identifier)
         if ends is not None and len(frame.data) >= 2:
             own, node = ends
@@ -582,6 +580,18 @@ class BusMultiplexer:
                 self._from_node(self.address_pair(node, own), frame)
         for listener in self._listeners:
             listener.offer(frame)
+
+    def _hear_announce(self, frame: Frame) -> None:
+        announce = Announce.decode(frame.identifier, frame.data)
+        if announce is not None:
+            self.presses.hear(announce)
+            if announce.pressed:
+                return  # it has heard every question: nothing else follows from a button
+        node = frame.identifier & 0xFF
+        self._announced[node] = time.monotonic()
+        line = self._lines.get((node, self.own))
+        if line is not None and line.transaction >= 0:
+            line.events.put(ReplyEvent("announced"))
 
     def announced_since(self, node: int, moment: float) -> bool:
         """Return True if a node announced itself at this address after ``moment`` (time.monotonic)."""

@@ -101,7 +101,7 @@ class CanDiscovery(Discovery):
     def _heard(self, frame: Frame | None) -> float:
         """Return the seconds after the last broadcast at which the next one is due because of this frame."""
         announce = Announce.decode(frame.identifier, frame.data) if frame is not None else None
-        if announce is None:
+        if announce is None or announce.pressed:
             return math.inf
         self._presence.announced(self.port.place, announce)
         if self._presence.awaits(announce):

@@ -36,6 +36,7 @@ from teds_provision.links.can.spec import LAST_NODE, CanSpec, parse_spec
 from teds_provision.links.discovery import SightingSink
 from teds_provision.links.ports import CAN, Capabilities, Contact, Notice, NoticeSink, Trace
 from teds_provision.links.streaming import DataListener, MeasuringLink, StreamPieces
+from teds_provision.protocol.announce import uuid_crc
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.operation.can_frames import DriveAddress, cut, trigger_identifier
 
@@ -112,7 +113,8 @@ class CanPort(MeasuringLink):
 
     def contact(self, node: int, identity: Identity) -> Contact:
         """Return a contact with the node at this address."""
-        return Contact(identity, self.link(node), address=node, trace=self.trace, bus=self.place)
+        pressed = partial(self.bus().presses.marks, node, uuid_crc(identity.uuid))
+        return Contact(identity, self.link(node), address=node, trace=self.trace, bus=self.place, pressed=pressed)
 
     def next_transaction(self) -> int:
         """Return a transaction number, 0 to 255; the first of a process is random."""
@@ -318,6 +320,8 @@ class CanPort(MeasuringLink):
                     lost = False
                     notice(Notice("reader-ready", f"The bus {self.spec.text} is back."))
                 arrivals.pause(stop)
+                for uuid in arrivals.pressed():
+                    notice(Notice("pressed", f"Node {uuid.hex()} says it was pressed.", uuid=uuid))
             except LinkError as error:
                 arrivals.lost()
                 if not lost:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
         Draft,
         ExportedNode,
         ExportEligibility,
+        FirmwareRecord,
         Group,
         Handover,
         Holder,
@@ -38,7 +39,7 @@ else:
             "audit": "AuditEntry AuditLog AuditVerdict AuditFilter is_failure",
             "lock": "NodeLock StoreLock",
             "records": "DatasheetRecord Draft ExportEligibility Group ExportedNode Handover Holder KeyRecord KeyFlags"
-            " KeptMeasurement NodeReading NodeRecord RevocationRecord"
+            " FirmwareRecord KeptMeasurement NodeReading NodeRecord RevocationRecord"
             " StationRecord Tombstone TrustRecord WhitelistEntry utc_now",
             "store": "Store",
             "tables.overview": "NodeOverview Search",
@@ -58,6 +59,7 @@ __all__ = [
     "EvidenceRow",
     "ExportEligibility",
     "ExportedNode",
+    "FirmwareRecord",
     "Group",
     "Handover",
     "Holder",

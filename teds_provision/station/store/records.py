@@ -129,6 +129,22 @@ class NodeReading:
         return (int.from_bytes(c, "big") - int.from_bytes(self.c, "big")) % (1 << 64) < 1 << 32
 
 
+@dataclass(frozen=True, slots=True)
+class FirmwareRecord:
+    """What a node last reported of its firmware.
+
+    ``report`` is the payload of the reply to About, empty if the node reports none; ``at`` is when this very report
+    first came. ``signed`` is the report under which its datasheet was last signed here, None if none was.
+    """
+
+    uuid: bytes
+    report: bytes
+    in_session: bool
+    at: str
+    signed: bytes | None = None
+    mac: bytes | None = field(default=None, repr=False, compare=False)
+
+
 class ExportEligibility(NamedTuple):
     """What decides whether one node may leave: its identity key with its seal, and whether it was retired."""
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Final
 
 APPLICATION_ID: Final = 0x54454453  # "TEDS"
-SCHEMA_VERSION: Final = 14
+SCHEMA_VERSION: Final = 15
 OLDEST_SCHEMA: Final = 7
 """The first of KeyAgreement 2. Link keys of older stores were agreed as no node does any more."""
 
@@ -292,6 +292,15 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         " WHERE retired LIKE 'decommissioned%' OR retired LIKE 'replaced by%')",
         "ALTER TABLE nodes DROP COLUMN groups",
         "CREATE INDEX groups_of_node ON group_members(uuid)",
+    ),
+    # what nodes report of their firmware, and under which one their datasheet was signed
+    15: (
+        """CREATE TABLE firmware(
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10),
+        report BLOB NOT NULL CHECK(length(report) = 0 OR length(report) BETWEEN 42 AND 90),
+        in_session INTEGER NOT NULL CHECK(in_session IN (0, 1)), at TEXT NOT NULL,
+        signed BLOB CHECK(length(signed) = 0 OR length(signed) BETWEEN 42 AND 90),
+        mac BLOB CHECK(length(mac) = 16)) STRICT, WITHOUT ROWID""",
     ),
 }
 

@@ -8,6 +8,7 @@ from typing import Final, cast
 from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import METHODS, Monotone
 from teds_provision.teds.codec.model import AccessCode, Units
+from teds_provision.teds.profile.firmware import firmware_demand
 from teds_provision.teds.profile.keys import (
     CALIBRATION_KEYS,
     CHANNEL_KEYS,
@@ -324,6 +325,7 @@ def interpret(table: TomlTable, name: str, file: str, lineage: tuple[str, ...], 
     phy_pairs = phy.pairs(PHY_KEYS) if phy else ()
     if phy:
         phy.finish()
+    firmware = firmware_demand(top)
     texts = tuple(text for part in top.sections("text") if (text := _text(part, numbers)))
     title = top.text("title", name)
     description = top.text("description")
@@ -346,6 +348,7 @@ def interpret(table: TomlTable, name: str, file: str, lineage: tuple[str, ...], 
         texts,
         abstract,
         warnings,
+        firmware,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
@@ -246,6 +246,9 @@ def describe(profile: Profile) -> dict[str, Any]:
         "extends": list(profile.lineage[1:]),
         "meta": {name: value for name, value in profile.meta if isinstance(value, (int, float))},
         "channels": [describe_channel(channel) for channel in profile.channels],
+        "firmware": None
+        if profile.firmware is None
+        else asdict(profile.firmware) | {"bad": list(profile.firmware.bad)},
         "warnings": list(profile.warnings),
     }
 
@@ -347,6 +350,11 @@ def template(name: str) -> str:
             "# indication = [0.01, -40.0]        # slope, intercept: what a raw value indicates before calibration",
             "# zero-offset = false               # the offset may be adjusted in use",
             "# standard-deviation = 0.5          # in the channel's unit; variance of topics",
+            "",
+            "# [firmware]                        # which firmware boards of this type should run, as they report it",
+            '# text = "*/loadcell"               # board and application; *, ? and [...] as in file names',
+            '# minimum = "1.2.0"',
+            '# bad = ["1.2.1", "1.3.0+7"]        # versions, or digests of images (64 hex digits)',
             "",
             "# [phy]                             # PHY TEDS of IEEE 1451.5, access code 13; many nodes bring their own",
             *_lines(PHY_KEYS, comment=True),

@@ -15,6 +15,7 @@ from teds_provision.teds.codec.composer import compose
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import AccessCode, Edition, Units
 from teds_provision.teds.image import BlockId
+from teds_provision.teds.profile.firmware import FirmwareDemand
 from teds_provision.teds.units import WrittenUnit
 
 USER_DEFINED_NAME: Final = 0
@@ -142,6 +143,7 @@ class Profile:
     texts: tuple[TextProfile, ...] = ()
     abstract: bool = False
     warnings: tuple[str, ...] = field(default=())
+    firmware: FirmwareDemand | None = None
     composed: dict[tuple[object, ...], bytes] = field(init=False, default_factory=dict, repr=False, compare=False)
     """Parts that are equal for every node of this type, made for the first one: TEDS, and the profile's digest."""
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from teds_provision.errors import BadDataError
 from teds_provision.lazy import late
 from teds_provision.station.store.database import Database, places
-from teds_provision.station.store.records import DatasheetRecord, Draft, NodeReading, iso, utc_now
+from teds_provision.station.store.records import DatasheetRecord, Draft, FirmwareRecord, NodeReading, iso, utc_now
 from teds_provision.teds.image import BlockId, Image
 
 if TYPE_CHECKING:
@@ -174,6 +174,21 @@ class DatasheetTables:
     def drop_reading(self, uuid: bytes) -> None:
         """Forget what was read of a node: it was reset."""
         self._database.execute("DELETE FROM readings WHERE uuid = ?", (uuid,))
+        self._database.execute("DELETE FROM firmware WHERE uuid = ?", (uuid,))
+
+    def firmware_of(self, uuids: Sequence[bytes]) -> dict[bytes, FirmwareRecord]:
+        """Return what these nodes (a page of them) last reported of their firmware, by UUID."""
+        found = self._database.read(_firmware, f"SELECT * FROM firmware WHERE uuid IN ({places(uuids)})", uuids)
+        return {record.uuid: record for record in found}
+
+    def all_firmware(self) -> list[FirmwareRecord]:
+        """Return what all nodes last reported of their firmware."""
+        return self._database.read(_firmware, "SELECT * FROM firmware ORDER BY uuid")
+
+    def put_firmware(self, record: FirmwareRecord) -> None:
+        """Keep what a node reports of its firmware, in place of what it reported before."""
+        values = (record.uuid, record.report, record.in_session, record.at, record.signed, record.mac)
+        self._database.execute(f"INSERT OR REPLACE INTO firmware VALUES({places(values)})", values)
 
     def put_history(self, records: list[DatasheetRecord]) -> None:
         """Keep datasheets of a node, oldest first, in place of those that are there (for restore)."""
@@ -188,6 +203,10 @@ class DatasheetTables:
 def _reading(*row: Any) -> NodeReading:
     values = dict(zip(READING_FIELDS, row, strict=True))
     return NodeReading(**(values | {"whole": bool(values["whole"])}))
+
+
+def _firmware(uuid: bytes, report: bytes, in_session: int, at: str, *rest: Any) -> FirmwareRecord:
+    return FirmwareRecord(uuid, report, bool(in_session), at, *rest)
 
 
 def _draft(uuid: bytes, blocks: bytes, stage: Any, profile: str | None, created: str) -> Draft:

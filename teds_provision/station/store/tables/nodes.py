@@ -157,7 +157,8 @@ class NodeTables:
         """Forget the identity key of a node on its owner's explicit order; epoch and sequence stay."""
         with self._database.together():
             self._database.execute("UPDATE nodes SET point = NULL, point_mac = NULL WHERE uuid = ?", (uuid,))
-            self._database.execute("DELETE FROM readings WHERE uuid = ?", (uuid,))  # of the board that it was
+            for table in ("readings", "firmware"):  # of the board that it was
+                self._database.execute(f"DELETE FROM {table} WHERE uuid = ?", (uuid,))
 
     def resolve(self, text: str) -> bytes:
         """Return the UUID that ``text`` means, looking at nodes and whitelist.

@@ -1,0 +1,102 @@
+"""Which firmware a node reports, if its type accepts it, and how it is found (profile.md, "About and Locate").
+
+A report is read once per session. In a session it is a statement by the holder of the node's key, outside one a hint,
+which may refuse and never permit. It does not affect the verdict, which covers only the datasheet.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, PolicyError
+from teds_provision.protocol.messages.firmware import ABOUT
+from teds_provision.protocol.messages.frames import Function, Reason, security_command
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.firmware import (
+    FirmwareReading,
+    FirmwareState,
+    decoded_report,
+    state_of,
+)
+from teds_provision.station.station import Station
+from teds_provision.talk.conversation import Conversation
+from teds_provision.teds.profile.firmware import FirmwareDemand
+
+
+def read_firmware(node: Conversation, *, once: bool = False) -> FirmwareReading | None:
+    """Ask a node which firmware it runs, once per session; None if it may not be asked here, or cannot answer now.
+
+    ``once``: a single question, even if it or its answer is lost. Raises LinkError, and what a lost session raises.
+    """
+    session = node.open_counter if node.sealed else None
+    if node.reported_firmware is not None and node.reported_firmware[0] == session:
+        return FirmwareReading(node.reported_firmware[1], session is not None)
+    if session is None and not node.wired and node.identity.state != NodeState.FACTORY:
+        return None  # it would answer 3
+    try:
+        payload = (node.request if once else node.request_idempotent)(ABOUT, "to report its firmware")
+    except NodeRefusedError as refusal:
+        if refusal.reason != Reason.UNKNOWN_COMMAND:
+            return None
+        report = None
+    except (LinkError, GarbledError):
+        if not once:
+            raise
+        return None
+    else:
+        report = decoded_report(payload)
+    node.reported_firmware = (node.open_counter if node.sealed else None, report)
+    return FirmwareReading(report, node.sealed)
+
+
+def locate(node: Conversation, seconds: int) -> None:
+    """Make a node blink or beep, 0: stop; needs a session, or a node in factory state. Raises NodeRefusedError."""
+    try:
+        node.request_retry_once(security_command(Function.LOCATE, bytes([seconds])), "to blink")
+    except NodeRefusedError as refusal:
+        if refusal.reason != Reason.UNKNOWN_COMMAND:
+            raise
+        raise NodeRefusedError(
+            f"Node {node.uuid.hex()} cannot blink or beep.", reason=refusal.reason, hint="Press its button instead."
+        ) from refusal
+
+
+class FirmwareError(PolicyError):
+    """The firmware of a board is not what its type demands."""
+
+    code = "firmware"
+
+
+_REFUSED: Final[dict[FirmwareState, str]] = {
+    "bad": "runs firmware that its type rules out",
+    "other": "runs other firmware than its type",
+    "outdated": "runs outdated firmware",
+    "not-reported": "does not report its firmware",
+}
+
+
+def require_firmware(uuid: bytes, demand: FirmwareDemand | None, reading: FirmwareReading | None) -> None:
+    """Refuse a board whose firmware its type does not accept, before it is keyed or signed; raises FirmwareError.
+
+    An answer outside a session may refuse, never permit; None, where it could not be asked, refuses in no case.
+    """
+    if demand is None or reading is None:
+        return
+    state = state_of(demand, reading.report)
+    if state not in _REFUSED:
+        return
+    report, node = reading.report, uuid.hex()
+    named = "" if report is None else f": {report.text} {report.version_text}+{report.build}"
+    wanted = ", ".join(
+        filter(None, (demand.text, f"at least {demand.minimum}" if demand.minimum and state == "outdated" else ""))
+    )
+    raise FirmwareError(
+        f"Board {node} {_REFUSED[state]}{named}{f' (wanted: {wanted})' if wanted else ''}. Nothing was signed.",
+        hint=f"Install other firmware, then try again: agree {node}, update {node} IMAGE, provision.",
+    )
+
+
+def keep_firmware(station: Station, uuid: bytes, reading: FirmwareReading | None, *, signed: bool = False) -> None:
+    """Keep a node's answer. ``signed``: its datasheet was signed now, under this firmware."""
+    if reading is not None:
+        station.nodes.keep_firmware(uuid, reading.payload, in_session=reading.sealed, signed=signed)
