@@ -38,7 +38,8 @@ class FirmwareImage:
     """An image file whose header and digest are good.
 
     ``digest`` is MCUboot's (of SHA-384 and SHA-512 the first 32 octets), not that of the file. ``board`` is the text of
-    the TLV 0x54A0, None if there is none; ``security_counter`` likewise. ``signed``: its signature was checked.
+    the TLV 0x54A0, None if there is none; ``security_counter`` likewise. The payload begins at ``header_octets``.
+    ``signed``: its signature was checked.
     """
 
     octets: bytes
@@ -46,6 +47,7 @@ class FirmwareImage:
     digest: bytes
     board: str | None
     security_counter: int | None
+    header_octets: int
     signed: bool = False
 
     @property
@@ -135,7 +137,10 @@ def read_firmware_image(octets: bytes, key: KeyClass | None = None) -> FirmwareI
             "The firmware image is not signed with this key.",
             hint="Sign it with the owner's key (imgtool sign -k), or name the right one with --key.",
         )
-    return FirmwareImage(octets, tuple(version), digest[:_DIGEST_OCTETS], board, counter, signed=key is not None)
+    header = int(info["header"]["hdr_size"])
+    return FirmwareImage(
+        octets, tuple(version), digest[:_DIGEST_OCTETS], board, counter, header, signed=key is not None
+    )
 
 
 def _named_in(info: Any, digest: bytes) -> tuple[str | None, int | None]:

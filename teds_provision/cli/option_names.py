@@ -32,6 +32,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "read": frozenset({"output", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "reset": frozenset({"yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "address": frozenset({"yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
+    "update": frozenset({"key", "match", "parallel", "wait", "allow-downgrade", "other-board", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "label": frozenset({"output"}),
     "log": frozenset({"follow", "last", "today", "since", "act", "failed"}),
     "trace show": frozenset({"messages", "whole"}),
@@ -95,10 +96,10 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "evidence verify": frozenset({"ca", "pins", "roster"}),
     "demo": frozenset({"page", "plant", "line", "http"}),
     "node check": frozenset({"factory", "explain", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
-    "node create": frozenset({"uuid", "name", "teds", "profile", "from", "message", "max-message"}),
+    "node create": frozenset({"uuid", "new-uuid", "name", "teds", "profile", "from", "message", "max-message", "firmware", "firmware-key"}),
     "node run": frozenset({"nfc", "tag", "can", "ble", "source", "bus", "node-id", "crypto-delay", "flash-delay", "wait-time", "battery", "pace"}),
 }
-FILES: Final = frozenset({"batch", "calibration", "calibrations", "certificate", "csv", "dcc", "draft", "files", "home", "image", "label-to", "laboratory", "list", "map", "member", "output", "pins", "plot", "receipt", "record", "recovery-key", "report", "request", "require", "roster", "teds", "tls-cert", "tls-key", "trace", "trust-dcc"})
+FILES: Final = frozenset({"batch", "calibration", "calibrations", "certificate", "csv", "dcc", "draft", "files", "firmware", "firmware-key", "home", "image", "key", "label-to", "laboratory", "list", "map", "member", "output", "pins", "plot", "receipt", "record", "recovery-key", "report", "request", "require", "roster", "teds", "tls-cert", "tls-key", "trace", "trust-dcc"})
 """Options that name a file or a folder, in every command that has them."""
 PARAMETERS: Final[dict[str, dict[str, str]]] = {
     "": {"json": "as_json"},
@@ -146,6 +147,7 @@ SEVERAL: Final[dict[str, frozenset[str]]] = {
     "read": frozenset({"nfc", "can"}),
     "reset": frozenset({"nfc", "can"}),
     "address": frozenset({"nfc", "can"}),
+    "update": frozenset({"nfc", "can"}),
     "show": frozenset({"trust-dcc"}),
     "record show": frozenset({"channel"}),
     "sample": frozenset({"nfc", "can"}),

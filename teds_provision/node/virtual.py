@@ -183,9 +183,15 @@ class VirtualNode:
 
     def _start(self) -> Tim:
         """Start the board: the boot loader chooses the image, and what lay in RAM is gone."""
-        if self._slots is not None:
-            self._slots.start()
-            self._end_trial_in_time(self._slots)
+        slots = self._slots
+        if slots is not None:
+            slots.start()
+            if slots.behaves("crash") and slots.on_trial:
+                slots.start()  # the watchdog, and the boot loader reverts it
+            if slots.behaves("confirm"):
+                slots.confirm()
+            self._off = slots.behaves("mute")
+            self._end_trial_in_time(slots)
         return Tim(
             _SlowKey(self.flash_file.key, self._work),
             _Flash(self.flash_file, self._core),
@@ -266,7 +272,7 @@ class VirtualNode:
         at = None if simulated else received  # a simulation's tick does not advance while a command runs
         with self._core.command():
             if self._off:
-                raise NodeSilentError("The board does not start.")
+                raise NodeSilentError("The board does not answer.")
             port = port_of(link)._replace(fd=fd, mtu=mtu, hears=hears)
             reply = self.tim.handle(frame, link=link, tapped=tapped, port=port, received=at)
         with self._wire:

@@ -20,6 +20,7 @@ from typing import Any, cast
 
 import pytest
 
+from teds_provision.node.firmware.boot_loader import ImageSlots
 from teds_provision.node.node_template import create
 from teds_provision.station.store import Store
 from tests.bench import PASSPHRASE
@@ -180,14 +181,27 @@ class Desk:
         """A random UUID of a node that keeps its default address beside the others of this desk."""
         return new_uuid(self.addresses)
 
-    def node(self, name: str = "node", *, uuid: str | None = None, called: str = "", type_: str | None = None) -> Node:
-        """A new node in factory state, made in this process: what the command does is in tests/node."""
+    def node(
+        self,
+        name: str = "node",
+        *,
+        uuid: str | None = None,
+        called: str = "",
+        type_: str | None = None,
+        firmware: tuple[Path, Path] | None = None,
+    ) -> Node:
+        """A new node in factory state, made in this process: what the command does is in tests/node.
+
+        ``firmware``: the image that it runs, and the owner's key pair.
+        """
         own = bytes.fromhex(uuid) if uuid else self.new_uuid()
         if self.nodes == "c":
             if called or type_:
                 pytest.skip("the node in C has no datasheet of its own")
-            return cast(Node, CNode(self, self.folder / name, own.hex()))
+            return cast(Node, CNode(self, self.folder / name, own.hex(), firmware=firmware))
         made = create(self.folder / name, uuid=own, name=called, profile=type_)
+        if firmware is not None:
+            ImageSlots.create(self.folder / name, *firmware)
         made.release()
         return Node(self, self.folder / name, made.load().uuid.hex())
 

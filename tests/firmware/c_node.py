@@ -11,6 +11,7 @@ import pytest
 
 from teds_provision.protocol.announce import default_can_address
 from tests.firmware import builds
+from tests.firmware_images import public
 from tests.pace import until
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ class CNode:
     folder: Path
     uuid: str
     process: Running | None = None
+    firmware: tuple[Path, Path] | None = None
 
     def start(self, *options: object, nfc: bool = True, can: bool = False, **more: Any) -> CNode:
         """Power on, and wait until its links are up. What it has no option for is not this test's node."""
@@ -40,6 +42,10 @@ class CNode:
         links = self.desk.links
         words: list[object] = ["--flash", self.folder / "flash.bin", "--uuid", self.uuid]
         words += [*(["--nfc", links.nfc] if nfc else []), *(["--can", links.can] if can else [])]
+        if self.firmware is not None:
+            image, key = self.firmware
+            words += ["--images", self.folder / "images", "--owner", public(key, "raw"), "--image", image]
+            words += ["--security-counter"]
         self.process = self.desk.start(*words, program=(str(builds.host()),), fork=False, **more)
         ready = self.process.wait_for_lines(1)[0]  # an actuator tells its state soon after
         assert ready.get("ready") is True, ready

@@ -3,7 +3,8 @@
 An image that was chosen starts once, on trial; at the next start the other one runs again unless it was confirmed.
 Which slot runs is one small file that is replaced whole, so a loss of power at any moment leaves the old image or the
 new one.
-A virtual node executes no image: which one runs decides what it reports, nothing else.
+A virtual node executes no image: which one runs decides what it reports, and an image of tests how it fails
+(:meth:`ImageSlots.behaves`).
 """
 
 from __future__ import annotations
@@ -136,6 +137,10 @@ class ImageSlots:
     def pending(self) -> bool:
         """True if the other image starts at the next start."""
         return self._state.pending is not None
+
+    def behaves(self, how: str) -> bool:
+        """Return True if the running image is one of tests that is to fail so: its payload begins with a line #!HOW."""
+        return self.running.octets[self.running.header_octets :].startswith(f"#!{how}\n".encode())
 
     def confirm(self) -> None:
         """Keep the running image; durable when it returns."""

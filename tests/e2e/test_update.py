@@ -1,0 +1,180 @@
+"""Firmware updates by command line, on real links, of the node in Python and of the one in C."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.firmware_images import make_key, public, sign
+from tests.pace import until
+
+from .desk import ANGLE, Desk, Node, Station
+
+pytestmark = [pytest.mark.link]
+PROVISIONED = ("--profile", ANGLE)
+
+
+class Owner:
+    """An owner's key and the images that it signed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.key = folder, make_key(folder / "owner.pem")
+        self.public = public(self.key, "pem")
+        self.old, self.new = self.image("1.0.0"), self.image("1.1.0")
+
+    def image(self, version: str, **more: Any) -> Path:
+        return sign(self.folder, version, more.pop("key", self.key), **{"counter": 1, **more})
+
+
+@pytest.fixture(scope="module")
+def owner(tmp_path_factory: pytest.TempPathFactory) -> Owner:
+    return Owner(tmp_path_factory.mktemp("owner"))
+
+
+def board(desk: Desk, owner: Owner, name: str = "node", **start: Any) -> Node:
+    return desk.node(name, firmware=(owner.old, owner.key)).start(nfc=False, can=True, **start)
+
+
+def update(station: Station, *words: object, code: int = 0) -> tuple[list[Any], dict[str, Any]]:
+    """Run ``update --json``; its lines, and the totals."""
+    outcome = station.run("--json", "update", *words, "--yes", *station.desk.links.over("can"))
+    assert outcome.code == code, outcome
+    *lines, last = map(json.loads, outcome.out.splitlines())
+    return lines, last["totals"]
+
+
+@pytest.mark.both_nodes
+def test_a_board_gets_new_firmware_and_keeps_everything_else(desk: Desk, owner: Owner) -> None:
+    station, node = desk.station(), board(desk, owner)
+    station.provision("can", *PROVISIONED)
+    before, over = node.octets, desk.links.over("can")
+
+    plan = station.ask("update", node.uuid, owner.new, "--key", owner.public, "--dry-run", *over)
+    assert (plan["from"], plan["to"], plan["plan"], plan["octets"]) == (
+        "1.0.0",
+        "1.1.0",
+        "upload",
+        owner.new.stat().st_size,
+    )
+    assert node.octets == before
+    (line,), totals = update(station, node.uuid, owner.new, "--key", owner.public)
+    assert {name: line[name] for name in ("uuid", "from", "to", "octets", "result", "image")} == {
+        "uuid": node.uuid,
+        "from": "1.0.0",
+        "to": "1.1.0",
+        "octets": owner.new.stat().st_size,
+        "result": "updated",
+        "image": plan["image"],
+    }
+    assert {name: totals[name] for name in ("updated", "already", "reverted", "refused", "lost")} == {
+        "updated": 1,
+        "already": 0,
+        "reverted": 0,
+        "refused": 0,
+        "lost": 0,
+    }
+    assert node.octets == before, "key, datasheet, address, epoch and sequence"
+    assert station.ask("verify", node.uuid, *over)["verdict"] == "authentic"
+    (line,), _ = update(station, node.uuid, owner.new)
+    assert (line["result"], line["octets"]) == ("already", 0)
+
+    (line,), _ = update(station, node.uuid, owner.old, code=6)
+    assert (line["result"], line["error"]["code"]) == ("refused", "downgrade")
+    other = owner.image("1.2.0", board="other/board")
+    (line,), _ = update(station, node.uuid, other, code=6)
+    assert (line["result"], line["error"]["code"]) == ("refused", "wrong-image"), "--yes is not enough"
+    rival = owner.image("3.0.0", key=make_key(owner.folder / f"{node.uuid}.pem"))
+    assert station.refuses("update", node.uuid, rival, "--key", owner.public, *over, code=4)["code"] == "not-authentic"
+    (line,), _ = update(station, node.uuid, rival, code=6)
+    assert (line["result"], line["error"]["code"]) == ("reverted", "reverted")
+    torn = owner.folder / f"{node.uuid}.bin"
+    torn.write_bytes(owner.new.read_bytes()[:-9])
+    assert station.refuses("update", node.uuid, torn, *over, code=8)["code"] == "bad-data"
+    assert station.ask("verify", node.uuid, *over)["verdict"] == "authentic"
+    (line,), _ = update(station, node.uuid, owner.old, "--allow-downgrade")
+    assert line["result"] == "updated"
+    assert station.log_is_whole()
+
+
+@pytest.mark.both_nodes
+def test_an_image_that_crashes_does_not_speak_or_confirms_itself(desk: Desk, owner: Owner) -> None:
+    station, node = desk.station(), board(desk, owner)
+    station.provision("can", *PROVISIONED)
+    before = node.octets
+    (line,), _ = update(station, node.uuid, owner.image("2.0.0", behaves="crash"), code=6)
+    assert (line["result"], line["error"]["code"]) == ("reverted", "reverted")
+    (line,), totals = update(station, node.uuid, owner.image("2.1.0", behaves="mute"), "--wait", "2", code=5)
+    assert (line["result"], line["error"]["code"], totals["lost"]) == ("lost", "lost", 1)
+    node.kill()
+    node.start(nfc=False, can=True)
+    assert node.octets == before
+    (line,), _ = update(station, node.uuid, owner.new)
+    assert (line["from"], line["result"]) == ("1.0.0", "updated"), "its old firmware runs after power off and on"
+    (line,), _ = update(station, node.uuid, owner.image("2.2.0", behaves="confirm"), "--wait", "5", code=6)
+    assert line["result"] == "refused"
+    assert "confirmed itself" in line["error"]["message"]
+    assert node.octets == before
+
+
+@pytest.mark.both_nodes
+def test_kill_9_of_either_end_in_an_upload_and_the_same_command_goes_on(desk: Desk, owner: Owner) -> None:
+    station, node = desk.station(), board(desk, owner)
+    station.provision("can", *PROVISIONED)
+    before, over = node.octets, desk.links.over("can")
+    long = owner.image("1.3.0", octets=60_000)
+    words = ("--json", "update", node.uuid, long, "--yes", *over)
+
+    running = station.start(*words)
+    until(lambda: _octets_there(node) > 4000)
+    running.process.kill()
+    running.end()
+    (line,), _ = update(station, node.uuid, long)
+    assert line["result"] == "updated"
+    assert 0 < line["octets"] < long.stat().st_size - 2000, "it went on at the offset of the board"
+
+    longer = owner.image("1.4.0", octets=60_000)
+    running = station.start("--json", "update", node.uuid, longer, "--yes", *over)
+    until(lambda: _octets_there(node) > 4000)
+    node.kill()
+    node.start(nfc=False, can=True)
+    done = running.end()
+    assert json.loads(done.out.splitlines()[0])["result"] == "updated", done
+    assert node.octets == before
+
+
+def _octets_there(node: Node) -> int:
+    """Octets of the slot that is written now, as far as its file shows them."""
+    slots = [path for path in node.folder.glob("**/*") if path.is_file() and path.parent.name in ("firmware", "images")]
+    newest = max(slots, key=lambda path: path.stat().st_mtime_ns, default=None)
+    return 0 if newest is None else len(newest.read_bytes().rstrip(b"\xff"))
+
+
+def test_many_boards_at_once_and_one_that_takes_no_firmware(desk: Desk, owner: Owner) -> None:
+    station = desk.station()
+    boards = [board(desk, owner, f"board{number}") for number in range(3)]
+    plain = desk.node("plain").start(nfc=False, can=True)
+    over = desk.links.over("can")
+    for node in (*boards, plain):
+        station.ask("whitelist", "add", node.uuid)
+    station.run(
+        "provision", "--all", *PROVISIONED, "--yes", *over
+    )  # 6: the type wants a calibration, which is no matter
+    lines, totals = update(station, "--match", f"type:{ANGLE}", owner.new, "--parallel", "3", code=6)
+    results = {line["uuid"]: line["result"] for line in lines}
+    assert results == {**{node.uuid: "updated" for node in boards}, plain.uuid: "refused"}
+    assert next(line["error"]["code"] for line in lines if line["uuid"] == plain.uuid) == "no-update"
+    assert (totals["updated"], totals["refused"]) == (3, 1)
+    _, totals = update(station, *(node.uuid for node in boards), owner.new)
+    assert totals["already"] == 3
+    assert (
+        station.refuses("update", "--match", "name:nothing*", owner.new, "--yes", *over, code=3)["code"] == "not-found"
+    )
+    assert station.refuses("update", owner.new, "--yes", *over, code=2)["code"] == "usage"
+    shown = station.run("update", boards[0].uuid, owner.new, "--yes", *over)
+    assert "already" in shown.out
+    asked = station.run("update", boards[0].uuid, owner.image("1.9.0"), *over)
+    assert asked.code == 6
+    assert "--yes" in asked.err
