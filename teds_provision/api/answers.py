@@ -89,6 +89,7 @@ class PastSegment(TypedDict):
 
     id: Annotated[int, Meta(description="ascending; a channel keeps its numbers until the station is restarted")]
     unit: Annotated[str, Meta(description="SI unit of its values; empty for counts")]
+    raw: NotRequired[Annotated[bool, Meta(description="raw numbers: the channel has no calibration")]]
 
 
 class Past(TypedDict):

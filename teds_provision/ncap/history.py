@@ -14,7 +14,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -152,15 +152,27 @@ class _Meaning:
     calibration: Calibration | None = None
     turn: tuple[float | None, float | None] | None = None  # limits between which its values wrap
     unsigned: bool = False
+    raw: bool = False  # it has no values: raw numbers are kept
 
     @classmethod
-    def from_facts(cls, facts: ChannelFacts) -> _Meaning:
+    def from_facts(cls, facts: ChannelFacts, *, raw: bool = False) -> _Meaning:
         """Return it; a calibration that was only dated or documented again is the same one."""
         calibration = facts.calibration
         if calibration is not None:
             calibration = replace(calibration, date=None, zeroed=None, interval=None, points=(), by="")
         turn = (facts.low, facts.high) if facts.full_turn else None
-        return cls(facts.unit, facts.units, calibration, turn, facts.unsigned)
+        return cls(facts.unit, facts.units, calibration, turn, facts.unsigned, raw)
+
+
+_NOTHING_KNOWN: Final = _Meaning()
+
+
+def raw_numbers(block: Block, column: int) -> NDArray[Any]:
+    """Return the raw values of a channel as numbers; NaN for what is none."""
+    raw = block.raw[:, column]
+    if raw.dtype != object:
+        return np.asarray(raw, np.float64)
+    return np.array([float(each) if isinstance(each, int | float) else np.nan for each in raw.tolist()], np.float64)
 
 
 class _Channel:
@@ -168,20 +180,21 @@ class _Channel:
         self.hour = _Bins(1.0, HOUR, coarse=False)
         self.minute = _Bins(FINE, round(MINUTE / FINE), coarse=True)
         self.segment, self.meaning = 0, meaning
-        self._units = {0: meaning.unit}
+        self._meanings = {0: meaning}
 
     def begin_segment(self, meaning: _Meaning) -> None:
         """Let what comes from now on be of another segment."""
         self.segment, self.meaning = self.segment + 1, meaning
-        self._units = {
-            segment: unit
-            for segment, unit in self._units.items()
+        self._meanings = {
+            segment: known
+            for segment, known in self._meanings.items()
             if any(segment in bins.segments for bins in (self.hour, self.minute))
-        } | {self.segment: meaning.unit}
+        } | {self.segment: meaning}
 
-    def unit(self, segment: int) -> str:
-        """Return the SI unit of a segment."""
-        return self._units[segment]
+    def described(self, segment: int) -> dict[str, Any]:
+        """Return a segment with its SI unit; one of raw numbers has none."""
+        meaning = self._meanings[segment]
+        return {"id": segment, "unit": "", "raw": True} if meaning.raw else {"id": segment, "unit": meaning.unit}
 
 
 @dataclass
@@ -196,7 +209,7 @@ class History:
     """The last hour of all channels. ``block`` may be called from any thread and returns at once."""
 
     def __init__(self) -> None:
-        self._waiting: deque[Block | tuple[ChannelFacts, ...]] = deque()
+        self._waiting: deque[Block | dict[Key, _Meaning]] = deque()
         self._channels: dict[Key, _Channel] = {}
         self._meanings: dict[Key, _Meaning] = {}
         self._streams: dict[tuple[str, int], _Stream] = {}
@@ -215,9 +228,12 @@ class History:
         if self._thread is not None:
             self._thread.join(5.0)
 
-    def learn(self, facts: Iterable[ChannelFacts]) -> None:
-        """Take the facts of channels whose blocks come from now on: with another meaning a new segment begins."""
-        self._waiting.append(tuple(facts))
+    def learn(self, facts: Iterable[ChannelFacts], raw: Container[Key] = ()) -> None:
+        """Take the facts of channels whose blocks come from now on: with another meaning a new segment begins.
+
+        Channels in ``raw`` have raw numbers alone.
+        """
+        self._waiting.append({known.key: _Meaning.from_facts(known, raw=known.key in raw) for known in facts})
 
     def block(self, block: Block) -> None:
         """Queue samples of a stream; a test pattern is no measurement."""
@@ -242,14 +258,14 @@ class History:
         with self._turn:
             while self._waiting:
                 item = self._waiting.popleft()
-                if isinstance(item, tuple):
-                    self._meanings.update((facts.key, _Meaning.from_facts(facts)) for facts in item)
+                if isinstance(item, dict):
+                    self._meanings.update(item)
                 else:
                     self._put(item)
 
     def _channel(self, key: Key) -> _Channel:
         """Return a channel, in the segment of what its values mean now."""
-        meaning = self._meanings.get(key, _Meaning())
+        meaning = self._meanings.get(key, _NOTHING_KNOWN)
         channel = self._channels.get(key)
         if channel is None:
             channel = self._channels[key] = _Channel(meaning)
@@ -265,6 +281,9 @@ class History:
         self._streams[key] = _Stream(run, block.index + len(block.time))
         valid = np.asarray(block.valid, bool)
         values = np.where(valid, block.value, np.nan)
+        for column, number in enumerate(block.channels):
+            if self._meanings.get((block.uuid, number), _NOTHING_KNOWN).raw:
+                values[:, column] = raw_numbers(block, column)
         for fine in (False, True):
             numbers, starts = _bins_of(at, FINE if fine else 1.0)
             with np.errstate(invalid="ignore"):
@@ -292,9 +311,10 @@ class History:
         """At most ``points`` bins of a channel between two moments (unix seconds; None: an hour ago, now).
 
         ``bin`` is their width in s, ``time`` their beginnings; a bin in which nothing happened is left out. ``low`` and
-        ``high`` are SI values, None where none was valid. The last minute is given in bins of 10 ms if no more is asked
-        for. ``segment`` is the ``id`` of each bin's segment, ``segments`` has the SI ``unit`` of each: values of two
-        segments have different meanings. Raises NotFoundError if nothing of the channel was measured in that hour.
+        ``high`` are SI values, None where none was valid, or raw numbers in a segment that is ``raw`` (no calibration).
+        The last minute is given in bins of 10 ms if no more is asked for. ``segment`` is the ``id`` of each bin's
+        segment, ``segments`` has the SI ``unit`` of each: values of two segments have different meanings. Raises
+        NotFoundError if nothing of the channel was measured in that hour.
         """
         self._take_in()
         end = time.time() if until is None else until
@@ -312,7 +332,7 @@ class History:
             first, last = max(first, bins.newest - bins.size + 1), min(last, bins.newest)
             numbers, low, high, counts = bins.between(first, last)
             segments = bins.segments_of(numbers)
-            known = {int(segment): one.unit(int(segment)) for segment in dict.fromkeys(segments.tolist())}
+            known = [one.described(int(segment)) for segment in dict.fromkeys(segments.tolist())]
             rate = _rate(one.hour)
         each = max(1, -(-(last - first + 1) // max(1, points)))
         if len(numbers) and each > 1:
@@ -332,7 +352,7 @@ class History:
             "invalid": counts[1].tolist(),
             "lost": counts[2].tolist(),
             "segment": segments.tolist(),
-            "segments": [{"id": segment, "unit": unit} for segment, unit in known.items()],
+            "segments": known,
         }
 
 

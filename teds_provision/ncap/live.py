@@ -13,14 +13,14 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.lazy import late
 from teds_provision.measure.sinks.lines import plain
-from teds_provision.ncap.history import History
+from teds_provision.ncap.history import History, raw_numbers
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.teds.channel import TURN
 
@@ -117,6 +117,7 @@ class Live:
         self._channels: dict[Key, _Channel] = {}
         self._last: dict[Key, LastValue] = {}
         self._turning: frozenset[Key] = frozenset()
+        self._raw: frozenset[Key] = frozenset()  # channels without calibration: their raw numbers are given out
         self._listeners: set[LiveClient] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
         self.overrun = 0
@@ -135,10 +136,15 @@ class Live:
                 self.overrun += 1
             self._waiting.append(block)
 
-    def learn(self, facts: Iterable[ChannelFacts]) -> None:
-        """Record facts of channels: no line is drawn from one end of a full turn to the other."""
+    def learn(self, facts: Iterable[ChannelFacts], raw: Container[Key] = ()) -> None:
+        """Record facts of channels: no line is drawn from one end of a full turn to the other.
+
+        Channels in ``raw`` have raw numbers alone.
+        """
         every = list(facts)
-        self.history.learn(every)
+        self.history.learn(every, raw)
+        keys = {known.key for known in every}
+        self._raw = (self._raw - keys) | {key for key in keys if key in raw}
         turning = {facts.key for facts in every if facts.full_turn}
         self._turning = (self._turning - {facts.key for facts in every}) | turning
 
@@ -182,7 +188,11 @@ class Live:
             changed = self._gather(now - before)
             before = now
             if changed:
-                text = json.dumps({"type": "values", "time": time.time(), "channels": changed})
+                names = {f"{uuid}/{number}" for uuid, number in self._raw}
+                raw = {name: points for name, points in changed.items() if name in names}
+                values = {name: points for name, points in changed.items() if name not in raw}
+                message: dict[str, Any] = {"type": "values", "time": time.time(), "channels": values}
+                text = json.dumps({**message, "raw": raw} if raw else message)
                 for listener in self._listeners:
                     listener.values(text)
             if now - told >= _TOLD:
@@ -231,7 +241,10 @@ class Live:
                 key = block.uuid, number
                 one = self._channels.setdefault(key, _Channel())
                 one.times.append(block.time)
-                one.values.append(np.where(block.valid[:, column], block.value[:, column], np.nan))
+                if key in self._raw:
+                    one.values.append(raw_numbers(block, column))
+                else:
+                    one.values.append(np.where(block.valid[:, column], block.value[:, column], np.nan))
                 touched.add(key)
                 value = float(block.value[-1, column]) if block.valid[-1, column] else None
                 self._last[key] = LastValue(value, plain(block.raw[-1:, column].tolist()[0]), float(block.time[-1]))

@@ -725,10 +725,12 @@ class MeasurementSupervisor:
             self._report(running, said)
 
         def facts(said: Sequence[ChannelFacts]) -> None:
-            self._live.learn(said)
+            raw: set[tuple[str, int]] = set()
             for uuid in {fact.uuid for fact in said}:
                 self._directory.show_sheet(uuid, None)
                 self._directory.refresh([uuid])
+                raw |= {(uuid, number) for number in self._directory.raw_only(uuid)}
+            self._live.learn(said, raw)
 
         def sink(failed: Sink) -> None:
             self._live.event("sink", **sink_json(running.kept.id, failed))

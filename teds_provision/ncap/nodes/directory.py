@@ -232,6 +232,10 @@ class NodeDirectory:
         """Return number and name of every channel."""
         return [(channel["number"], channel["name"]) for channel in self._sheet(uuid)]
 
+    def raw_only(self, uuid: str) -> list[int]:
+        """Return the sensors whose raw numbers cannot become values: nobody has calibrated them."""
+        return [channel["number"] for channel in self._sheet(uuid) if channel["problem"]]
+
     def known(self, uuid: str) -> bool:
         """Return True if there is anything to show of a node."""
         with self._lock:

@@ -27,7 +27,15 @@ export function reading(value, channel, uncertainty = channel.uncertainty) {
 export function figure(last, channel) {
   if (!last) return "no value yet";
   if (typeof last.value === "number") return reading(last.value, channel);
-  return channel.problem ? "raw value only" : "not valid";
+  if (!channel.problem) return "not valid";
+  const raw = rawOf(last);
+  return raw === "" ? "raw value only" : `${raw} raw`;
+}
+
+/** The raw value of a channel without calibration, as text; empty if it is not known. */
+function rawOf(last) {
+  if (typeof last.raw === "number") return sign(Number.isInteger(last.raw) ? String(last.raw) : String(Number(last.raw.toPrecision(6))));
+  return typeof last.raw === "string" && last.raw.length <= 16 ? last.raw : "";
 }
 
 /** Why a channel shows no number, for whoever points at it; empty where nothing says so. */

@@ -12,7 +12,11 @@ const LISTS = ["time", "low", "high", "count", "invalid", "lost", "segment"];
 
 /** SI unit of the newest segment of these bins; undefined where there are none. */
 const newestUnit = (bins) => unitOf(bins, bins.segment.at(-1));
-const unitOf = (bins, segment) => bins.segments.find((one) => one.id === segment)?.unit;
+const RAW = "raw"; // in place of the SI unit: numbers of a channel without calibration
+const unitOf = (bins, segment) => {
+  const found = bins.segments.find((one) => one.id === segment);
+  return found?.raw ? RAW : found?.unit;
+};
 
 /** Bins of a channel between two moments, SI; none where nothing was measured. */
 export async function between(uuid, number, from, until, points) {

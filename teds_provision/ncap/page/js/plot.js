@@ -34,6 +34,12 @@ function theme() {
   };
 }
 
+/** A channel as a plot shows it; one without calibration by its raw numbers, in a frame of their own. */
+export function plotted(uuid, channel, label) {
+  const { number, problem } = channel;
+  return problem ? { uuid, number, label, unit: "raw, not calibrated", uncertainty: null, turn: null, problem } : { uuid, number, label, unit: channel.unit ?? "", uncertainty: channel.uncertainty, turn: channel.turn, problem };
+}
+
 /** A panel of moving curves. `channels`: [{uuid, number, label, unit, uncertainty, problem}]. */
 export class LivePlot {
   constructor(channels) {
@@ -207,7 +213,7 @@ export class LivePlot {
       const [end, hour] = [from + columns * width, this.hour(channel)];
       const stretch = this.range ? (this.zoomed.get(`${channel.uuid}/${channel.number}`) ?? hour.bins) : this.window > LIVE ? hour.bins : null;
       const course = stretch ? columnsOf(stretch, from, end, columns, 3 / (hour.bins.rate || 10), hour.unit) : ringOf(channel.uuid, channel.number).bins(from, end, columns, silence);
-      const scale = scaleOf(channel.uuid, channel.number);
+      const scale = channel.problem ? { factor: 1, offset: 0 } : scaleOf(channel.uuid, channel.number);
       return course.map((value) => (typeof value === "number" ? toShown(scale, value) : value)); // null ends a line
     });
     frame.marks = frame.channels.map((channel) => [this.hour(channel).bins, left, right]);

@@ -107,6 +107,6 @@ export function status(wire) {
 /** One message of /live as an event with a name. */
 export function live(message) {
   if (message.type === "event") return message;
-  if (message.type === "values") return { event: "values", channels: message.channels };
+  if (message.type === "values") return { event: "values", channels: message.channels, raw: message.raw ?? {} };
   return { ...message, event: message.type ?? message.event };
 }

@@ -163,7 +163,7 @@ const LISTS = {
 function forgetOtherUnits(node) {
   for (const channel of node.channels ?? []) {
     const before = state.nodes.get(node.uuid)?.channels?.find((one) => one.number === channel.number);
-    if (before && before.scale.si !== channel.scale.si) state.rings.get(keyOf(node.uuid, channel.number))?.clear();
+    if (before && (before.scale.si !== channel.scale.si || Boolean(before.problem) !== Boolean(channel.problem))) state.rings.get(keyOf(node.uuid, channel.number))?.clear();
   }
 }
 
@@ -252,6 +252,7 @@ const TAKERS = {
   dropped: (event) => (state.dropped += event.messages ?? 0),
   values: (event) => {
     for (const [key, [times, values]] of Object.entries(event.channels)) takeStream(key, times, values);
+    for (const [key, [times, values]] of Object.entries(event.raw)) takeStream(key, times, values, true);
   },
   node: (event) => {
     refreshNode(event.uuid);
@@ -284,9 +285,11 @@ const TAKERS = {
   },
 };
 
-function takeStream(key, times, values) {
+/** Points of a channel: values, or `raw` numbers of one without calibration. */
+function takeStream(key, times, values, raw = false) {
   const [uuid, channel] = key.split("/");
   const ring = ringOf(uuid, channel);
+  if (raw !== (state.values.get(key)?.isRaw ?? raw)) ring.clear(); // calibrated meanwhile: other numbers
   for (let index = 0; index < times.length; index++) ring.push(times[index], values[index] ?? NaN);
   state.received += times.length;
   if (!times.length) return;
@@ -294,7 +297,7 @@ function takeStream(key, times, values) {
   const value = values.at(-1);
   const old = state.values.get(key);
   const period = old && time > old.time ? (time - old.time) / times.length : (old?.period ?? 0);
-  state.values.set(key, { value, time, period, valid: value !== null });
+  state.values.set(key, raw ? { value: null, raw: value, time, period, valid: false, isRaw: true } : { value, time, period, valid: value !== null, isRaw: false });
 }
 
 const PLAIN = { factor: 1, offset: 0 };

@@ -3,7 +3,7 @@
 import { change, paths, post, remove } from "../api.js";
 import { button, chip, empty, field, fill, h, icon, keyed, say, text, toast, trouble } from "../dom.js";
 import { byName, channelName, count, nameOf, namesOf, verdict } from "../format.js";
-import { LivePlot } from "../plot.js";
+import { LivePlot, plotted } from "../plot.js";
 import { isOfCommand, measuring, membersOf, on, refresh, state } from "../state.js";
 import { SetPoints } from "./setpoints.js";
 import { plotHead, requireRate, told } from "./values.js";
@@ -262,7 +262,7 @@ class Course {
     const moving = (one) => this.chosen.get(one.key) ?? measuring(one.node.uuid) !== null;
     const shown = all.filter(moving).slice(0, MOST);
     const names = new Set(shown.map((one) => one.node.uuid)).size > 1;
-    this.plot.show(shown.map(({ node, channel }) => ({ uuid: node.uuid, number: channel.number, label: names ? `${nameOf(node)} ${channelName(channel)}` : channelName(channel), unit: channel.unit ?? "", uncertainty: channel.uncertainty, problem: channel.problem })));
+    this.plot.show(shown.map(({ node, channel }) => plotted(node.uuid, channel, names ? `${nameOf(node)} ${channelName(channel)}` : channelName(channel))));
     keyed(this.ticks, all, (one) => one.key, (one) => this.tick(one), (element, one) => {
       element.firstChild.checked = shown.some((each) => each.key === one.key);
       text(element.lastChild, `${nameOf(one.node)}: ${channelName(one.channel)}`);

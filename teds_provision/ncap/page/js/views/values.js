@@ -3,7 +3,7 @@
 import { paths, post, Refusal, remove } from "../api.js";
 import { button, chip, empty, field, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
 import { age, channelName, count, figure as words, hertz, nameOf, range, reading, short, whyNoNumber } from "../format.js";
-import { LivePlot, WINDOWS } from "../plot.js";
+import { LivePlot, plotted, WINDOWS } from "../plot.js";
 import { isOfCommand, isStale, lastOf, measuring, now, on, refresh, state } from "../state.js";
 import { ActuatorPanel } from "./actuator.js";
 import { SetPoints } from "./setpoints.js";
@@ -76,7 +76,7 @@ export class LiveTab {
       fill(this.plotBox, h("h3", {}, "Plot"), h("p", { class: "hint" }, "Press Measure to see live values."));
       return;
     }
-    const shown = channels.slice(0, MOVING).map((channel) => ({ uuid: this.uuid, number: channel.number, label: channelName(channel), unit: channel.unit ?? "", uncertainty: channel.uncertainty, problem: channel.problem }));
+    const shown = channels.slice(0, MOVING).map((channel) => plotted(this.uuid, channel, channelName(channel)));
     if (this.plot) {
       this.plot.show(shown);
       return;
@@ -110,6 +110,7 @@ export class LiveTab {
       element.classList.toggle("stale", stale);
       element.classList.toggle("fresh", !stale);
       if (bar) bar.value = last?.value ?? channel.low;
+      if (bar) bar.hidden = Boolean(channel.problem); // a raw number has no place in the range
     }
   }
 
