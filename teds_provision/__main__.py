@@ -20,10 +20,8 @@ def main() -> None:
         code = command_line.run(sys.argv[1:])
         sys.exit(stdout.ended(code, output, as_json=command_line.wants_json(sys.argv[1:])))
     except ModuleNotFoundError as error:  # click: without it there is no command line that could report it
-        from teds_provision.lazy import install_command, package_of
-
-        cure = install_command(package_of((error.name or "").partition(".")[0]))
-        print(f"Error: The installation is incomplete: {error.name} missing.\n  → Install it: {cure}", file=sys.stderr)
+        cure = f"Install it: {sys.executable} -m pip install {error.name}"
+        print(f"Error: The installation is incomplete: {error.name} missing.\n  → {cure}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:  # while Python was still importing, or already leaving
         sys.exit(130)

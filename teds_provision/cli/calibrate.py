@@ -14,7 +14,7 @@ import click
 from teds_provision import __version__, measure, steps, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
-    ChannelNumber,
+    ChannelName,
     FileToRead,
     WholeNumber,
     command,
@@ -57,7 +57,7 @@ def calibrate() -> None:
     context_settings=_NEGATIVE,
 )
 @click.argument("node", metavar="UUID")
-@click.argument("channel", type=ChannelNumber())
+@click.argument("channel", type=ChannelName())
 @click.option("--value", type=float, metavar="V", help="What the channel should read now (default: 0).")
 @click.option("--unit", metavar="U", help="Unit of V (default: the SI unit of the datasheet).")
 @click.option(
@@ -70,7 +70,7 @@ def calibrate() -> None:
 def zero(
     app: App,
     node: str,
-    channel: int,
+    channel: int | str,
     value: float | None,
     unit: str | None,
     accept_calibration: str | None,
@@ -147,7 +147,7 @@ def _zero_lines(done: ZeroResult, *, dry_run: bool) -> str:
     context_settings=_NEGATIVE,
 )
 @click.argument("node", metavar="UUID")
-@click.argument("channel", type=ChannelNumber())
+@click.argument("channel", type=ChannelName())
 @click.option(
     "--reference", type=float, required=True, metavar="V", help="True value at this moment, from your reference."
 )
@@ -163,7 +163,7 @@ def _zero_lines(done: ZeroResult, *, dry_run: bool) -> str:
 @link_options
 @pass_app
 def capture(
-    app: App, node: str, channel: int, reference: float, unit: str | None, file: Path, links: LinkSettings
+    app: App, node: str, channel: int | str, reference: float, unit: str | None, file: Path, links: LinkSettings
 ) -> None:
     """Take one calibration point from the running sensor.
 

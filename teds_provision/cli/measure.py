@@ -18,7 +18,7 @@ from teds_provision import talk, teds
 from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
-    ChannelNumber,
+    ChannelName,
     FileToRead,
     Number,
     WholeNumber,
@@ -59,7 +59,12 @@ KINDS = ("periodic", "event", "free")
 @click.option("--rate", type=Number(min=0.001), metavar="HZ", help="Samples per second (default: from the datasheet).")
 @click.option("--duration", type=Number(min=0.1), metavar="S", help="Seconds (default: until Ctrl-C).")
 @click.option(
-    "--channel", "channels", type=ChannelNumber(), multiple=True, metavar="N", help="Only this channel; repeatable."
+    "--channel",
+    "channels",
+    type=ChannelName(),
+    multiple=True,
+    metavar="CHANNEL",
+    help="Only this channel, by number or name; repeatable.",
 )
 @click.option("--kind", type=click.Choice(KINDS), help="How the node samples (default: each channel's own kind).")
 @click.option("--trigger", is_flag=True, help="Start all nodes at the same moment, with one frame.")
@@ -135,6 +140,7 @@ def measure(
     sinks = [*files, *ros, *filter(None, [mqtt]), *live]
     if no_scalars:
         sinks = [measure_room.sinks.without_scalars(sink) for sink in sinks]
+    wished["channels"] = _numbers(station, uuids, wished["channels"])
     kept = _asked(group, uuids, sinks, wished | {"require": _requirements(require)})
     if group and duration is None:
         kept = _carried_on(app, station, kept)
@@ -144,6 +150,32 @@ def measure(
     for uuid in uuids:
         station.unlock(uuid)
     _tell_end(app, _run(app, job, links, uuids, duration), job.request.require, file_units)
+
+
+def _numbers(station: Station, uuids: Sequence[bytes], channels: Sequence[int | str]) -> list[int]:
+    """Return the numbers of channels that were chosen by number or name, by the datasheets that the store has.
+
+    Raises BadDataError (no channel of that name), UsageError (it has another number on another node).
+    """
+    numbers: list[int] = []
+    for chosen in channels:
+        if isinstance(chosen, int):
+            numbers.append(chosen)
+            continue
+        found: dict[int, str] = {}
+        for uuid in uuids:
+            image = station.nodes.datasheet(uuid)
+            if image is None:
+                raise UsageError(
+                    f"The channels of node {uuid.hex()} are not known yet, so {chosen!r} cannot be looked up.",
+                    hint=f"Give its number, or read the node first: teds-provision verify {uuid.hex()}",
+                )
+            found.setdefault(teds.sheet.Sheet.from_image(image).chosen(chosen, uuid.hex()).number, uuid.hex())
+        if len(found) > 1:
+            where = ", ".join(f"{number} on {uuid}" for number, uuid in found.items())
+            raise UsageError(f"Channel {chosen!r} has different numbers: {where}.", hint="Measure them one by one.")
+        numbers += found
+    return numbers
 
 
 def _require_streams(links: LinkSettings, *, trigger: bool) -> None:

@@ -9,7 +9,7 @@ import click
 
 from teds_provision import measure, steps, teds
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import COMMAND_SETTINGS, WholeNumber, command, dry_run_option, examples
+from teds_provision.cli.options import COMMAND_SETTINGS, ChannelName, command, dry_run_option, examples
 from teds_provision.errors import NotFoundError, UsageError
 from teds_provision.station.measurements import STATION
 from teds_provision.station.shown_units import channel_profiles
@@ -42,11 +42,11 @@ def list_names(app: App) -> None:
     name="set",
 )
 @click.argument("node", metavar="UUID|station")
-@click.argument("channel", type=WholeNumber(0, 255))
+@click.argument("channel", type=ChannelName(0))
 @click.argument("name")
 @dry_run_option
 @pass_app
-def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> None:
+def set_name(app: App, node: str, channel: int | str, name: str, *, dry_run: bool) -> None:
     """Publish a channel under NAME.
 
     Channel 0 means the node's or station's own part of its topics.
@@ -59,7 +59,7 @@ def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> 
             f"{name!r} is not a valid topic name.",
             hint="Use letters, digits and single _, starting with a letter; / separates the parts of a channel's name.",
         )
-    _require_channel(station, uuid, channel)
+    channel = _require_channel(station, uuid, channel)
     if uuid != STATION:
         topics = measure.sinks.names.Topics(measure.running.measurement_job.station_facts(station))
         topics.learn(facts for _, _, facts in _channels(station))
@@ -71,16 +71,18 @@ def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> 
 
 @command("teds-provision names reset 8d4d 1", name="reset")
 @click.argument("node", metavar="UUID|station")
-@click.argument("channel", type=WholeNumber(0, 255))
+@click.argument("channel", type=ChannelName(0))
 @dry_run_option
 @pass_app
-def reset_name(app: App, node: str, channel: int, *, dry_run: bool) -> None:
+def reset_name(app: App, node: str, channel: int | str, *, dry_run: bool) -> None:
     """Publish a channel under its default name.
 
     Channel 0 means the node's or station's own part of its topics.
     """
     station = app.station()
     uuid = _who(station, node)
+    if isinstance(channel, str):  # a number may be one that the datasheet has no longer
+        channel = _require_channel(station, uuid, channel)
     if not dry_run:
         _change(app, station, uuid, channel, None)
     _print_names(app, station)
@@ -92,11 +94,11 @@ def reset_name(app: App, node: str, channel: int, *, dry_run: bool) -> None:
     name="frame",
 )
 @click.argument("node", metavar="UUID")
-@click.argument("channel", type=WholeNumber(0, 255))
+@click.argument("channel", type=ChannelName(0))
 @click.argument("frame", metavar="FRAME")
 @dry_run_option
 @pass_app
-def set_frame(app: App, node: str, channel: int, frame: str, *, dry_run: bool) -> None:
+def set_frame(app: App, node: str, channel: int | str, frame: str, *, dry_run: bool) -> None:
     """Choose the coordinate frame of a channel for ROS.
 
     Values are published with FRAME as their frame_id; "" restores the profile's.
@@ -109,7 +111,7 @@ def set_frame(app: App, node: str, channel: int, frame: str, *, dry_run: bool) -
         raise UsageError(
             f"{frame!r} is not a valid frame.", hint="Use letters, digits, _ and /, starting with a letter."
         )
-    _require_channel(station, uuid, channel)
+    channel = _require_channel(station, uuid, channel)
     if not dry_run:
         with station.lock("names", app.note), station.transaction():
             station.measurements.set_frame(uuid, channel, frame or None)
@@ -121,11 +123,18 @@ def _who(station: Station, node: str) -> bytes:
     return STATION if node == "station" else station.nodes.resolve(node)
 
 
-def _require_channel(station: Station, uuid: bytes, channel: int) -> None:
-    known = [number for key, number, _ in _channels(station) if key == uuid]
-    if channel and (uuid == STATION or (known and channel not in known)):
-        has = ", ".join(map(str, known)) or "none"
-        raise NotFoundError(f"{uuid.hex()} has no channel {channel}.", hint=f"Channels in its datasheet: {has}.")
+def _require_channel(station: Station, uuid: bytes, channel: int | str) -> int:
+    """Return the number of a channel that was chosen by number or name; raises NotFoundError."""
+    known = {number: facts.name for key, number, facts in _channels(station) if key == uuid}
+    if isinstance(channel, str):
+        alike = [number for number, name in known.items() if name.casefold() == channel.casefold()]
+        if len(alike) == 1:
+            return alike[0]
+    elif not channel or (uuid != STATION and (not known or channel in known)):
+        return channel
+    has = ", ".join(f"{number} ({name})" if name else str(number) for number, name in sorted(known.items())) or "none"
+    which = repr(channel) if isinstance(channel, str) else channel
+    raise NotFoundError(f"{uuid.hex()} has no channel {which}.", hint=f"Channels in its datasheet: {has}.")
 
 
 def _change(app: App, station: Station, uuid: bytes, channel: int, name: str | None) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, date, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 from click.core import ParameterSource
@@ -139,14 +140,24 @@ class Day(click.DateTime):
         return datetime(day.year, day.month, day.day, tzinfo=UTC)
 
 
-class ChannelNumber(WholeNumber):
-    """The number of a TransducerChannel, 1 to 255, with a matching message."""
+class ChannelName(WholeNumber):
+    """A TransducerChannel by its number, from ``least`` to 255, or its name in the datasheet: an int or a str."""
 
     name = "channel"
-    means = "channel number, 1 to 255"
 
-    def __init__(self) -> None:
-        super().__init__(1, 255)
+    def __init__(self, least: int = 1) -> None:
+        super().__init__(least, 255)
+        self.means = f"channel number, {least} to 255, or a channel's name"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Read a number; anything else but a number is a name, which the datasheet resolves."""
+        text = str(value).strip()
+        if text and text.isprintable() and not _NUMBER.fullmatch(text):
+            return text
+        return super().convert(value, param, ctx)
+
+
+_NUMBER: Final = re.compile(r"[-+]?[0-9.]+")
 
 
 class Seconds(Number):

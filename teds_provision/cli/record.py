@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
@@ -15,7 +15,7 @@ from teds_provision import measure as measure_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
     COMMAND_SETTINGS,
-    ChannelNumber,
+    ChannelName,
     FileToRead,
     WholeNumber,
     examples,
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from teds_provision.cli import measure_view, rendering
     from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
     from teds_provision.measure.display_units import FileUnits
-    from teds_provision.measure.recordings.source import Recording
+    from teds_provision.measure.recordings.source import Entry, Recording
     from teds_provision.measure.recordings.summary import RecordingSummary
 else:
     rendering = late("teds_provision.cli.rendering")
@@ -122,16 +122,16 @@ def _local(text: str) -> str:
 @click.option(
     "--channel",
     "channels",
-    type=ChannelNumber(),
+    type=ChannelName(),
     multiple=True,
-    metavar="N",
-    help="Show only this channel; repeatable.",
+    metavar="CHANNEL",
+    help="Show only this channel, by number or name; repeatable.",
 )
 @click.option(
     "--limit", type=WholeNumber(1), metavar="N", help="Show the first N values (default: 20, or all with --json)."
 )
 @pass_app
-def show(app: App, file: Path, channels: tuple[int, ...], limit: int | None) -> None:
+def show(app: App, file: Path, channels: tuple[int | str, ...], limit: int | None) -> None:
     """Show values with time, node and channel, in display units.
 
     With --json the lines are the events of `measure --json` (SI units). The last one, `end`, has the figures of `record
@@ -142,13 +142,23 @@ def show(app: App, file: Path, channels: tuple[int, ...], limit: int | None) -> 
     left: float = limit or (math.inf if app.json else SHOWN)
     for entry in recording.entries():
         summary.add_entry(entry)
-        if left > 0 and (cut := recordings.source.first_instants(entry, channels, left)) is not None:
+        wanted = _wanted(entry, summary, channels)
+        if left > 0 and (cut := recordings.source.first_instants(entry, wanted, left)) is not None:
             left -= len(cut.time)
             app.lines(list(_events(cut, summary) if app.json else _values(cut, summary)))
     if app.json:
         app.emit({"event": "end", **summary.to_json(recording)})
     elif summary.messages > (limit or SHOWN):
         app.note(f"{summary.messages} time stamps in all; use --limit to show more.")
+
+
+def _wanted(entry: Entry, summary: RecordingSummary, channels: Sequence[int | str]) -> set[tuple[str, int]] | None:
+    """Return the channels of an entry that are chosen by number or name; None if all are."""
+    if not channels or not isinstance(entry, measure_room.blocks.Block | measure_room.blocks.GroupRows):
+        return None
+    names = {channel.casefold() if isinstance(channel, str) else channel for channel in channels}
+    known = {key: summary.facts.get(key) for key in entry.keys}
+    return {key for key, facts in known.items() if key[1] in names or (facts and facts.name.casefold() in names)}
 
 
 def _events(shown: Block | GroupRows, summary: RecordingSummary) -> Iterator[str]:

@@ -9,13 +9,13 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from teds_provision import measure, talk
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import ChannelNumber, Number, WholeNumber, command, link_options, said_here
+from teds_provision.cli.options import ChannelName, Number, WholeNumber, command, link_options, said_here
 from teds_provision.cli.rendering import print_table, reporter_for, shown, tidy
 from teds_provision.errors import NodeRefusedError, UsageError
 from teds_provision.links import LinkSettings
@@ -25,6 +25,7 @@ from teds_provision.teds.channel import within_turn
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from teds_provision.measure.held_actuator import AppliedSetPoint
     from teds_provision.measure.sampling import Sample
     from teds_provision.measure.verified_session import VerifiedSession
     from teds_provision.protocol.operation.commands import OperationReply, PowerReply
@@ -81,10 +82,10 @@ def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes, *
     "teds-provision sample 8d4d 1 3 --nfc usb",
 )
 @click.argument("node", metavar="UUID")
-@click.argument("channels", nargs=-1, type=ChannelNumber(), metavar="[CHANNEL …]")
+@click.argument("channels", nargs=-1, type=ChannelName(), metavar="[CHANNEL …]")
 @link_options
 @pass_app
-def sample(app: App, node: str, channels: Sequence[int], links: LinkSettings) -> None:
+def sample(app: App, node: str, channels: Sequence[int | str], links: LinkSettings) -> None:
     """Take one reading, with the datasheet verified and the values calibrated. By default every sensor is read.
 
     If the node has restarted since its datasheet was read, only the Security TEDS is read again ("from": "kept" with
@@ -94,7 +95,7 @@ def sample(app: App, node: str, channels: Sequence[int], links: LinkSettings) ->
     uuid = station.nodes.resolve(node)
     standing = measure.standing.NodeStanding(station, uuid)
     with trusted_node(app, station, links, uuid, by="sample") as trusted:
-        samples = measure.sampling.take_samples(trusted, channels)
+        samples = measure.sampling.take_samples(trusted, [trusted.channel(chosen).number for chosen in channels])
         standing.require()
     origin = "kept" if trusted.kept else "session"
     result = {"uuid": uuid.hex(), "from": origin, "samples": [sample.as_json() for sample in samples]}
@@ -188,12 +189,13 @@ def _mode(console: Console, found: OperationReply, names: dict[int, str], power:
 @command(
     "teds-provision set 91aa 1 0.5 --can socketcan:can0",
     "teds-provision set 91aa 1 45 --unit degree --hold 3 --can socketcan:can0",
+    "teds-provision set hand opening 50 --unit mm --can socketcan:can0",
     "teds-provision set 91aa 1 -0.5 --can socketcan:can0",
     name="set",
     context_settings={"ignore_unknown_options": True},  # -0.5 is a value, and no option
 )
 @click.argument("node", metavar="UUID")
-@click.argument("channel", type=ChannelNumber())
+@click.argument("channel", type=ChannelName())
 @click.argument("value", type=float)
 @click.option("--unit", metavar="U", help="Unit of VALUE (default: the SI unit of the datasheet).")
 @click.option("--hold", type=Number(min=0), metavar="S", help="Seconds to hold the value (default: until Ctrl-C).")
@@ -210,7 +212,7 @@ def _mode(console: Console, found: OperationReply, names: dict[int, str], power:
 def set_value(
     app: App,
     node: str,
-    channel: int,
+    channel: int | str,
     value: float,
     links: LinkSettings,
     unit: str | None,
@@ -237,9 +239,10 @@ def set_value(
         ending(stop),
     ):
         actuator = measure.held_actuator.HeldActuator(trusted, channel, unit=unit, dead_man=dead_man)
-        _require_unit(app, actuator.channel, value, unit)
+        driven = actuator.channel
+        _require_unit(app, driven, value, unit)
         actuator.octets_of(value)  # the limits, before anything is claimed
-        station.audit("set", uuid, "begun", channel=channel, value=value, unit=actuator.unit.text)
+        station.audit("set", uuid, "begun", channel=driven.number, value=value, unit=actuator.unit.text)
         with actuator:
             until = None if hold is None else time.monotonic() + hold
             told = False
@@ -248,20 +251,31 @@ def set_value(
                 applied = actuator.apply(value)
                 if not told:
                     told = True
-                    app.emit({"applied": applied.as_json()}, f"Channel {channel}: {applied.value:g} {applied.unit}")
+                    app.emit({"applied": applied.as_json()}, f"Channel {driven.label}: {_near(driven, applied)}")
                 left = actuator.pause if until is None else min(actuator.pause, until - time.monotonic())
                 if left <= 0 or stop.wait(left):
                     break
-    station.audit("set", uuid, "done", channel=channel, safe=actuator.safe)
+    station.audit("set", uuid, "done", channel=driven.number, safe=actuator.safe)
     safe = actuator.require_confirmation()
     app.emit({"event": "end", "safe": safe}, "safe" if safe else "NOT in its safe state")
+
+
+_ZERO: Final = 1e-9
+"""Part of a channel's range below which a set point is 0 but for rounding."""
+
+
+def _near(channel: Channel, applied: AppliedSetPoint) -> str:
+    """Return a set point for people: one that rounding alone keeps from 0 is 0."""
+    span = max(abs(channel.low), abs(channel.high))
+    zero = math.isfinite(span) and abs(applied.value) < _ZERO * span
+    return f"{0.0 if zero else applied.value:g} {applied.unit}".rstrip()
 
 
 def _require_unit(app: App, channel: Channel, value: float, unit: str | None) -> None:
     """Refuse a bare number if this channel's display unit is not SI: 45 would be radians."""
     if unit is None and app.interactive and channel.shown.text != channel.si_unit:
         raise UsageError(
-            f"Without --unit, {value:g} means {value:g} {channel.si_unit}, but channel {channel.number} is shown in "
+            f"Without --unit, {value:g} means {value:g} {channel.si_unit}, but channel {channel.label} is shown in "
             f"{channel.shown.text}.",
             hint=f"Add --unit {channel.shown.text} or --unit {channel.si_unit}.",
         )

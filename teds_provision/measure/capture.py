@@ -46,7 +46,7 @@ def capture_at(
     station: Station,
     links: LinkSettings,
     node: str,
-    number: int,
+    chosen: int | str,
     reference: float,
     file: Path,
     reporter: Reporter,
@@ -54,7 +54,7 @@ def capture_at(
     unit: str | None = None,
     shown_unit_asked: bool = False,
 ) -> CaptureResult:
-    """Add a point to a file: channel ``number`` of ``node`` gives its raw value at ``reference``.
+    """Add a point to a file: the ``chosen`` channel of ``node`` gives its raw value at ``reference``.
 
     Another station's claim on the sensor does not matter: several may measure it. Raises PolicyError (too restless, at
     the wrap of its raw values, a file of another node), BadDataError (unit, channel, file), NotFoundError (folder).
@@ -69,10 +69,10 @@ def capture_at(
     ):
         try:
             trusted = open_trusted(station, visit.node, by=_NAME)
-            channel = trusted.channel(number)
+            channel = trusted.channel(chosen)
             si = reference_for(channel, reference, unit, shown_unit_asked=shown_unit_asked)
             with steps.step("read") as step:
-                point = _point(take_samples_of(trusted, number), si)
+                point = _point(take_samples_of(trusted, channel.number), si)
                 step.detail = f"raw {point.raw:.8g}, {point.count} samples"
         except SessionLostError as lost:
             raise lost.cause from lost

@@ -51,24 +51,32 @@ def unit_for(channel: Channel, text: str | None) -> WrittenUnit:
     if unit.units != channel.units:
         words = " or ".join(dict.fromkeys((channel.shown.text, channel.unit.text, channel.si_unit)))
         raise BadDataError(
-            f"{text} is not a unit for channel {channel.number}, whose values are in {channel.si_unit}.",
+            f"{text} is not a unit for channel {channel.label}, whose values are in {channel.si_unit}.",
             hint=f"Use {words}.",
         )
     return unit
+
+
+def _actuators_of(trusted: VerifiedSession) -> str:
+    found = ", ".join(channel.label for channel in trusted.sheet.channels if channel.actuator)
+    return f"Its actuators: {found}." if found else "It has no actuator."
 
 
 class HeldActuator:
     """One claimed actuator: ``with HeldActuator(…) as hand: hand.apply(value)`` again and again; let go at the end."""
 
     def __init__(
-        self, trusted: VerifiedSession, number: int, *, unit: str | None = None, dead_man: int = DEAD_MAN
+        self, trusted: VerifiedSession, chosen: int | str, *, unit: str | None = None, dead_man: int = DEAD_MAN
     ) -> None:
-        channel = trusted.channel(number)
+        channel = trusted.channel(chosen)
         if not channel.actuator:
-            raise BadDataError(f"Channel {number} of node {trusted.uuid} is not an actuator.")
+            raise BadDataError(
+                f"Channel {channel.label} of node {trusted.uuid} is a sensor, not an actuator.",
+                hint=_actuators_of(trusted),
+            )
         self.unit = unit_for(channel, unit)
         self.channel, self._verified, self._dead_man = channel, trusted, dead_man
-        self._interpreter = ChannelInterpreter(trusted.sheet, number)
+        self._interpreter = ChannelInterpreter(trusted.sheet, channel.number)
         if self._interpreter.problem:
             raise BadDataError(self._interpreter.problem)
         self.safe: bool | None = None

@@ -63,7 +63,7 @@ def take_samples_of(
     """
     channel = trusted.channel(number)
     if channel.actuator:
-        raise BadDataError(f"Channel {number} of node {trusted.uuid} is an actuator, not a sensor.")
+        raise BadDataError(f"Channel {channel.label} of node {trusted.uuid} is an actuator, not a sensor.")
     one = ChannelInterpreter(trusted.sheet, number)
     readers = {number: one} | {other: ChannelInterpreter(trusted.sheet, other) for other in one.others}
     width = sum(reader.octets for reader in readers.values())

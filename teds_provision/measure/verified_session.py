@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
-from teds_provision.errors import BadDataError, PolicyError
+from teds_provision.errors import PolicyError
 from teds_provision.links.ports import TimestampedLink
 from teds_provision.measure.blocks import ChannelFacts, Kind
 from teds_provision.measure.clock import ClockMap, Exchange
@@ -131,13 +131,9 @@ class VerifiedSession:
         frame = self.frames.get(channel.number) or self.frames.get(0) or (of_type.frame if of_type else "")
         return replace(known, siblings=siblings, frame=frame, deviation=_deviation(of_type, channel))
 
-    def channel(self, number: int) -> Channel:
-        """Return a channel of the datasheet; raises BadDataError if there is none."""
-        found = self.sheet.channel(number)
-        if found is None:
-            numbers = ", ".join(str(channel.number) for channel in self.sheet.channels) or "none"
-            raise BadDataError(f"Node {self.uuid} has no channel {number}; its datasheet has {numbers}.")
-        return found
+    def channel(self, channel: int | str) -> Channel:
+        """Return a channel of the datasheet by its number or name; raises BadDataError if there is none."""
+        return self.sheet.chosen(channel, self.uuid)
 
 
 def open_trusted(station: Station, node: Conversation, *, by: str, unsigned: bool = False) -> VerifiedSession:

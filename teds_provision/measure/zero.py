@@ -57,7 +57,7 @@ class ZeroOrder:
     ``accept_calibration`` is the reason given for a result that the guard would refuse.
     """
 
-    channel: int
+    channel: int | str
     value: float | None = None
     unit: str | None = None
     shown_unit_asked: bool = False
@@ -187,7 +187,7 @@ class _ZeroRun:
                 said = unit_for(channel, order.unit) if order.unit is not None else channel.shown
                 asked, low, high = (format_value(number, said) for number in (si, channel.low, channel.high))
                 raise PolicyError(
-                    f"{asked} exceeds the limits of channel {channel.number}, {low} to {high}.",
+                    f"{asked} exceeds the limits of channel {channel.label}, {low} to {high}.",
                     hint="Limits come from the signed datasheet and cannot be exceeded.",
                 )
         return own.unit.from_si(si)
@@ -248,16 +248,16 @@ def _require_nobody_else(trusted: VerifiedSession) -> None:
         )
 
 
-def _adjustable(trusted: VerifiedSession, number: int) -> tuple[Channel, Calibration]:
+def _adjustable(trusted: VerifiedSession, chosen: int | str) -> tuple[Channel, Calibration]:
     """Return a sensor and its calibration; raises PolicyError if it has no adjustable offset."""
-    channel = trusted.channel(number)
+    channel = trusted.channel(chosen)
     if channel.actuator:
-        raise BadDataError(f"Channel {number} of node {trusted.uuid} is an actuator, not a sensor.")
+        raise BadDataError(f"Channel {channel.label} of node {trusted.uuid} is an actuator, not a sensor.")
     own = channel.calibration
     if own is None:
         why = channel.calibration_problem or "it has none."
         raise PolicyError(
-            f"Channel {number} has no calibration with an offset that can be changed: {why}",
+            f"Channel {channel.label} has no calibration with an offset that can be changed: {why}",
             hint="Calibrate it first: calibrate capture, then provision with --calibration FILE.",
         )
     return channel, own

@@ -141,6 +141,11 @@ class Channel:
     value_table: Mapping[int, str] = field(default_factory=dict)
 
     @property
+    def label(self) -> str:
+        """``2 (opening)``, or the number alone of a channel without a name."""
+        return f"{self.number} ({self.name})" if self.name else str(self.number)
+
+    @property
     def actuator(self) -> bool:
         """True for an actuator; everything else gives values."""
         return self.kind is ChannelKind.ACTUATOR

@@ -125,6 +125,22 @@ class Sheet:
         found = [channel for channel in self.channels if channel.name == name]
         return found[0] if len(found) == 1 else None
 
+    def chosen(self, channel: int | str, node: str) -> Channel:
+        """Return the channel that a person chose by number or name; ``node`` names the node in errors.
+
+        Case counts only if two names differ by it. Raises BadDataError with the channels that there are.
+        """
+        if isinstance(channel, int):
+            found = self.channel(channel)
+        else:
+            alike = [one for one in self.channels if one.name.casefold() == channel.casefold()]
+            found = self.named(channel) or (alike[0] if len(alike) == 1 else None)
+        if found is None:
+            known = ", ".join(f"{one.number} ({one.name})" if one.name else str(one.number) for one in self.channels)
+            which = channel if isinstance(channel, int) else repr(channel)
+            raise BadDataError(f"Node {node} has no channel {which}; its datasheet has {known or 'none'}.")
+        return found
+
     @property
     def errors(self) -> tuple[SheetFinding, ...]:
         """Findings of severity error."""

@@ -30,17 +30,18 @@ def test_what_is_wrong_is_said_and_what_to_do(hall: Hall, tmp_path: Path) -> Non
     cases = [
         (("measure", g, "--mqtt", "http://x"), 2, "is not a broker URL"),
         (("measure", g, "--mqtt", "mqtt://me:secret@x"), 2, "password-file"),
-        (("measure", g, "--channel", "y"), 2, "not a channel number"),
+        (("measure", g, "--channel", "y"), 8, "has no channel 'y'"),
         (("measure", g, "--channel", "1", "--duration", "1"), 8, "is not a sensor"),
         (("measure", g, "--to", "run.xyz"), 2, ".csv"),
         (("measure", g, "--to", tmp_path / "no" / "run.csv", "--duration", "1"), 3, "its folder is not there"),
         (("measure", g, "--require", nothing), 8, "asks for nothing"),
-        (("set", g, "x", "1"), 2, "not a channel number"),
+        (("set", g, "x", "1"), 8, "3 (grip force)"),
         (("set", g, "1", "-0.5"), 6, "exceeds the limits"),  # a value, and no option
         (("set", g, "1", "0.05", "--hodl", "3"), 2, "--hodl"),
-        (("set", g, "2", "1", "--hold", "0.1"), 8, "not an actuator"),
+        (("set", g, "2", "1", "--hold", "0.1"), 8, "is a sensor, not an actuator"),
         (("set", g, "1", "1", "--unit", "kelvin"), 8, "not a unit for channel 1"),
-        (("sample", g, "x"), 2, "not a channel number"),
+        (("sample", g, "x"), 8, "has no channel 'x'"),
+        (("sample", g, "256"), 2, "not a channel number"),
     ]
     wrong = []
     for words, code, text in cases:

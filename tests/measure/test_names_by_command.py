@@ -42,6 +42,11 @@ def test_topics_are_listed_chosen_and_made_again(hall: Hall) -> None:
     assert topics(hall) == chosen
     for words in ((a, 1), (g, 0), ("station", 0)):
         hall.station.ask("names", "reset", *words)
+    hall.station.ask("names", "set", g, "grip force", "hand/force")
+    assert topics(hall)[g, 3] == "/hand/force"
+    hall.station.ask("names", "reset", g, "Grip Force")
+    said = hall.station.refuses("names", "set", g, "torque", "x", code=3)
+    assert said["hint"].startswith("Channels in its datasheet: 1 (opening set point), 2 (opening)")
     assert made.items() <= topics(hall).items()
 
 
@@ -61,6 +66,31 @@ def test_frames_are_listed_chosen_and_taken_back(hall: Hall) -> None:
     assert frame_of(hall, a) is None
     hall.station.refuses("names", "frame", a, 1, "no frame", code=2)
     hall.station.refuses("names", "frame", a, 9, "tip", code=3)
+
+
+def test_a_channel_is_chosen_by_name_wherever_it_is_by_number(hall: Hall, tmp_path: Path) -> None:
+    """By the name in the signed datasheet; a name that is none lists those that are."""
+    g, bus, file = hall.nodes["g"], ["--can", hall.can], tmp_path / "run.csv"
+    g.start()
+    (opening,) = hall.station.ask("sample", "g", "opening", *bus)["samples"]
+    assert (opening["channel"], opening["name"]) == (2, "opening")
+    driven = hall.station.run("set", "g", "Opening set point", 0, "--hold", 0, *bus)
+    assert driven.code == 0, driven
+    assert driven.out.startswith("Channel 1 (opening set point): 0 m\n")
+    said = hall.station.refuses("set", "g", "opening", 0.05, "--hold", 0, *bus, code=8)
+    assert "Channel 2 (opening)" in said["message"]
+    assert said["hint"] == "Its actuators: 1 (opening set point)."
+    said = hall.station.refuses("sample", "g", "openning", *bus, code=8)
+    assert "2 (opening), 3 (grip force)" in said["message"]
+    said = hall.station.refuses("set", "g", "1", 99, "--hold", 0, *bus, code=6)
+    assert "channel 1 (opening set point)" in said["message"]
+    hall.station.refuses("measure", "g", "--channel", "torque", "--duration", 1, *bus, code=8)
+    ended = hall.station.run("measure", "g", "--channel", "grip force", "--duration", "0.3", "--to", file, *bus)
+    assert ended.code == 0, ended
+    shown = hall.station.run("record", "show", file, "--channel", "grip force", "--limit", 3)
+    assert shown.out.count("grip force") == 3
+    assert hall.station.run("record", "show", file, "--channel", "opening").out == ""
+    g.kill()
 
 
 def test_what_cannot_be_a_topic_is_refused(hall: Hall) -> None:

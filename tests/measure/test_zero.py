@@ -157,7 +157,7 @@ def test_limits_are_kept_and_the_guard_is_in_force(hall: Hall) -> None:
     load.turn("force", 8_388_608 + 2000)
     assert "exceeds the limits" in hall.ask("calibrate", "zero", "load", 1, "--value", 501, code=6)["error"]["message"]
     kilo = hall.ask("calibrate", "zero", "load", 1, "--value", 0.6, "--unit", "kN", code=6)["error"]["message"]
-    assert kilo == "0.6 kN exceeds the limits of channel 1, -0.5 kN to 0.5 kN."
+    assert kilo == "0.6 kN exceeds the limits of channel 1 (force), -0.5 kN to 0.5 kN."
     small = hall.ask("calibrate", "zero", "load", 1)
     assert small["before"] == pytest.approx(2000 / 8_388_608 * 998, abs=1e-3)
     assert small["after"] == pytest.approx(0, abs=1e-3)

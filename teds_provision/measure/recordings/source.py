@@ -90,11 +90,11 @@ class Recording(ABC):
         self.facts[facts.key] = facts
 
 
-def first_instants(entry: Entry, channels: Collection[int], most: float) -> Block | GroupRows | None:
-    """Return the first ``most`` instants of these channels (all if empty); None if the entry has none of them."""
+def first_instants(entry: Entry, channels: Collection[tuple[str, int]] | None, most: float) -> Block | GroupRows | None:
+    """Return the first ``most`` instants of these channels (None: all); None if the entry has none of them."""
     if not isinstance(entry, Block | GroupRows):
         return None
-    kept = [column for column, (_, number) in enumerate(entry.keys) if not channels or number in channels]
+    kept = [column for column, key in enumerate(entry.keys) if channels is None or key in channels]
     if not kept:
         return None
     n = int(min(most, len(entry.time)))

@@ -233,7 +233,7 @@ class ChannelInterpreter:
         unit = told or self.channel.shown
         asked, *ends = (unit.from_si(self.unit.to_si(number)) for number in (value, low, high))
         text = f"{min(ends):.6g} to {max(ends):.6g} {unit.text}".strip()
-        return f"{asked:.6g} {unit.text} exceeds the limits of channel {self.channel.number}, {text}."
+        return f"{asked:.6g} {unit.text} exceeds the limits of channel {self.channel.label}, {text}."
 
     @property
     def accepted(self) -> Range:
