@@ -41,7 +41,7 @@ def test_what_is_wrong_is_said_and_what_to_do(hall: Hall, tmp_path: Path) -> Non
         (("set", g, "2", "1", "--hold", "0.1"), 8, "is a sensor, not an actuator"),
         (("set", g, "1", "1", "--unit", "kelvin"), 8, "not a unit for channel 1"),
         (("sample", g, "x"), 8, "has no channel 'x'"),
-        (("sample", g, "256"), 2, "not a channel number"),
+        (("sample", g, "256"), 2, "not in the range 1<=x<=255"),
     ]
     wrong = []
     for words, code, text in cases:
