@@ -10,7 +10,7 @@ from teds_provision import handover, plant, steps, talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, links_given, yes_option
 from teds_provision.cli.rendering import reporter_for
-from teds_provision.errors import LinkError, PolicyError
+from teds_provision.errors import FrozenError, LinkError, PolicyError
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
@@ -146,12 +146,19 @@ def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, forc
         with (
             talk.meeting.meet(station, links, uuid, reporter_for(app)) as node,
             station.node_lock(uuid),
-            station.released(uuid, "reset"),
+            station.released(uuid, "reset") as released,
         ):
+            undone = "It was not reset and stays in service."
+            steps.sign.require_not_measured(station, node, released=bool(released), undone=undone)
             return steps.agree.reset_node(station, node, steps.identify.identify(station, node))
     except (LinkError, PolicyError) as error:
+        if isinstance(error, FrozenError) or talk.conversation.is_busy(error):
+            raise  # it answers: once it is free it signs its reset, and --force would record less than can be had
         if not force and not app.interactive:
-            error.hint = "Bring the node within reach, or add --force to record it as unconfirmed."
+            first = "Bring the node within reach" if isinstance(error, LinkError) else error.hint.rstrip(".")
+            error.hint = (
+                f"{first}, or add --force to record it as unconfirmed." if first else "Add --force: unconfirmed."
+            )
             raise
         app.note(f"Cannot reset the node: {error.message}")
         app.confirm("Take it out of service anyway, unconfirmed?", yes=force)

@@ -11,8 +11,9 @@ from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import BadDataError, NotFoundError, StoreChangedError, StoreError, VaultError
 from teds_provision.files import read_text
 from teds_provision.limits import LIMITS, load_toml
+from teds_provision.station.node_keys import deferred_until
 from teds_provision.station.station import Station
-from teds_provision.station.store import Store
+from teds_provision.station.store import Store, utc_now
 from teds_provision.station.store.database import has_store
 
 _SHOWN: Final = 5
@@ -93,12 +94,22 @@ def nodes(system: System) -> Iterator[Finding]:
         return
     with Store.open(system.home) as opened:
         tally = opened.tally(datetime.now(UTC).strftime("%Y-%m-%d"))
+        marks = opened.all_key_flags()
+    begins = {uuid: deferred_until(mark.rotation or "") or "" for uuid, mark in marks.items()}
+    later = tuple(uuid for uuid in tally.rotations if begins.get(uuid, "") > utc_now())
+    own = tuple(uuid for uuid in tally.rotations if uuid not in later)
+    first = min((begins[uuid] for uuid in later), default="")
     told = [
         (tally.overdue, "with an expired calibration", "teds-provision nodes --due 0"),
         (tally.twice, "with a name that another node has", "Give them different names: build UUID --name, sign, write"),
         (tally.drafts, "with a datasheet that was built but not written", "teds-provision draft list"),
         (tally.unverified, "keyed but never verified", "teds-provision verify UUID"),
-        (tally.rotations, "whose key must be rotated", "Open a session once: teds-provision verify UUID"),
+        (own, "whose key must be rotated", "Open a session once: teds-provision verify UUID"),
+        (
+            later,
+            "whose key another holder rotates first",
+            f"Wait for its copy; verify UUID does it from {first} on",
+        ),
     ]
     for uuids, what, fix in told:
         if uuids:

@@ -46,6 +46,11 @@ def deferred(begins: datetime, why: str) -> str:
     return f"{_FROM}{begins:%Y-%m-%dT%H:%M:%SZ}: {why}"
 
 
+def deferred_until(why: str) -> str | None:
+    """Return when this station does a rotation that another one is to do first; None for its own rotation."""
+    return why[len(_FROM) :].partition("Z")[0] + "Z" if why.startswith(_FROM) else None
+
+
 @dataclass(frozen=True)
 class NodeKey:
     """One unwrapped link key that this station holds for a node."""
@@ -332,9 +337,8 @@ class NodeKeys:
         False while another station is due to do so before.
         """
         why = self.rotation_due(uuid)
-        if why is None or not why.startswith(_FROM):
-            return why is not None
-        return utc_now() >= why[len(_FROM) :].partition("Z")[0] + "Z"
+        begins = None if why is None else deferred_until(why)
+        return why is not None and (begins is None or utc_now() >= begins)
 
     def rotations_due(self) -> dict[bytes, str]:
         """Why a rotation is due, for every node that has one."""

@@ -160,7 +160,9 @@ def sign(
     return SignResult(made, number, reused=False)
 
 
-def require_not_measured(station: Station, node: Conversation, *, released: bool = False) -> None:
+def require_not_measured(
+    station: Station, node: Conversation, *, released: bool = False, undone: str = "Nothing was signed or written."
+) -> None:
     """Raise FrozenError if a command of this station measures the node: it would refuse what is about to be signed.
 
     ``released``: the running `ncap` measured the node and let it go. A write at the reader ends the claims of sensors.
@@ -168,7 +170,7 @@ def require_not_measured(station: Station, node: Conversation, *, released: bool
     holder = None if released or node.tapped else station.measurements.holder(node.uuid)
     if holder is not None:
         raise FrozenError(
-            f"Node {node.uuid.hex()} is being measured by {holder}. Nothing was signed or written.",
+            f"Node {node.uuid.hex()} is being measured by {holder}. {undone}",
             hint="End that measurement first.",
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -84,6 +85,23 @@ def test_a_node_that_is_not_met_stays_pending(yard: Yard) -> None:
     again = yard.done("south", "import-keys", bundle, "--yes", "--prove", *yard.bus)
     assert again["proven"] == [node.uuid]
     assert node.flash["epoch"] == 1
+
+
+def test_a_node_that_a_measurement_holds_is_not_taken_out_of_service(yard: Yard) -> None:
+    """It answers: neither is it out of reach, nor is anything recorded as unconfirmed, --force or not."""
+    node = yard.node("node", type_=PROFILE)
+    yard.done("north", "provision", "--profile", PROFILE, "--yes", *yard.bus)
+    words = ("measure", node.uuid, "--rate", "5", *yard.bus)
+    running = yard.desk.start("--home", yard.homes["north"], "--json", *words, passphrase=PASSPHRASE)
+    running.wait_for('"data"')
+    for more in ([], ["--force"]):
+        said = yard.run("north", "decommission", node.uuid, "--yes", *more, *yard.bus)
+        assert (said.code, said.json["error"]["code"]) == (6, "frozen"), said
+        assert "stays in service" in said.json["error"]["message"]
+        assert said.json["error"]["hint"] == "End that measurement first."
+    running.signal(signal.SIGINT)
+    assert running.end().code == 0
+    assert yard.done("north", "decommission", node.uuid, "--yes", *yard.bus)["confirmed"] is True
 
 
 def test_out_of_service_with_the_nodes_own_receipt(yard: Yard) -> None:

@@ -10,6 +10,7 @@ import tomllib
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
+from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from teds_provision.doctor.links import READERS
 from teds_provision.doctor.station import holds_private_key
 from teds_provision.lazy import REQUIRED, install_command
 from teds_provision.protocol.keys import SoftwareKey, to_pem
+from teds_provision.station.node_keys import deferred
 from teds_provision.station.store import (
     Draft,
     KeyFlags,
@@ -459,12 +461,17 @@ def test_what_waits_for_somebody_is_told(stationed: System) -> None:
             store.put_node(NodeRecord(bytes([number]) * 10, name="same" if number else "other", due="2020-01-01"))
         store.put_draft(Draft(bytes(10), Image(bytes(10), {(0, 1): b"x"})))
         store.add_key(KeyRecord(bytes(10), 1, "ab" * 8, "active", 1, b"wrapped"))
-        store.put_key_flags({b"\1" * 10: KeyFlags(rotation="restored")})
-    said = [finding.why for finding in look(stationed, "nodes")]
+        later = deferred(datetime(2099, 1, 1, tzinfo=UTC), "station lost was removed")
+        store.put_key_flags({b"\1" * 10: KeyFlags(rotation="restored"), b"\2" * 10: KeyFlags(rotation=later)})
+    found = look(stationed, "nodes")
+    said = [finding.why for finding in found]
     counts = [why.split()[0] for why in said]
-    assert counts == ["3", "2", "1", "1", "1"]
-    for why, word in zip(said, ("expired", "name", "not written", "never verified", "rotated"), strict=True):
+    assert counts == ["3", "2", "1", "1", "1", "1"]
+    words = ("expired", "name", "not written", "never verified", "must be rotated", "another holder rotates first")
+    for why, word in zip(said, words, strict=True):
         assert word in why
+    assert found[-2].fix.startswith("Open a session once")
+    assert "2099-01-01T00:00:00Z" in found[-1].fix  # a session today would change nothing
 
 
 def test_seals_are_checked_where_the_passphrase_is_given(stationed: System) -> None:
