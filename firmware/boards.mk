@@ -5,7 +5,8 @@
 BOARDS := loadcell_hx711 gripper_servo
 STANDIN := port/zephyr/standin
 OF_ZEPHYR := -DTEDS_SHA256_OCTETS=256 -DCONFIG_TEDS_NODE=1 -DCONFIG_TEDS_NODE_CAN=1 \
-  -DCONFIG_TEDS_NODE_STACK=8192 -DCONFIG_TEDS_NODE_PRIORITY=7 -DCONFIG_TEDS_NODE_DRIFT=50
+  -DCONFIG_TEDS_NODE_STACK=8192 -DCONFIG_TEDS_NODE_PRIORITY=7 -DCONFIG_TEDS_NODE_DRIFT=50 \
+  -DCONFIG_GPIO=1 '-DCONFIG_BOARD_TARGET="standin"' '-DCONFIG_TEDS_NODE_APPLICATION="board"'
 
 .PHONY: boards
 boards: $(BOARDS:%=$(BUILD)/boards/%)
@@ -17,7 +18,7 @@ FD_gripper_servo := -DTEDS_CAN_FD=1 -DCONFIG_TEDS_NODE_CAN_FD=1
 $(BUILD)/boards/%: $(SOURCES) $(HEADERS) port/psa/teds_psa.c $(wildcard port/zephyr/*.[ch] $(STANDIN)/*.c $(STANDIN)/zephyr/*/*.h boards/*/src/*.[ch])
 	@mkdir -p $(@D)
 	$(CC) $(WARNINGS) $(LEVEL) -g -pthread $(OF_ZEPHYR) $(FD_$*) -Iinclude -Isrc -Iport/psa -Iport/zephyr -Iport/posix -I$(STANDIN) \
-	  $(SOURCES) port/psa/teds_psa.c port/zephyr/node_thread.c port/zephyr/flash.c port/zephyr/can_bus.c \
+	  $(SOURCES) port/psa/teds_psa.c port/zephyr/node_thread.c port/zephyr/flash.c port/zephyr/firmware.c port/zephyr/can_bus.c \
 	  $(wildcard boards/$*/src/*.c) $(wildcard $(STANDIN)/*.c) \
 	  port/posix/bus.c port/posix/multicast.c port/posix/socketcand.c port/posix/pacing.c port/posix/flash_file.c \
 	  -o $@.new -lmbedcrypto -lm

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,11 @@ import pytest
 
 from teds_provision.links.can.bus import Bus
 from teds_provision.links.can.isotp import FUNCTIONAL, Frame, single
+from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import parse_spec
-from teds_provision.protocol.messages.frames import IDENTIFY
+from teds_provision.protocol.announce import Announce
+from teds_provision.protocol.messages.firmware import ABOUT, FirmwareFlag, FirmwareReport
+from teds_provision.protocol.messages.frames import IDENTIFY, Function, decode_reply, security_command
 from tests.bench import make_station
 from tests.e2e.desk import Desk, Running, Station
 from tests.firmware import builds
@@ -228,3 +232,30 @@ def test_native_sim_has_the_nodes_partitions_and_its_can() -> None:
     places = [(int(at, 16), int(octets, 16)) for at, octets in re.findall(r"reg = <(0x\w+) (0x\w+)>", overlay)]
     assert [octets >= 4096 + 256 for _, octets in places[1:]] == [True, True]
     assert all(at + octets <= more for (at, octets), (more, _) in pairwise(places))
+
+
+def test_a_board_reports_what_runs_and_shows_which_one_it_is(desk: Desk) -> None:
+    """By its LED and its button: aliases of the devicetree."""
+    board = powered(desk, LOAD, 6)
+    with closing(Bus(parse_spec(desk.links.can))) as bus:
+        address = until(lambda: _pressed(board, bus))
+    with closing(CanPort(desk.links.can)) as port:
+        link = port.link(address)
+        report = FirmwareReport.decode(decode_reply(link.exchange(ABOUT.encode())).payload)
+        assert (report.text, report.image) == ("standin/board", None)
+        assert report.flags == FirmwareFlag.LOCATE, "without MCUboot there is no update"
+        for seconds in (60, 0):
+            assert decode_reply(link.exchange(security_command(Function.LOCATE, bytes([seconds])).encode())).ok
+    assert board.wait_for_lines(3)[1:] == [{"led": True}, {"led": False}]
+
+
+def _pressed(board: Running, bus: Bus) -> int | None:
+    """Press the button and let it go; the address that announces it, None if a busy machine held it too long."""
+    for _ in range(2):
+        board.process.send_signal(signal.SIGUSR2)
+        time.sleep(0.1)
+    while (frame := bus.receive(1.1)) is not None:  # a second press counts after a second
+        said = Announce.decode(frame.identifier, frame.data)
+        if said is not None and said.pressed:
+            return said.address
+    return None

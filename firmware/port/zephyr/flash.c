@@ -22,6 +22,21 @@ BUILD_ASSERT(APART(storage_partition, teds_identity) && APART(storage_partition,
              "the node's partitions overlap storage_partition");
 #endif
 
+/* A boot loader writes its slots and its scratch area as it likes: the first update would take the identity away. */
+#define OF_THE_NODE_APART(other) (APART(other, teds_identity) && APART(other, teds_slot_a) && APART(other, teds_slot_b))
+#if PARTITION_EXISTS(boot_partition)
+BUILD_ASSERT(OF_THE_NODE_APART(boot_partition), "the node's partitions overlap boot_partition");
+#endif
+#if PARTITION_EXISTS(slot0_partition)
+BUILD_ASSERT(OF_THE_NODE_APART(slot0_partition), "the node's partitions overlap slot0_partition");
+#endif
+#if PARTITION_EXISTS(slot1_partition)
+BUILD_ASSERT(OF_THE_NODE_APART(slot1_partition), "the node's partitions overlap slot1_partition");
+#endif
+#if PARTITION_EXISTS(scratch_partition)
+BUILD_ASSERT(OF_THE_NODE_APART(scratch_partition), "the node's partitions overlap scratch_partition");
+#endif
+
 static const struct flash_area *areas[3];
 
 static int port_erase(void *user, int area)

@@ -17,7 +17,7 @@ static struct k_thread thread;
 static K_SEM_DEFINE(woken, 0, 1);
 static K_SEM_DEFINE(begun, 0, 1);
 static int begin_failed;
-static atomic_t by_hand = ATOMIC_INIT(0);
+static atomic_t by_hand = ATOMIC_INIT(0), pressed = ATOMIC_INIT(0);
 static teds_node node;
 
 #define SECOND 1000000000u
@@ -50,6 +50,12 @@ void teds_zephyr_wake(void)
 void teds_zephyr_reset_by_hand(void)
 {
     atomic_set(&by_hand, 1);
+    teds_zephyr_wake();
+}
+
+void teds_zephyr_pressed(void)
+{
+    atomic_set(&pressed, 1);
     teds_zephyr_wake();
 }
 
@@ -128,6 +134,7 @@ static int begin(const teds_zephyr_board *board)
     port->step = SECOND / CONFIG_SYS_CLOCK_TICKS_PER_SEC;
 #endif
     port->drift = CONFIG_TEDS_NODE_DRIFT;
+    teds_zephyr_firmware(port);
     if (failed == 0 && teds_psa_fill(port, true) != 0) {
         failed = TEDS_E_CRYPTO;
     }
@@ -160,6 +167,11 @@ static void run(void *board, void *two, void *three)
     (void)two;
     (void)three;
     begin_failed = begin(board);
+#ifdef CONFIG_TEDS_MANAGE
+    if (begin_failed != 0 && teds_zephyr_on_trial()) {
+        teds_zephyr_restart(); /* which reverts it */
+    }
+#endif
     k_sem_give(&begun);
     while (begin_failed == 0) {
         bool moved = bus_work();
@@ -173,6 +185,12 @@ static void run(void *board, void *two, void *three)
         if (atomic_cas(&by_hand, 1, 0)) {
             (void)teds_node_reset_by_hand(&node);
         }
+        if (atomic_cas(&pressed, 1, 0)) {
+            teds_can_pressed(&node, teds_zephyr_now());
+        }
+#ifdef CONFIG_TEDS_MANAGE
+        teds_zephyr_feed();
+#endif
         due = teds_node_poll(&node, teds_zephyr_now());
         moved = bus_work() || moved;
         if (moved || (due > teds_zephyr_now() + IDLE && teds_idle_work(&node))) {

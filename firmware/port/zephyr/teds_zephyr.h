@@ -30,6 +30,10 @@ uint64_t teds_zephyr_now(void);
 /** A pad was held for five seconds: the effect of Reset, soon, on the node's thread. Also from an interrupt. */
 void teds_zephyr_reset_by_hand(void);
 
+/** A button was released that was held for 50 ms to 2 s: the board announces itself, soon, on the node's thread. Also from an
+ * interrupt. The devicetree alias teds-button does it by itself. */
+void teds_zephyr_pressed(void);
+
 /** teds_sensor_event, and wake the node's thread. From an interrupt or a thread. */
 void teds_zephyr_event(uint8_t channel, uint64_t tick, const uint8_t *octets, bool valid);
 
@@ -40,6 +44,12 @@ uint32_t teds_zephyr_dropped(void);
 /* -- between the files of this port ---------------------------------------------------------------------------------- */
 
 int teds_zephyr_flash(teds_port *port);
+void teds_zephyr_firmware(teds_port *port);
+#ifdef CONFIG_TEDS_MANAGE
+void teds_zephyr_feed(void);
+bool teds_zephyr_on_trial(void);
+void teds_zephyr_restart(void);
+#endif
 int teds_zephyr_can_start(void);
 /* Give the node what came and the controller what may leave; true if something moved. */
 bool teds_zephyr_can_work(teds_node *node);

@@ -3,6 +3,7 @@
  * voltages. One JSON line when the bus is up, one for each change of the servo.
  *
  *   TEDS_FLASH  file of the flash      TEDS_CAN  bus, as --can
+ *   SIGUSR1     turns the reset pad, SIGUSR2 the button (teds-button)
  *   TEDS_CHIP   number of the chip     TEDS_RAW  what the HX711 converts: 24 bits, two's complement
  */
 #define _GNU_SOURCE
@@ -237,10 +238,21 @@ static void turn_pad(int signal)
     pad = !pad;
 }
 
+/* The button: SIGUSR2 presses it or lets it go. */
+static volatile sig_atomic_t button;
+static struct gpio_callback *on_button;
+
+static void turn_button(int signal)
+{
+    (void)signal;
+    button = !button;
+    on_button->handler(&standin_gpio, on_button, 1);
+}
+
 int gpio_pin_configure_dt(const struct gpio_dt_spec *spec, gpio_flags_t extra_flags)
 {
     (void)extra_flags;
-    if (spec->pin == STANDIN_reset_gpios) {
+    if (spec->pin == STANDIN_zephyr_user_reset_gpios) {
         pad = getenv("TEDS_PAD") != NULL;
         (void)signal(SIGUSR1, turn_pad);
     }
@@ -249,16 +261,52 @@ int gpio_pin_configure_dt(const struct gpio_dt_spec *spec, gpio_flags_t extra_fl
 
 int gpio_pin_get_dt(const struct gpio_dt_spec *spec)
 {
-    return spec->pin == STANDIN_hx711_data_gpios ? hx711_data() : spec->pin == STANDIN_reset_gpios ? (int)pad : 0;
+    switch (spec->pin) {
+    case STANDIN_zephyr_user_hx711_data_gpios: return hx711_data();
+    case STANDIN_zephyr_user_reset_gpios: return (int)pad;
+    case STANDIN_teds_button_gpios: return (int)button;
+    default: return 0;
+    }
+}
+
+void gpio_init_callback(struct gpio_callback *callback, gpio_callback_handler_t handler, gpio_port_pins_t pin_mask)
+{
+    (void)pin_mask;
+    callback->handler = handler;
+}
+
+int gpio_add_callback_dt(const struct gpio_dt_spec *spec, struct gpio_callback *callback)
+{
+    (void)spec;
+    on_button = callback;
+    return 0;
+}
+
+int gpio_pin_interrupt_configure_dt(const struct gpio_dt_spec *spec, gpio_flags_t flags)
+{
+    (void)spec;
+    (void)flags;
+    (void)signal(SIGUSR2, turn_button);
+    return 0;
+}
+
+/* The LED: a line when it goes on or off for Locate, none for each blink. */
+int gpio_pin_toggle_dt(const struct gpio_dt_spec *spec)
+{
+    (void)spec;
+    return 0;
 }
 
 int gpio_pin_set_dt(const struct gpio_dt_spec *spec, int value)
 {
-    if (spec->pin == STANDIN_hx711_clock_gpios) {
+    if (spec->pin == STANDIN_zephyr_user_hx711_clock_gpios) {
         hx711_clock(value != 0);
-    } else if (spec->pin == STANDIN_supply_gpios && powered != (value != 0)) {
+    } else if (spec->pin == STANDIN_zephyr_user_supply_gpios && powered != (value != 0)) {
         powered = value != 0;
         tell();
+    } else if (spec->pin == STANDIN_teds_led_gpios) {
+        (void)printf("{\"led\": %s}\n", value != 0 ? "true" : "false");
+        (void)fflush(stdout);
     }
     return 0;
 }
