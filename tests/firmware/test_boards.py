@@ -195,11 +195,13 @@ def test_what_zephyr_needs_lies_beside_each_board(name: str) -> None:
     ours = [line.split("=")[0] for line in (folder / "prj.conf").read_text().splitlines() if "TEDS_NODE" in line]
     assert ours
     assert all(f"config {option.removeprefix('CONFIG_')}\n" in kconfig for option in ours)
-    overlay = (folder / "nucleo_g474re.overlay").read_text()
-    assert all(f"{label}: partition@" in overlay for label in ("teds_identity", "teds_slot_a", "teds_slot_b"))
-    places = [(int(at, 16), int(octets, 16)) for at, octets in re.findall(r"reg = <(0x\w+) (0x\w+)>;\n\t\t};", overlay)]
+    assert '#include "../nucleo_g474re_partitions.dtsi"' in (folder / "nucleo_g474re.overlay").read_text()
+    overlay = (folder.parent / "nucleo_g474re_partitions.dtsi").read_text()
+    labels = ("slot1_partition", "teds_identity", "teds_slot_a", "teds_slot_b")
+    assert all(f"{label}: partition@" in overlay for label in labels)
+    places = [(int(at, 16), int(octets, 16)) for at, octets in re.findall(r"reg = <(0x\w+) (0x\w+)>;", overlay)]
     ends = [at + octets for at, octets in places]
-    assert len(places) == 3
+    assert len(places) == 5, "both images of MCUboot before the node's own"
     assert all(at % 0x800 == 0 and octets % 0x800 == 0 for at, octets in places), "whole pages"
     assert all(end <= begin for end, (begin, _) in zip(ends, places[1:], strict=False)), "none in another's place"
     assert ends[-1] <= 0x7E800, "there the board's storage_partition begins, which holds the identity key"

@@ -5,7 +5,7 @@
  * filled is looked at after each step (holds_together).
  *
  * The first octet of an input says where it goes: CAN frames (length, then id and data), whole commands, a reader, a
- * session that measures, a connection. With
+ * session that measures, a connection, packets of Manage. With
  * -DTEDS_FUZZ_ALONE it is a program that runs the files named to it, for machines without libFuzzer. */
 #include "inside.h"
 #include "memory.h"
@@ -421,14 +421,113 @@ static void measures(memory_board *own, const uint8_t *octets, size_t length, bo
     leave(own, air);
 }
 
+/* -- packets of Manage -------------------------------------------------------------------------------------------------- */
+
+static memory_board *managed;
+static uint8_t flags, bent; /* of About; how the manager's answer is bent, 0: not */
+
+/* What reaches the manager is on the list and as long as it says, whatever came; then it is the host port's own server. */
+static size_t manager(char what, unsigned argument, uint8_t *packet, size_t length, size_t room)
+{
+    static const uint8_t listed[][3] = {{8, 0, 6}, {8, 0, 8}, {8, 1, 0}, {8, 1, 6}, {10, 0, 0}, {10, 1, 0}, {10, 1, 1}};
+    bool found = false;
+    (void)argument;
+    if (what == 'a') {
+        packet[0] = flags;
+        return 41;
+    }
+    if (what != 'm') {
+        return 0;
+    }
+    for (size_t i = 0; i < sizeof listed / sizeof listed[0]; i++) {
+        found = found || (packet[0] == listed[i][0] && packet[4] == 0 && packet[5] == listed[i][1] && packet[7] == listed[i][2]);
+    }
+    if (!found || packet[1] != 0 || teds_get16(packet + 2) != length - 8 || length < 9) {
+        abort();
+    }
+    length = images_manage(&managed->images, packet, length, packet, room);
+    if (bent != 0 && length > 8) {
+        packet[8u + bent % (length - 8)] ^= bent;
+    }
+    return bent == 0xFF ? room + 1 : length;
+}
+
+/* Steps: what (a whole packet; the body of a listed one; a time; flags and failures), how much. */
+static void manages(memory_board *own, const uint8_t *octets, size_t length)
+{
+    static const uint8_t about[] = {0, 0, TEDS_CLASS_SECURITY, TEDS_ABOUT, 0, 0};
+    static const uint8_t heads[8][3] = {{8, 0, 6}, {8, 0, 8}, {8, 1, 0}, {8, 1, 6}, {10, 0, 0}, {10, 0, 5}, {10, 1, 0}, {10, 1, 1}};
+    uint8_t open[6 + 89] = {0, 0, TEDS_CLASS_SECURITY, TEDS_OPEN, 0, 89}, command[256];
+    uint64_t now = 1000000;
+    uint32_t counter = 0;
+    managed = own;
+    flags = TEDS_FIRMWARE_SIGNED;
+    bent = 0;
+    memory_at(own, now);
+    (void)memory_images(own, about, sizeof about, false);
+    memory_firmware(own, manager, 0);
+    memset(open + 14, 7, 65);
+    open[14] = 4;
+    one_command(own, open, sizeof open, false);
+    inner(own, ++counter, about, sizeof about, false);
+    while (length >= 2) {
+        const uint8_t what = octets[0];
+        size_t count = octets[1];
+        uint8_t *copy;
+        octets += 2;
+        length -= 2;
+        count = count < 240 ? count : 240;
+        copy = piece(&octets, &length, &count);
+        memset(command, 0, 14);
+        command[2] = TEDS_CLASS_SECURITY;
+        command[3] = TEDS_MANAGE;
+        switch (what & 3) {
+        case 0:
+            memcpy(command + 6, copy, count);
+            break;
+        case 1:
+            command[6] = heads[what >> 2 & 7][0];
+            teds_put16(command + 8, (uint16_t)count);
+            command[11] = heads[what >> 2 & 7][1];
+            command[13] = heads[what >> 2 & 7][2];
+            memcpy(command + 14, copy, count);
+            count += 8;
+            break;
+        case 2:
+            now += (uint64_t)count << (what >> 2 & 31);
+            memory_at(own, now);
+            (void)memory_poll(own);
+            break;
+        default:
+            flags = (uint8_t)(TEDS_FIRMWARE_SIGNED | (what >> 2 & 3) << 2);
+            bent = count > 0 ? copy[0] : 0;
+            memory_fails(own, (what >> 4 & 1) != 0);
+            inner(own, ++counter, about, sizeof about, false);
+            break;
+        }
+        free(copy);
+        if ((what & 3) < 2) {
+            teds_put16(command + 4, (uint16_t)count);
+            inner(own, ++counter, command, 6 + count, false);
+        }
+        memory_reply_left(own, 0xF1);
+        holds_together(own);
+        if (own->node.managed.upload_of != NULL && !own->node.managed.upload_of->used) {
+            abort();
+        }
+    }
+}
+
 int LLVMFuzzerTestOneInput(const uint8_t *octets, size_t length)
 {
     memory_board *own;
     if (length < 2) {
         return 0;
     }
-    own = board((octets[0] & 10) != 0);
-    if (octets[0] & 8) {
+    own = board((octets[0] & 0x2A) != 0);
+    if (octets[0] & 0x20) {
+        manages(own, octets + 1, length - 1);
+    } else if (octets[0] & 8) {
         measures(own, octets + 1, length - 1, (octets[0] & 16) != 0);
     } else if (octets[0] & 4) {
         taps(own, octets + 1, length - 1);
