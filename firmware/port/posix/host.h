@@ -35,6 +35,12 @@ int host_flash_open(host_flash *flash, const char *path);
 int host_flash_erase(host_flash *flash, int area);
 int host_flash_write(host_flash *flash, int area, uint32_t at, const uint8_t *octets, size_t length);
 int host_flash_read(const host_flash *flash, int area, uint32_t at, uint8_t *out, size_t length);
+/* Count a step; true if it is the one at which the power fails. And that end of the process. */
+bool host_flash_fails(host_flash *flash);
+void host_flash_end(void);
+
+/* -- image_file.c: the same for images ------------------------------------------------------------------------------ */
+
 /* Open or make the files of the images in `folder`, and put `image` into the first slot if both are blank, as a programmer
  * would (NULL: not); 0, or -1 with errno. Each step of theirs counts as one of flash, too. */
 int host_flash_images(host_flash *flash, const char *folder, const char *image, images_flash *out);

@@ -189,6 +189,48 @@ void board_sleep(uint64_t until)
     (void)until;
 }
 
+/* -- firmware: each of these may be left out (NULL) ----------------------------------------------------------------- */
+
+/* Describe what runs. With MCUboot: version and SHA256 TLV from the header and TLVs of the running slot, on trial if its
+ * image-ok flag is not set, TEDS_FIRMWARE_SIGNED only if the boot loader checks a signature. `text` is board/application. */
+static void about(void *user, teds_firmware *out)
+{
+    (void)user;
+    out->major = 1;
+    out->text = "template/blank";
+}
+
+/* Blink an LED from a timer while `seconds` is not 0; the node calls it with 0 when the time is over. */
+static void locate(void *user, uint8_t seconds)
+{
+    (void)user;
+    (void)seconds;
+}
+
+/* Answer one SMP packet: hand it to an SMP server over two slots of flash. Read all of `packet` before you write to `out`,
+ * which shares its memory. Called only if TEDS_MANAGED is 1 and `about` says TEDS_FIRMWARE_SIGNED. */
+static size_t manage(void *user, const uint8_t *packet, size_t length, uint8_t *out, size_t room)
+{
+    (void)user;
+    (void)packet;
+    (void)length;
+    (void)out;
+    (void)room;
+    return 0;
+}
+
+/* Reset the chip: NVIC_SystemReset(). */
+static void restart(void *user)
+{
+    (void)user;
+}
+
+/* True once when a button was released that was held for 50 ms to 2 s. */
+bool board_was_pressed(void)
+{
+    return false;
+}
+
 /* -- start --------------------------------------------------------------------------------------------------------- */
 
 /* Start clocks and peripherals, then fill in port and configuration. */
@@ -220,6 +262,11 @@ int board_start(teds_port *port, teds_config *config)
     port->safe = safe;
     port->arm = arm;
     port->kick = kick;
+    port->about = about;
+    port->locate = locate;
+    port->manage = manage;
+    port->manage_octets = 0; /* as long as a sealed command holds; or what the SMP server's buffer holds */
+    port->restart = restart;
     own.crypto.random = draw;
     return teds_bearssl_fill(port, &own.crypto);
 }

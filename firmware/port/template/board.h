@@ -21,6 +21,9 @@ void board_send(const teds_can_frame *frame);
 /* True once after the controller went off the bus; it has been restarted. */
 bool board_was_bus_off(void);
 
+/* True once when a button was pressed for a short time. */
+bool board_was_pressed(void);
+
 /* True once when the reset button was held for 5 s. */
 bool board_reset_was_held(void);
 

@@ -24,6 +24,9 @@ int main(void)
             teds_node_bus_off(&node);
             teds_can_start(&node, board_now());
         }
+        if (board_was_pressed()) {
+            teds_can_pressed(&node, board_now());
+        }
         if (board_reset_was_held()) {
             (void)teds_node_reset_by_hand(&node);
         }
