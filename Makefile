@@ -132,6 +132,7 @@ fuzz: .venv-fuzz/.ready
 # backups of 100,000 nodes; an hour and a half, or all (FULL=1).
 faults: $(VENV)/.dev
 	$(BIN)/python -m tests.faults.bench $(if $(FULL),--full,--minutes 60)
+	$(BIN)/python -m pytest -q -m soak tests/steps/test_update.py
 	$(BIN)/pytest -q -m "soak or not soak" tests/plant/test_cut.py tests/plant/test_line_cut.py \
 	  tests/plant/test_server_faults.py
 

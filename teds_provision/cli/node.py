@@ -495,11 +495,11 @@ def _servers(
     if air is not None:
         servers.append(air)
     if nfc:
-        servers.append(
-            nfc_room.server.NfcServer(
-                nfc, nodes[0], tag=tag, pace=pace, wt_int=wait_time // 4 * 4, extras=_extras(nodes[0], air)
-            )
+        reader = nfc_room.server.NfcServer(
+            nfc, nodes[0], tag=tag, pace=pace, wt_int=wait_time // 4 * 4, extras=_extras(nodes[0], air)
         )
+        nodes[0].when_restarted(reader.restarted)
+        servers.append(reader)
     if can:
         bus = can_room.server.CanServer(can, tell=app.warn)
         for node in nodes:
@@ -515,6 +515,7 @@ def _servers(
 def _in_the_air(controller: str, node: VirtualNode) -> BleServer:
     address = ble_room.address.StaticAddress(node.flash_file.path.parent, factory=node.in_factory_state())
     server = ble_room.server.BleServer(controller, node, address)
+    node.when_restarted(server.restarted)
     node.streams_over(server.send_data, ble_room.peripheral.BUS)
     return server
 

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import click
 
-from teds_provision import plant, station, teds
+from teds_provision import firmware_image, plant, station, teds
 from teds_provision import steps as steps_room
 from teds_provision.cli.build import calibration_json, order_options
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, said_here, yes_option
 from teds_provision.cli.rendering import firmware_words, print_table, reporter_for
-from teds_provision.errors import NotWhitelistedError, TedsProvisionError, UsageError
+from teds_provision.errors import NotWhitelistedError, TedsProvisionError, UsageError, WrongImageError
 from teds_provision.links import LinkSettings
 from teds_provision.sanitize import sanitize
 from teds_provision.talk.progress import Reporter, StepResult
@@ -29,7 +29,9 @@ from teds_provision.talk.progress import Reporter, StepResult
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from teds_provision.firmware_image import FirmwareImage
     from teds_provision.links import Notice
+    from teds_provision.station.station import Station
     from teds_provision.station.summary import NodeSummary
     from teds_provision.steps.adoption import FactoryDatasheet
     from teds_provision.steps.batch import BatchRun, ProvisionPlan, ProvisionRequest, Questions
@@ -99,6 +101,10 @@ _CHANGES_SHOWN = 20
 )
 @click.option("--scan", is_flag=True, help="Read scanned labels from stdin: the next board must be the one scanned.")
 @click.option("--evidence", is_flag=True, help="Keep signed evidence of each board; see: evidence export.")
+@click.option("--firmware", type=FileToRead(), metavar="IMAGE", help="Install this firmware first; see: update.")
+@click.option(
+    "--firmware-key", type=FileToRead(), metavar="PEM", help="Owner's key: check the image's signature first."
+)
 @click.option(
     "--operator",
     metavar="NAME",
@@ -125,6 +131,8 @@ def provision(
     label_format: str,
     scan: bool,
     evidence: bool,
+    firmware: Path | None,
+    firmware_key: Path | None,
     operator: str | None,
     yes: bool,
     dry_run: bool,
@@ -165,6 +173,14 @@ def provision(
             "--calibrations, --operator, --files, --only, --label-to and --scan require a job.",
             hint="Add --job FILE, or --evidence.",
         )
+    if firmware is not None or firmware_key is not None:
+        if firmware is None or dry_run or request.several or line is not None:
+            raise UsageError(
+                "--firmware installs an image on one board; --firmware-key goes with it.",
+                hint="For many boards: agree, update --match EXPR IMAGE, provision. For a plan: update --dry-run.",
+            )
+        image = firmware_image.load_firmware_image(firmware, firmware_key)
+        request = replace(request, node=_with_firmware(app, base, links, uuid, image, reporter, yes=yes))
     boards = steps_room.batch.BatchRun(base, links, request, reporter, line=line)
     for warning in boards.warnings:
         app.warn(warning)
@@ -180,6 +196,36 @@ def provision(
             _many(app, boards, questions, screen, totals=everything or batch is not None or job is not None)
     else:
         _one(app, boards, _questions(app, yes))
+
+
+def _with_firmware(
+    app: App,
+    base: Station,
+    links: LinkSettings,
+    node: str | None,
+    image: FirmwareImage,
+    reporter: Reporter,
+    *,
+    yes: bool,
+) -> str:
+    """Key the one board, install firmware on it, and return its UUID."""
+    questions = _questions(app, yes)
+    uuid = steps_room.commands.key_board_at(
+        base, links, node, reporter, accept=questions.accept, take_over=questions.take_over
+    )
+    update = steps_room.update
+    order, onward = update.UpdateOrder(image), links.after_agreeing()
+    plan = update.plan_update(base, onward, uuid, order, reporter)
+    if plan.question:
+        if not app.interactive or not app.ask_yes_no(f"{plan.question} Install it all the same?"):
+            raise WrongImageError(plan.question, hint=f"update {uuid.hex()} IMAGE --other-board, then provision.")
+        order = replace(order, other_board=True)
+    if plan.stage != "nothing":
+        app.confirm(f"Install {image.version_text} on board {uuid.hex()}?", yes=yes)
+        for done in update.update_boards(base, onward, [(uuid, order)], lambda _uuid: reporter):
+            if done.error is not None:
+                raise done.error
+    return uuid.hex()
 
 
 def _check_line(request: ProvisionRequest, job: str | None, only: str | None) -> None:

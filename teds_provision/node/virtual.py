@@ -48,6 +48,8 @@ _EVENTS: Final = 0.005
 _SIMULATION_WAITS: Final = 0.5
 _TRIAL_SECONDS: Final = 600.0
 """An image that was not confirmed by then has failed: the board restarts, and the boot loader reverts it."""
+_READER_SECONDS: Final = 0.5
+"""Time for a reader to take the reply to a restart."""
 _log = logging.getLogger(__name__)
 
 SendData = Callable[[DataFrame], None]
@@ -254,7 +256,12 @@ class VirtualNode:
 
     def request(self, link: str, frame: bytes, *, tapped: bool) -> bytes:
         """Run one command frame; see NodeHandler."""
-        return self.request_received(link, frame, tapped=tapped, received=self.tick())
+        reply = self.request_received(link, frame, tapped=tapped, received=self.tick())
+        if self.tim.restarts_after(link):  # a reader takes the reply by itself: nothing reports that it has left
+            timer = threading.Timer(_READER_SECONDS, self.reply_left, (link,))
+            timer.daemon = True
+            timer.start()
+        return reply
 
     def request_received(
         self,

@@ -33,12 +33,20 @@ from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.firmware import KnownFirmware, firmware_of
 from teds_provision.station.station import Station
 from teds_provision.station.store import DatasheetRecord, Draft
-from teds_provision.steps.agree import AgreeResult, ResetReceipt, agree, open_session, require_session, reset_node
+from teds_provision.steps.agree import (
+    AgreeResult,
+    ResetReceipt,
+    TakeOver,
+    agree,
+    open_session,
+    require_session,
+    reset_node,
+)
 from teds_provision.steps.board_type import Retype, differences, is_remembered, require_board_type, shown_by
 from teds_provision.steps.build import guard, own_name, require_free_name
 from teds_provision.steps.firmware import keep_firmware, locate, read_firmware
 from teds_provision.steps.identify import IdentifiedNode, describe, identify
-from teds_provision.steps.provision import add_to_whitelist
+from teds_provision.steps.provision import Accept, add_to_whitelist, key_board
 from teds_provision.steps.readings import keep
 from teds_provision.steps.sign import SignResult, known_image, known_node_keys, require_not_measured, sign
 from teds_provision.steps.teds_read import read_identity, read_image, take_snapshot
@@ -240,6 +248,21 @@ def _identified(station: Station, node: Conversation, add: bool) -> ProvenNode:
     ble = node.contact.ble.text if node.contact.ble else None
     runs = firmware_of(station, who.uuid, firmware)
     return ProvenNode(who, node.identity, entry is not None, described.channels, name, charging, ble, runs)
+
+
+def key_board_at(
+    station: Station,
+    links: LinkSettings,
+    node: str | None,
+    reporter: Reporter,
+    *,
+    accept: Accept,
+    take_over: TakeOver | None = None,
+) -> bytes:
+    """Identify, whitelist and key the board that ``node`` names (None: the one that is there); return its UUID."""
+    wanted = None if node is None else station.nodes.resolve(node)
+    with meet(station, links, wanted, reporter, before=station.unlock) as there:
+        return key_board(station, there, accept=accept, reporter=reporter, take_over=take_over).uuid
 
 
 # -- agree, address ----------------------------------------------------------------------------------------------------

@@ -199,7 +199,7 @@ class ImageManager:
                 hint="The board still runs its present firmware. Check that the image fits its slot.",
             )
         try:
-            return kind.loads(octets)
+            loaded = kind.loads(octets)
         except (ValueError, AssertionError, TypeError) as error:  # pydantic's errors are ValueErrors
             raise _no_reply(doing, "it lacks what belongs there") from error
         except Exception as error:
@@ -208,6 +208,9 @@ class ImageManager:
             if not isinstance(error, SMPException):
                 raise
             raise _no_reply(doing, "it lacks what belongs there") from error
+        if not _is_same(values, loaded.model_dump(include=set(values))):
+            raise _no_reply(doing, "a value is of another type")
+        return loaded
 
     def _exchange(self, packet: bytes, doing: str) -> bytes:
         """Send one packet; a busy board is asked again for a while."""
@@ -219,6 +222,15 @@ class ImageManager:
                 if refusal.reason != Reason.BUSY or time.monotonic() >= until:
                     raise
             time.sleep(_BUSY_PAUSE)
+
+
+def _is_same(came: object, loaded: object) -> bool:
+    """Return True if what smp loaded is what came: it takes the text "9" for the number."""
+    if isinstance(came, dict):
+        return isinstance(loaded, dict) and all(_is_same(value, loaded.get(key)) for key, value in came.items())
+    if isinstance(came, list):
+        return isinstance(loaded, list) and len(came) == len(loaded) and all(map(_is_same, came, loaded))
+    return (isinstance(loaded, type(came)) and isinstance(came, bool) == isinstance(loaded, bool)) and came == loaded
 
 
 def _error_text(failed: object) -> str:

@@ -227,6 +227,21 @@ def provision(
         raise
 
 
+def key_board(
+    station: Station, node: Conversation, *, accept: Accept, reporter: Reporter, take_over: TakeOver | None = None
+) -> IdentifiedNode:
+    """Identify, whitelist and agree, as :func:`provision` begins, for a board that gets new firmware before the rest.
+
+    ``accept`` and ``take_over`` are asked as there.
+    """
+    order, low = BuildOrder(), wait_for_charge
+    run = _Run(
+        station, node, order, accept, no_confirmation, reporter, None, low, take_over, None, None, refuse_adoption
+    )
+    with station.node_lock(node.uuid), station.released(node.uuid, "provision"), station.run():
+        return run.keyed()
+
+
 class _Run:
     def __init__(
         self,
@@ -268,6 +283,12 @@ class _Run:
                 self.unit.failed(self.node, who, self.steps.done, self.steps.current, cause)
             raise
         return done
+
+    def keyed(self) -> IdentifiedNode:
+        """Only identify, whitelist and agree."""
+        who = self._identify()
+        self._agree(who, self._whitelist(who))
+        return who
 
     def run(self, who: IdentifiedNode) -> ProvisionResult:
         prepared = self._prepared(who)

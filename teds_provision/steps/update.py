@@ -29,13 +29,15 @@ from teds_provision.errors import (
 from teds_provision.firmware_image import FirmwareImage, version_text
 from teds_provision.links import LinkSettings, open_port
 from teds_provision.links.ports import Port
-from teds_provision.protocol.messages.firmware import ABOUT, FirmwareFlag, FirmwareReport
-from teds_provision.protocol.messages.frames import Function, Reason, security_command
+from teds_provision.protocol.messages.firmware import FirmwareFlag, FirmwareReport
+from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.commands import OPERATION, ChannelState, OperationReply
+from teds_provision.station.firmware import FirmwareReading
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import open_session, require_session, unknown_key
 from teds_provision.steps.board_type import require_working_hardware
+from teds_provision.steps.firmware import keep_firmware, read_firmware
 from teds_provision.steps.identify import identify, prove
 from teds_provision.steps.image_manager import ImageManager
 from teds_provision.steps.sign import require_not_measured
@@ -51,6 +53,8 @@ _SAME_POWER_UP: Final = 1 << 32
 """c of Open grows by less than this between two restarts (profile.md, "Sessions")."""
 _MEET_SECONDS: Final = 2.0
 _PAUSE: Final = 0.2
+_RESTART_SECONDS: Final = 3.0
+"""Seconds in which a board has restarted after its reply; then it is asked once more."""
 
 Result = Literal["updated", "already", "reverted", "refused", "lost"]
 RESULTS: Final[tuple[Result, ...]] = ("updated", "already", "reverted", "refused", "lost")
@@ -167,15 +171,9 @@ def _at_port(
 
 def read_about(node: Conversation) -> FirmwareReport | None:
     """Read About in the open session; None for a node that does not report its firmware."""
-    try:
-        return FirmwareReport.decode(node.request_idempotent(ABOUT, "to report its firmware"))
-    except NodeRefusedError as refusal:
-        if refusal.reason != Reason.UNKNOWN_COMMAND:
-            raise
-    except GarbledError:
-        if not node.lives():
-            raise
-    return None
+    node.reported_firmware = None  # it changes within the session
+    reading = read_firmware(node)
+    return None if reading is None else reading.report
 
 
 def version_of(report: FirmwareReport) -> str:
@@ -251,6 +249,7 @@ class _Update:
             require_not_measured(self._station, node, released=released)
             report, stage = self._look(node)
             if stage == "nothing":
+                self._keep(report)
                 return "already"
             if stage != "prove":
                 if self._mismatch(report) and not self._order.other_board:
@@ -397,6 +396,12 @@ class _Update:
         report = read_about(node)
         if report is None or report.image != self._digest or FirmwareFlag.ON_TRIAL in report.flags:
             raise GarbledError("The board did not keep the new image.")
+        self._keep(report)
+
+    def _keep(self, report: FirmwareReport) -> None:
+        """Record the firmware that was reported in the session."""
+        with self._station.durable("update"):
+            keep_firmware(self._station, self._uuid, FirmwareReading(report, sealed=True))
 
     # -- there and back --------------------------------------------------------------------------------------------
 
@@ -442,6 +447,7 @@ class _Update:
         """Wait until c of a session shows the restart, and yield that session; a board that did not is asked again."""
         self._reporter.started("restart")
         until, asked_again = time.monotonic() + self._order.wait, False
+        restarts_by = time.monotonic() + _RESTART_SECONDS
         with ExitStack() as stack:
             while True:
                 left = until - time.monotonic()
@@ -457,11 +463,15 @@ class _Update:
                     continue
                 if not _same_power_up(before.c, node.open_counter):
                     break
-                if asked_again:
-                    raise PolicyError("The board does not restart.", hint="Switch it off and on, then run this again.")
-                asked_again = True
-                ImageManager(node).restart()
+                if time.monotonic() >= restarts_by:
+                    if asked_again:
+                        raise PolicyError(
+                            "The board does not restart.", hint="Switch it off and on, then run this again."
+                        )
+                    asked_again, restarts_by = True, time.monotonic() + _RESTART_SECONDS
+                    ImageManager(node).restart()
                 stack.close()
+                time.sleep(_PAUSE)
             yield node
 
     @contextmanager

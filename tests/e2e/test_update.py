@@ -178,3 +178,29 @@ def test_many_boards_at_once_and_one_that_takes_no_firmware(desk: Desk, owner: O
     asked = station.run("update", boards[0].uuid, owner.image("1.9.0"), *over)
     assert asked.code == 6
     assert "--yes" in asked.err
+
+
+def test_provision_installs_the_firmware_first(desk: Desk, owner: Owner) -> None:
+    station, node = desk.station(), board(desk, owner)
+    over = desk.links.over("can")
+    words = ("--firmware", owner.new, "--firmware-key", owner.public)
+    assert (
+        station.refuses("provision", "--firmware", owner.new, "--all", *PROVISIONED, *over, code=2)["code"] == "usage"
+    )
+    done = station.provision("can", *PROVISIONED, *words)
+    assert done["verdict"] == "authentic"
+    assert done["firmware"]["version"] == "1.1.0"
+    (known,) = station.ask("nodes", node.uuid)["nodes"]
+    assert (known["firmware"]["version"], known["firmware"]["state"]) == ("1.1.0", "unjudged")
+    (line,), _ = update(station, node.uuid, owner.new)
+    assert line["result"] == "already"
+
+
+def test_update_over_nfc_says_that_it_is_slow(desk: Desk, owner: Owner) -> None:
+    station = desk.station()
+    node = desk.node(firmware=(owner.old, owner.key)).start()
+    station.provision("nfc", *PROVISIONED)
+    done = station.run("update", node.uuid, owner.new, "--yes", *desk.links.over("nfc"))
+    assert done.code == 0, done
+    assert "this link is slow" in done.err
+    assert "1.0.0 → 1.1.0  updated" in done.out

@@ -7,17 +7,21 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import cbor2
 import pytest
 
 from teds_provision.errors import (
     BoardLostError,
     DowngradeError,
     NodeSilentError,
+    NotAuthenticError,
     PolicyError,
     RevertedError,
     WrongImageError,
 )
 from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.messages.frames import Function, Reason, refusal, security_command
+from teds_provision.protocol.messages.smp import UPLOAD, SmpPacket, decode_packet
 from teds_provision.station.station import Station
 from teds_provision.teds.image import SECURITY
 from tests.bench import PASSPHRASE
@@ -264,3 +268,121 @@ def test_an_update_resumes_after_an_interruption_at_any_exchange(
 ) -> None:
     for at in range(1, exchanges_of(owner, tmp_path) + 1):
         interrupted(owner, tmp_path / str(at), interruption, at)
+
+
+# -- hostile boards and a hostile bus ----------------------------------------------------------------------------------
+
+
+class HostileManager:
+    """The manager of a board whose replies to uploads a test replaces; all else is the real one's."""
+
+    def __init__(self, bench: UpdateBench, reply: Callable[[SmpPacket, int], bytes]) -> None:
+        manage = bench.node.tim._manage
+        assert manage is not None
+        self._real, self._reply, self.uploads = manage._manager, reply, 0
+        manage._manager = self  # type: ignore[assignment]
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._real, name)
+
+    def manage(self, octets: bytes) -> bytes:
+        packet = decode_packet(octets)
+        if packet.command != UPLOAD:
+            return self._real.manage(octets)
+        self.uploads += 1
+        return self._reply(packet, self.uploads)
+
+
+def said(**values: object) -> Callable[[SmpPacket, int], bytes]:
+    return lambda packet, number: packet.reply(cbor2.dumps(values)).encode()
+
+
+HOSTILE: dict[str, tuple[Callable[[SmpPacket, int], bytes], type[Exception], int]] = {
+    "an offset that never moves": (said(off=0), NotAuthenticError, 3),
+    "an offset that goes to and fro": (
+        lambda packet, number: packet.reply(cbor2.dumps({"off": 100 + number % 2})).encode(),
+        NotAuthenticError,
+        5,
+    ),
+    "an offset beyond the image": (said(off=10**6), NotAuthenticError, 1),
+    "a negative offset": (said(off=-1), NotAuthenticError, 1),
+    "no offset": (said(), NotAuthenticError, 1),
+    "an offset that is text": (said(off="9"), NotAuthenticError, 1),
+    "a CBOR tag": (
+        lambda packet, number: packet.reply(bytes.fromhex("a1636f6666c24101")).encode(),
+        NotAuthenticError,
+        1,
+    ),
+    "a floating number": (said(off=1.5), NotAuthenticError, 1),
+    "something after the map": (lambda packet, number: packet.reply(b"\xa0\xa0").encode(), NotAuthenticError, 1),
+    "no map": (lambda packet, number: packet.reply(b"\xff").encode(), NotAuthenticError, 1),
+    "half a packet": (lambda packet, number: packet.reply(b"\xa0").encode()[:5], NotAuthenticError, 1),
+    "the reply to another request": (
+        lambda packet, number: packet._replace(sequence=packet.sequence ^ 1).reply(b"\xa1\x63off\x05").encode(),
+        NotAuthenticError,
+        1,
+    ),
+    "other octets than were sent": (said(off=9728, match=False), NotAuthenticError, 1),
+    "SMP's error of version 1": (said(rc=8), PolicyError, 1),
+    "SMP's error of version 2": (said(err={"group": 1, "rc": 30}), PolicyError, 1),
+    "an error that nobody knows": (said(err={"group": 1, "rc": 250}), PolicyError, 1),
+}
+
+
+@pytest.mark.parametrize("hostile", HOSTILE)
+def test_a_board_that_answers_nonsense_ends_the_update_soon(bench: UpdateBench, owner: Owner, hostile: str) -> None:
+    reply, error, most = HOSTILE[hostile]
+    manager = HostileManager(bench, reply)
+    image = owner.long
+    if hostile == "other octets than were sent":
+        manager._reply = said(off=len(image.octets), match=False)
+    done = bench.update(image)
+    assert (done.result, type(done.error)) == ("refused", error), done.error
+    assert manager.uploads <= most
+    assert bench.runs == ("1.0.0", False, False)
+
+
+@pytest.mark.parametrize("octet", [3, 12, -1])
+def test_a_bus_that_alters_replies_decides_nothing(owner: Owner, tmp_path: Path, octet: int) -> None:
+    """Each seventh exchange has one octet of its reply changed; what is sealed then opens no more."""
+    for at in range(3, 40, 7):
+        bench = UpdateBench.copy_of(owner, tmp_path / str(at))
+        flash = bench.node.tim.flash
+
+        def changed(_request: bytes, reply: bytes, bench: UpdateBench = bench, at: int = at) -> bytes:
+            if bench.exchanges != at or len(reply) < 13:
+                return reply
+            wrong = bytearray(reply)
+            wrong[octet] ^= 0x40
+            return bytes(wrong)
+
+        bench.changed = changed
+        done = bench.update(owner.new, wait=2.0)
+        assert bench.node.tim.flash == flash
+        assert done.result != "updated" or bench.runs == ("1.1.0", False, False)
+        bench.changed = lambda request, reply: reply
+        again = bench.update(owner.new, wait=2.0)
+        assert again.result in ("updated", "already"), (at, done, again)
+        bench.close()
+
+
+def test_a_recorded_update_cannot_be_played_again_and_without_the_key_there_is_none(
+    bench: UpdateBench, owner: Owner
+) -> None:
+    frames: list[bytes] = []
+
+    def record(request: bytes, reply: bytes) -> bytes:
+        frames.append(request)
+        return reply
+
+    bench.changed = record
+    assert bench.update(owner.new).result == "updated"
+    assert bench.update(owner.old, allow_downgrade=True).result == "updated"
+    before = bench.runs
+    for frame in frames:
+        if frame[3] in (Function.SEALED, Function.OPEN):
+            bench.node.request("can:f1", frame, tapped=False)
+    plain = security_command(Function.MANAGE, bytes.fromhex("0a00000100000705a0"))
+    assert bench.node.request("can:f2", plain.encode(), tapped=False) == refusal(Reason.NOT_PERMITTED).encode()
+    assert bench.runs == before
+    assert before[0] == "1.0.0"

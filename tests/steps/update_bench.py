@@ -39,6 +39,7 @@ class Owner:
     """What is made once: the owner's keys and images, a station, and a node of it that runs the old image."""
 
     def __init__(self, folder: Path) -> None:
+        folder.mkdir(exist_ok=True)
         self.folder = folder
         self.key, self.rival = make_key(folder / "owner.pem"), make_key(folder / "rival.pem")
         self.old, self.new = self.image("1.0.0", counter=1), self.image("1.1.0", counter=1)

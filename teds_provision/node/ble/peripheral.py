@@ -62,6 +62,7 @@ class Peripheral:
     def __init__(self, node: BleHandler, address: StaticAddress, *, stranger_seconds: float = STRANGER_SECONDS) -> None:
         self._node, self._address, self._stranger_seconds = node, address, stranger_seconds
         self._workers = WorkerPool()
+        self._dropping: set[asyncio.Task[None]] = set()
         self._lines: dict[int, CentralState] = {}
         self._tapped_until = 0.0
         self._advertising = False
@@ -202,6 +203,12 @@ class Peripheral:
             line.repetition.forget()
             line.turns.put(lambda: self._node.lost(line.name))
             self._news.set()
+
+    def restarted(self) -> None:
+        """Drop every connection: the board has restarted."""
+        for line in list(self._lines.values()):
+            self._dropping.add(task := asyncio.get_running_loop().create_task(self._drop(line)))
+            task.add_done_callback(self._dropping.discard)
 
     async def _drop(self, line: CentralState) -> None:
         with suppress(Exception):  # it was going anyway

@@ -73,6 +73,11 @@ class BleServer:
         if self._peripheral is not None:
             self._loop.call_soon_threadsafe(self._peripheral.tapped)
 
+    def restarted(self) -> None:
+        """Begin again with a node that has restarted: every connection is dropped."""
+        if self._peripheral is not None:
+            self._loop.call_soon_threadsafe(self._peripheral.restarted)
+
     def send_data(self, frame: DataFrame) -> None:
         """Send a data message; waits until the controller has taken it. Raises LinkError."""
         peripheral = self._peripheral

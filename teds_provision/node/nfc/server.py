@@ -137,6 +137,10 @@ class NfcServer:
             self._thread.join()
             self._tnep.stop()
 
+    def restarted(self) -> None:
+        """Begin again with a node that has restarted: what was said is forgotten."""
+        self._tnep.lost()
+
     def _bound(self) -> bool:
         """Take the port; a node that is just leaving it is given a second."""
         until = time.monotonic() + _LEAVING

@@ -255,6 +255,10 @@ class Tim:
         if self._role is not None and session is not None:
             self._role.streams.unheard(session)
 
+    def restarts_after(self, link: str) -> bool:
+        """Return True if the node restarts when the reply on this link has left."""
+        return self._manage is not None and self._manage.restart_link == link
+
     def in_session(self, link: str) -> bool:
         """Return True if a session is open on this link."""
         return self._sessions.on(link) is not None
