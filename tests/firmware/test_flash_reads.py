@@ -129,3 +129,24 @@ def test_a_first_start_that_cannot_read_its_identity_back_makes_no_second_one() 
         assert desk.node.start() == 0
         assert made[:IDENTITY] in (blank[:IDENTITY], desk.node.image[:IDENTITY])
     CDesk.close_all()
+
+
+def test_a_first_start_whose_flash_reads_back_as_something_else_says_so_and_the_next_one_is_good() -> None:
+    """An identity that is not there as it was written would be shown once, and be another one after the next start."""
+    desk = CDesk()
+    blank = bytes([0xFF]) * len(desk.node.image)
+    desk.node.image = blank
+    desk.node.garble(0)
+    assert desk.node.start() == 0
+    units = desk.node.written
+    assert units > 20
+    for unit in range(1, units + 1):
+        desk.node.image = blank
+        desk.node.garble(unit)
+        assert desk.node.start() == _FLASH, f"unit {unit}"
+        desk.node.garble(0)
+        assert desk.node.start() == 0
+        made = desk.node.image[:IDENTITY]
+        assert desk.node.start() == 0
+        assert desk.node.image[:IDENTITY] == made
+    CDesk.close_all()

@@ -15,6 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "teds_provision"
+SOURCES_IN_C = ROOT / "firmware" / "src"
 
 _COMPARISONS: dict[type[ast.cmpop], str] = {
     ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==", ast.Is: "is not",
@@ -61,6 +62,17 @@ class Pattern:
     was: str
     now: str
     test: str = ""
+
+
+@dataclass(frozen=True)
+class CPattern:
+    """A rule of the node in C, and the text of a file in ``firmware/src`` that holds it; ``test`` notices."""
+
+    rule: str
+    file: str
+    was: str
+    now: str
+    test: str
 
 
 class Module:
@@ -140,6 +152,20 @@ def found(pattern: Pattern, where: list[Module]) -> list[Mutant]:
         for node in ast.walk(tree)
         if isinstance(node, ast.expr) and ast.unparse(node) == wanted
     ]
+
+
+def found_in_c(pattern: CPattern) -> list[Mutant]:
+    """The places of a pattern in the C library; one, where all is well."""
+    path = SOURCES_IN_C / pattern.file
+    source, name = path.read_text(), path.relative_to(ROOT).as_posix()
+    told = f"{pattern.rule}: {' '.join(pattern.was.split())[:90]}  ->  {pattern.now}"
+    return [
+        Mutant(
+            name, place.start(), place.end(), pattern.now, "", source.count("\n", 0, place.start()) + 1, told,
+            test=pattern.test, rule=pattern.rule,
+        )
+        for place in re.finditer(re.escape(pattern.was), source)
+    ]  # fmt: skip
 
 
 def any_of(module: Module) -> list[Mutant]:

@@ -33,7 +33,9 @@ class Suite:
         return {name: self._from(name) for name in self._paths if name.rpartition(".")[2].startswith("test_")}
 
     def nearest(self, mutant: Mutant, most: int) -> list[str]:
-        """Paths of the test files to run, the most telling first."""
+        """Paths of the test files to run, the most telling first; of the C library the one that its pattern names."""
+        if not mutant.path.endswith(".py"):
+            return [mutant.test]
         module = _dotted(ROOT / mutant.path)
         room = module.split(".")[1] if module.count(".") else ""
         words = {word: self._weights.get(word, 0.0) for word in mutant.words}

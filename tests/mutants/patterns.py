@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.mutants.changes import Pattern
+from tests.mutants.changes import CPattern, Pattern
 
 PATTERNS = (
     # keys and their life (steps, station, handover)
@@ -373,4 +373,33 @@ PATTERNS = (
         "False",
         "tests/plant/test_evidence.py",
     ),
+)
+
+_C_TESTS = "tests/firmware/test_c_tests.py"
+_IN_ONE_PROCESS = "tests/firmware/test_protocol_suites.py"
+
+C_PATTERNS = (
+    CPattern(
+        "a slot is read back before it counts",
+        "teds_store.c",
+        "crc_good(port, into.area, total, &good) == 0 && good;",
+        "crc_good(port, into.area, total, &good) == 0;",
+        _IN_ONE_PROCESS,
+    ),
+    CPattern(
+        "an identity is read back before it counts",
+        "teds_store.c",
+        "return failed || good ? failed : TEDS_E_FLASH;",
+        "return failed;",
+        "tests/firmware/test_flash_reads.py",
+    ),
+    CPattern(
+        "the shortest dead-man limits a Drive message",
+        "drive.c",
+        "i < session->drive.count; i++) {\n        if (ahead >",
+        "i < 1; i++) {\n        if (ahead >",
+        "tests/firmware/test_operation_suites.py",
+    ),
+    CPattern("STmin of F1 to F9", "isotp.c", "if (stmin >= 0xF1 && stmin <= 0xF9) {", "if (0) {", _C_TESTS),
+    CPattern("a lower counter is a replay", "session.c", "taken->counter <= last", "taken->counter == last", _C_TESTS),
 )

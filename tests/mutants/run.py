@@ -29,15 +29,17 @@ from contextlib import suppress
 from dataclasses import dataclass
 from queue import SimpleQueue
 
-from tests.mutants.changes import ROOT, Mutant, any_of, found, modules
+from tests.mutants.changes import ROOT, Mutant, any_of, found, found_in_c, modules
 from tests.mutants.nearest import Suite
-from tests.mutants.patterns import PATTERNS
+from tests.mutants.patterns import C_PATTERNS, PATTERNS
 
 PLACE = ROOT / "build" / "mutants"
 FILES = 14
+IN_C = "firmware"
 LEAST, MOST = 20.0, 90.0
 """Seconds that the tests of one mutant get, whatever the time that is left says."""
 MARKS = "not slow and not soak and not machine and not realtime"
+COMPILING = 90.0
 _FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+?(?:\[.*?\])?)(?: - .*)?$", re.MULTILINE)
 
 
@@ -101,6 +103,8 @@ class Copy:
         """Write a module, so that no compiled form of another text can pass for it."""
         path = self.folder / name
         path.write_text(source)
+        if path.suffix != ".py":  # make compares times: what was written now is compiled
+            return
         self._moment += 2
         os.utime(path, (self._moment, self._moment))
         for compiled in (path.parent / "__pycache__").glob(f"{path.stem}.*.pyc"):
@@ -135,6 +139,7 @@ class Bench:
             copy.put(mutant.path, mutant.applied(source))
             files = self._tests.nearest(mutant, FILES)
             last = began + (MOST if mutant.rule else min(MOST, max(LEAST, share)))
+            last += COMPILING if mutant.test.startswith("tests/firmware/") else 0
             by, code = "", 1
             while not by and code not in (0, None, 5):
                 without = [word for test in self._bad for word in ("--deselect" if "::" in test else "--ignore", test)]
@@ -176,23 +181,37 @@ def main(arguments: list[str]) -> int:
     """Run the bench."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=300, help="patterns and random ones together")
-    parser.add_argument("--room", default="", help="a room or a module: steps, protocol/tim, steps/agree.py")
+    parser.add_argument("--room", default="", help="a room or a module: steps, protocol/tim, steps/agree.py; firmware")
     parser.add_argument("--minutes", type=float, default=60)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=int, default=0, help="0: another sample each time, told")
     parser.add_argument("--patterns", action="store_true", help="no random ones")
     chosen = parser.parse_args(arguments)
     seed = chosen.seed or random.SystemRandom().randrange(1, 100_000)
-    where = modules(chosen.room)
+    where = [] if chosen.room == IN_C else modules(chosen.room)
     everywhere = where if not chosen.room else modules()
-    lost = [pattern for pattern in PATTERNS if len(found(pattern, everywhere)) != 1]
-    for pattern in lost:
-        print(f"{pattern.function}: {pattern.was} is not there once ({pattern.rule})", file=sys.stderr)
+    lost = [
+        f"{pattern.function}: {pattern.was} is not there once ({pattern.rule})"
+        for pattern in PATTERNS
+        if len(found(pattern, everywhere)) != 1
+    ] + [
+        f"{pattern.file}: {pattern.was} is not there once ({pattern.rule})"
+        for pattern in C_PATTERNS
+        if len(found_in_c(pattern)) != 1
+    ]
     if lost:
+        print("\n".join(lost), file=sys.stderr)
         return 2
     named = [mutant for pattern in PATTERNS for mutant in found(pattern, where)]
-    others = [] if chosen.patterns else drawn(max(0, chosen.count - len(named)), chosen.room, random.Random(seed))
+    if chosen.room in ("", IN_C):
+        named += [mutant for pattern in C_PATTERNS for mutant in found_in_c(pattern)]
+    others = (
+        []
+        if chosen.patterns or chosen.room == IN_C
+        else drawn(max(0, chosen.count - len(named)), chosen.room, random.Random(seed))
+    )
     sources = {module.name: module.source for module in everywhere}
+    sources |= {mutant.path: (ROOT / mutant.path).read_text() for mutant in named if mutant.path not in sources}
     bench = Bench(chosen.jobs, time.monotonic() + 60 * chosen.minutes, sources)
     bench.left = len(named) + len(others)
     print(f"{len(named)} patterns, {len(others)} random ones (--seed {seed})", flush=True)

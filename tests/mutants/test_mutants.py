@@ -7,9 +7,9 @@ import random
 
 import pytest
 
-from tests.mutants.changes import ROOT, Module, Mutant, Pattern, any_of, found, modules
+from tests.mutants.changes import ROOT, Module, Mutant, Pattern, any_of, found, found_in_c, modules
 from tests.mutants.nearest import Suite
-from tests.mutants.patterns import PATTERNS
+from tests.mutants.patterns import C_PATTERNS, PATTERNS
 from tests.mutants.run import drawn
 
 
@@ -25,6 +25,15 @@ def test_every_rule_is_found_once_and_its_change_is_python(house: list[Module]) 
         source = (ROOT / mutants[0].path).read_text()
         changed = mutants[0].applied(source)
         assert ast.dump(ast.parse(changed)) != ast.dump(ast.parse(source)), pattern.rule
+
+
+def test_every_rule_of_the_node_in_c_is_found_once() -> None:
+    for pattern in C_PATTERNS:
+        (mutant,) = found_in_c(pattern)
+        source = (ROOT / mutant.path).read_text()
+        assert source.splitlines()[mutant.line - 1] in source[mutant.start - 200 : mutant.end + 200]
+        assert mutant.applied(source) == source.replace(pattern.was, pattern.now)
+        assert (ROOT / pattern.test).is_file()
 
 
 def test_a_pattern_outlives_a_move_and_another_layout() -> None:
