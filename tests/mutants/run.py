@@ -80,9 +80,9 @@ class Copy:
 
     def run(self, words: list[str], seconds: float) -> tuple[int | None, str]:
         """Run pytest; its exit code (None: its time was over) and what it said."""
-        compiles = any(word.startswith("tests/firmware/") for word in words)
+        longest = "150" if any(word.startswith("tests/firmware/") for word in words) else "40"  # it compiles
         command = [str(self.python), "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist",
-                   "--hypothesis-profile", "quick", "--timeout", "150" if compiles else "40", "-m", MARKS, *words]  # fmt: skip
+                   "--hypothesis-profile", "quick", "--timeout", longest, "-m", MARKS, *words]  # fmt: skip
         running = subprocess.Popen(
             command, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
             start_new_session=True, env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}, text=True,
