@@ -32,9 +32,9 @@ from teds_provision.cli.options import (
     tracing,
 )
 from teds_provision.cli.rendering import count_of, shown
-from teds_provision.errors import TedsProvisionError, UsageError
+from teds_provision.errors import NotFoundError, PolicyError, TedsProvisionError, UsageError
 from teds_provision.lazy import how_to_install, late
-from teds_provision.station.store.records import iso
+from teds_provision.station.store.records import COMMAND, iso
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -339,20 +339,27 @@ def _link(link: dict[str, Any]) -> str:
     "teds-provision ncap measure all",
     "teds-provision ncap measure type:magnetic-angular-position-sensor --rate 100",
     "teds-provision ncap measure 'group:arm,angle >= 360 deg' --frozen",
+    "teds-provision ncap measure all --stop",
     name="measure",
 )
 @click.argument("expression", metavar="EXPR")
 @click.option("--rate", type=Number(min=0.001), metavar="HZ", help="Maximum samples per second.")
 @click.option("--frozen", is_flag=True, help="Only the nodes that match now, as one group array; none joins or leaves.")
 @click.option("--to", "files", multiple=True, metavar="NAME", help="Record to NAME.mcap, .jsonl, .csv; repeatable.")
+@click.option("--stop", is_flag=True, help="End the measurement of EXPR or with this id; all ends every one.")
 @pass_app
-def measure(app: App, expression: str, rate: float | None, frozen: bool, files: Sequence[str]) -> None:
-    """Measure every authentic node that matches.
+def measure(app: App, expression: str, rate: float | None, frozen: bool, files: Sequence[str], stop: bool) -> None:
+    """Measure every authentic node that matches, or end that with --stop.
 
     Runs on the base station that is already running. EXPR is all, a group, or terms joined by commas, all of which must
     match: type:PROFILE, name:GLOB, group:NAME and bounds such as 'angle >= 360 deg'. The measurement is kept, across
-    restarts too, until it is deleted on the page or through the API.
+    restarts too, until --stop, or until it is ended on the page or through the API.
     """
+    if stop:
+        if rate is not None or frozen or files:
+            raise UsageError("--stop ends a measurement.", hint="Omit --rate, --frozen and --to.")
+        _stop(app, expression)
+        return
     with client.connect(home=app.home) as running:
         made = running.measure(match=expression, rate=rate, frozen=frozen, sinks=files)
         present = {node["uuid"] for node in running.nodes() if node["present"]}
@@ -368,6 +375,27 @@ def measure(app: App, expression: str, rate: float | None, frozen: bool, files: 
         {**made, "matching": list(found.matching), "others": others},
         "\n".join((f"Measuring {expression} (measurement {made['id']}).", *_match_lines(station, found, present))),
     )
+
+
+def _stop(app: App, wanted: str) -> None:
+    """End the measurements of an expression or group, or the one with an id; raises NotFoundError, PolicyError."""
+    with client.connect(home=app.home) as running:
+        kept = {one["id"]: one for one in running.measurements()}
+        named = {id_: one["match"] or one["group"] or ", ".join(one["uuids"]) for id_, one in kept.items()}
+        meant = [id_ for id_, what in named.items() if wanted in (id_, what, "all")]
+        commands = [id_ for id_ in meant if kept[id_]["owner"] == COMMAND]
+        ends = [id_ for id_ in meant if id_ not in commands]
+        if commands and not ends:
+            process = kept[commands[0]]["process"]
+            which = f" (process {process['id']})" if process is not None else ""
+            raise PolicyError(f"{wanted} is measured by a command{which}.", hint="End it there: Ctrl-C, or SIGTERM.")
+        if not meant and wanted != "all":
+            known = "; ".join(f"{id_} ({what})" for id_, what in named.items()) or "none"
+            raise NotFoundError(f"No measurement {wanted!r} is kept.", hint=f"Kept: {known}.")
+        for id_ in ends:
+            running.end_measurement(id_)
+    told = "; ".join(f"{id_} ({named[id_]})" for id_ in ends)
+    app.emit({"stopped": ends}, f"Ended: {told}." if ends else "Nothing to do: no measurement is kept.")
 
 
 def _match_lines(station: Station, found: MatchSurvey, present: Set[str]) -> list[str]:

@@ -337,7 +337,10 @@ def test_an_expression_on_a_running_station_takes_in_whom_it_means(lab: Lab) -> 
     lab.comes(left)
     with lab.service.client() as asked:
         [one] = asked.measurements()
-        asked.end_measurement(one["id"])
+        said = station.refuses("ncap", "measure", "leg", "--stop", code=3)
+        assert said["hint"] == f"Kept: {one['id']} (arm, name:l*)."
+        assert station.ask("ncap", "measure", "arm, name:l*", "--stop") == {"stopped": [one["id"]]}
+        assert station.ask("ncap", "measure", "all", "--stop") == {"stopped": []}
         until(lambda: asked.node(left.uuid)["mode"] == "idle")
         assert lab.told(left.uuid)[-1]["why"] == "the measurement ended"
         assert asked.measurements() == []
