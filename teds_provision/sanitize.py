@@ -36,3 +36,8 @@ def sanitize_json(text: str) -> str:
     return "".join(
         character if character.isprintable() or character == "\n" else json.dumps(character)[1:-1] for character in text
     )
+
+
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """``1 entry``, ``2 entries``: a number with its noun; ``plural`` where an s is not enough."""
+    return f"{number} {noun if number == 1 else plural or f'{noun}s'}"

@@ -13,6 +13,7 @@ from teds_provision.backup.sealed_file import MAX_OCTETS, SealedFile, Sealer, wr
 from teds_provision.errors import StoreError, StoreLockedError, TedsProvisionError, VaultError
 from teds_provision.files import whole_draft
 from teds_provision.protocol.keys import fingerprint
+from teds_provision.sanitize import counted
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now
 from teds_provision.station.store.snapshot import totals
@@ -127,5 +128,7 @@ def _warnings(station: Station, recovery: bytes | None, useless: int) -> list[st
     if recovery is not None and recovery in (station.point, station.ca):
         warnings.append("It is sealed to a key of this station: if the station is lost, nobody can open it.")
     if useless:
-        warnings.append(f"{useless} keys in the store do not open under this vault; run teds-provision doctor.")
+        warnings.append(
+            f"{counted(useless, 'key')} in the store cannot be opened under this vault; run teds-provision doctor."
+        )
     return warnings

@@ -12,6 +12,7 @@ from teds_provision.cli.options import command, dry_run_option, link_options, li
 from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import FrozenError, LinkError, PolicyError
 from teds_provision.links import LinkSettings
+from teds_provision.sanitize import counted
 
 if TYPE_CHECKING:
     from teds_provision.handover.life import TakeoverPlan
@@ -44,7 +45,8 @@ def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run:
     if dry_run:
         keys = len(station.keys.keys_of(octets))
         app.emit(
-            {"uuid": octets.hex(), "plan": "revoke", "keys": keys}, f"Plan: revoke {octets.hex()}, delete {keys} keys."
+            {"uuid": octets.hex(), "plan": "revoke", "keys": keys},
+            f"Plan: revoke {octets.hex()}, delete {counted(keys, 'key')}.",
         )
         return
     station.unlock()

@@ -21,7 +21,7 @@ from teds_provision.cli.options import COMMAND_SETTINGS, WholeNumber, command, e
 from teds_provision.cli.rendering import local_time, moment, print_json_list, shown
 from teds_provision.errors import StoreError, UsageError
 from teds_provision.lazy import late
-from teds_provision.sanitize import sanitize
+from teds_provision.sanitize import counted, sanitize
 from teds_provision.station import store
 
 if TYPE_CHECKING:
@@ -127,9 +127,11 @@ def _tell_lines(app: App, entries: _CountedEntries, verdict: AuditVerdict, after
     _require_intact(verdict)
     if narrowed:
         by_act = ", ".join(f"{count} {name}" for name, count in entries.acts.most_common())
-        app.note(f"{entries.entries} entries, {entries.failed} failed{': ' if by_act else '.'}{by_act}")
+        app.note(
+            f"{counted(entries.entries, 'entry', 'entries')}, {entries.failed} failed{': ' if by_act else '.'}{by_act}"
+        )
     part = f" from entry {after + 1} on" if after else ""
-    app.note(f"{verdict.count} entries, chain intact{part}, head {verdict.head[:16]}.")
+    app.note(f"{counted(verdict.count, 'entry', 'entries')}, chain intact{part}, head {verdict.head[:16]}.")
 
 
 def _follow(app: App, station: Station, choice: AuditFilter, verdict: AuditVerdict, after: int) -> None:

@@ -30,6 +30,7 @@ from teds_provision.cli.sample import ending, over_the_bus, where_met
 from teds_provision.errors import BadDataError, UsageError
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings
+from teds_provision.sanitize import counted
 from teds_provision.station.store import KeptMeasurement
 from teds_provision.station.store.records import COMMAND
 
@@ -293,7 +294,7 @@ def _tell_end(app: App, ended: MeasurementEnd, require: Requirements | None, fil
 def _end_lines(ended: MeasurementEnd, require: Requirements | None) -> list[str]:
     lines = [_stream_line(node["uuid"], stream) for node in ended.nodes for stream in node["streams"]]
     lines += [f"Written: {name}" for name in ended.files]
-    lines += [f"{sink['sink']}: {sink['dropped']} values dropped" for sink in ended.sinks if sink["dropped"]]
+    lines += [f"{sink['sink']}: {counted(sink['dropped'], 'value')} dropped" for sink in ended.sinks if sink["dropped"]]
     if require is not None and ended.error is not None:
         lines += [str(fit["why"]) for fit in require.fits if fit["result"] != "passed"]
     return lines
@@ -303,7 +304,8 @@ def _stream_line(uuid: str, stream: Mapping[str, Any]) -> str:
     lost = f"lost {stream['lost']}, late {stream['late']}, bad {stream['bad']}, invalid {stream['invalid']}"
     blocks = measure_room.blocks
     why = blocks.why_invalid([blocks.InvalidValues(**invalid) for invalid in stream["invalid_why"]])
-    return f"{uuid}: {stream['samples']} values in {stream['messages']} messages, {lost}{f' ({why})' if why else ''}"
+    came = f"{counted(stream['samples'], 'value')} in {counted(stream['messages'], 'message')}"
+    return f"{uuid}: {came}, {lost}{f' ({why})' if why else ''}"
 
 
 def _recover(app: App, files: Sequence[str], output: Path | None) -> None:
@@ -322,7 +324,7 @@ def _recover(app: App, files: Sequence[str], output: Path | None) -> None:
         result["output"] = str(done.output)
         told = f"is unchanged; its intact part is in {done.output}"
     error = _damage(files[0], done) if done.damaged else None
-    text = f"{files[0]} {told}: {done.messages} messages" + (f" until {until}" if until else "")
+    text = f"{files[0]} {told}: {counted(done.messages, 'message')}" + (f" until {until}" if until else "")
     app.conclude(result, text, error)
 
 

@@ -16,6 +16,7 @@ from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, why_i
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.sinks import Sink, ThreadedSink
 from teds_provision.measure.sinks.lines import as_line, data_lines, status_line
+from teds_provision.sanitize import counted
 from teds_provision.teds import units
 from teds_provision.teds.channel import within_turn
 
@@ -243,4 +244,6 @@ def _line(report: NodeReport) -> str:
 def _sink_line(sink: Sink) -> str:
     stats = sink.stats
     detail = stats.error or stats.detail
-    return f"{sink.name}: {stats.state}, {stats.written} values, {stats.dropped} dropped. {detail}".replace("[", "(")
+    return f"{sink.name}: {stats.state}, {counted(stats.written, 'value')}, {stats.dropped} dropped. {detail}".replace(
+        "[", "("
+    )

@@ -31,9 +31,10 @@ from teds_provision.cli.options import (
     said_here,
     tracing,
 )
-from teds_provision.cli.rendering import count_of, shown
+from teds_provision.cli.rendering import by_name, count_of, shown
 from teds_provision.errors import NotFoundError, PolicyError, TedsProvisionError, UsageError
 from teds_provision.lazy import how_to_install, late
+from teds_provision.sanitize import counted
 from teds_provision.station.store.records import COMMAND, iso
 
 if TYPE_CHECKING:
@@ -297,7 +298,7 @@ def _status(console: Console, found: dict[str, Any]) -> None:
         console.print(_NO_LINK, markup=False)
     for link in found["links"]:
         console.print(_link(link), markup=False)
-    for node in found["nodes"]:
+    for node in sorted(found["nodes"], key=lambda node: by_name(node["name"], node["uuid"])):
         there = "there" if node["present"] else "away"
         name = shown(node["name"]) or "no name"
         problem = f": {node['problem']['message']}" if node["problem"] else ""
@@ -332,7 +333,7 @@ def _verdict(node: dict[str, Any]) -> str:
 def _link(link: dict[str, Any]) -> str:
     problem = f": {link['problem']['message']}" if link["problem"] else ""
     others = f", {link['strangers']} not on the whitelist" if link["strangers"] else ""
-    return f"{link['place']}: {link['state']}, {link['nodes']} nodes{others}{problem}"
+    return f"{link['place']}: {link['state']}, {counted(link['nodes'], 'node')}{others}{problem}"
 
 
 @command(
@@ -349,7 +350,7 @@ def _link(link: dict[str, Any]) -> str:
 @click.option("--stop", is_flag=True, help="End the measurement of EXPR or with this id; all ends every one.")
 @pass_app
 def measure(app: App, expression: str, rate: float | None, frozen: bool, files: Sequence[str], stop: bool) -> None:
-    """Measure every authentic node that matches, or end that with --stop.
+    """Measure every authentic node that matches, or --stop.
 
     Runs on the base station that is already running. EXPR is all, a group, or terms joined by commas, all of which must
     match: type:PROFILE, name:GLOB, group:NAME and bounds such as 'angle >= 360 deg'. The measurement is kept, across

@@ -338,8 +338,8 @@ def run(
 ) -> None:
     """Run the nodes in DIR … until SIGTERM or Ctrl-C; SIGUSR1 resets them by hand, SIGUSR2 presses their button.
 
-    Prints one line when the links are up, then one line per actuator change, one when a node blinks to be found, and
-    for a wrapped node one line when a channel becomes invalid, with the reason, or valid again.
+    Prints one line when the links are up, then one line per actuator change, one when a node blinks to be found or
+    was reset, and for a wrapped node one line when a channel becomes invalid, with the reason, or valid again.
     """
     place = node_room.wrapped.running.SensorPlace(source, bus, tuple(node_ids), links["can"])
     _check_options(len(folders), place, **links)
@@ -363,7 +363,7 @@ def run(
     stop = talk.meeting.IdleStop(None)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.request_stop())
-    signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=_reset_all, args=(nodes,)).start())
+    signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=_reset_all, args=(nodes, lines)).start())
     signal.signal(signal.SIGUSR2, lambda *_: threading.Thread(target=_press_all, args=(nodes,)).start())
     running: list[Any] = []
     try:
@@ -459,9 +459,10 @@ def _boards(
     return make
 
 
-def _reset_all(nodes: Sequence[VirtualNode]) -> None:
+def _reset_all(nodes: Sequence[VirtualNode], lines: ActuatorLines) -> None:
     for node in nodes:
         node.reset_by_hand()
+        lines.note_reset(node.tim.flash.uuid.hex())
 
 
 def _press_all(nodes: Sequence[VirtualNode]) -> None:
@@ -589,6 +590,10 @@ class ActuatorLines:
         """Return what a node calls to be found by a person."""
         return lambda seconds: self._note({"event": "locate", "uuid": uuid, "seconds": seconds})
 
+    def note_reset(self, uuid: str) -> None:
+        """Print that a node was reset by hand."""
+        self._note({"event": "reset", "uuid": uuid, "state": "factory"})
+
     def _note(self, line: dict[str, object]) -> None:
         with self._condition:
             self._events.append(line | {"time": _iso(time.time())})
@@ -640,6 +645,9 @@ class ActuatorLines:
             self._app.emit(
                 line, f"{line['uuid']}: " + (f"blinks for {line['seconds']} s" if line["seconds"] else "stops")
             )
+            return
+        if line["event"] == "reset":
+            self._app.emit(line, f"{line['uuid']}: reset by hand, back in factory state")
             return
         state = f"invalid: {line['reason']}" if line["event"] == "invalid" else "valid again"
         self._app.emit(line, f"{line['uuid']} {line['name']}: {state}")

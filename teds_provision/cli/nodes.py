@@ -18,6 +18,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import WholeNumber, command
 from teds_provision.cli.rendering import (
     FIRMWARE_CHANGED,
+    by_name,
     firmware_words,
     local_time,
     moment,
@@ -89,6 +90,9 @@ def nodes(
     if fits is not None:
         show_fits(app, station, fits, found)
         return
+    if not app.json and form in (None, "table"):  # what scripts read stays in the order of UUIDs
+        names = {record.uuid: record.name for record in station.nodes.all()}
+        found = sorted(found, key=lambda uuid: by_name(names.get(uuid), uuid.hex()))
     described = _with_plant(station, inventory(station, found))
     if app.json or form == "json":
         print_json_list("nodes", described)

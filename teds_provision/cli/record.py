@@ -22,6 +22,7 @@ from teds_provision.cli.options import (
     file_units_option,
 )
 from teds_provision.lazy import late
+from teds_provision.sanitize import counted
 
 if TYPE_CHECKING:
     from teds_provision.cli import measure_view, rendering
@@ -74,9 +75,10 @@ def _lines(result: Mapping[str, Any], summary: RecordingSummary, recording: Reco
         yield f"From {_local(result['from'])} until {_local(result['until'])}"
     else:
         yield "It contains no values."
-    lost = "not recorded" if result["lost"] is None else f"{result['lost']} messages"
+    lost = "not recorded" if result["lost"] is None else counted(result["lost"], "message")
     yield (
-        f"{result['messages']} time stamps, {result['samples']} values, {result['invalid']} invalid; "
+        f"{counted(result['messages'], 'time stamp')}, {counted(result['samples'], 'value')}, "
+        f"{result['invalid']} invalid; "
         f"lost: {lost}, missing: {result['missing']} samples"
     )
     if result["being_written"]:
@@ -90,7 +92,7 @@ def _lines(result: Mapping[str, Any], summary: RecordingSummary, recording: Reco
         )
         span = _span(channel, facts)
         name = f"{channel.get('node') or channel['uuid']}/{channel.get('name') or channel['channel']}"
-        yield f"  {name}: {channel['samples']} values, {channel['invalid']} invalid{span}"
+        yield f"  {name}: {counted(channel['samples'], 'value')}, {channel['invalid']} invalid{span}"
     for note in result["notes"]:
         yield f"  {_local(note['time'])} {note['why']}"
 
@@ -219,5 +221,5 @@ def convert(app: App, source: Path, target: Path, wide: bool, file_units: FileUn
     files = [str(path) for path in done.files]
     app.emit(
         {"files": files, "unit": "si" if target.suffix.lower() == ".mcap" else file_units, **result},
-        f"{', '.join(files)}: {result['samples']} values at {result['messages']} time stamps",
+        f"{', '.join(files)}: {counted(result['samples'], 'value')} at {counted(result['messages'], 'time stamp')}",
     )

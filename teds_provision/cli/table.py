@@ -59,7 +59,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "sample": Entry("sample", "sample", "Take one verified, calibrated reading."),
         "calibrate": Entry("calibrate", "calibrate", "Zero a sensor where it is mounted; take calibration points."),
         "set": Entry("sample", "set_value", "Drive an actuator within its limits; it returns to its safe state."),
-        "mode": Entry("sample", "mode", "Show or change a node's operating mode."),
+        "mode": Entry("sample", "mode", "Show what a node does, which channels are claimed, and its power."),
         "ncap": Entry("ncap", "ncap", "Run and control the base station service."),
         "group": Entry("group", "group", "Manage groups of nodes that are measured together."),
         "names": Entry("names", "names", "Choose the topics under which channels are published."),

@@ -11,6 +11,7 @@ from teds_provision.cli.context import App, pass_app, read_line
 from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples, yes_option
 from teds_provision.cli.rendering import duration, local_time
 from teds_provision.errors import UsageError
+from teds_provision.sanitize import counted
 from teds_provision.vault import agent
 
 
@@ -85,7 +86,8 @@ def rewrap(app: App, yes: bool, dry_run: bool) -> None:
     if dry_run:
         count = sum(1 for _ in station.keys.all())
         app.emit(
-            {"keystore": kind, "rewrapped": count, "plan": True}, f"Plan: rewrap {count} keys under a new master key."
+            {"keystore": kind, "rewrapped": count, "plan": True},
+            f"Plan: rewrap {counted(count, 'key')} under a new master key.",
         )
         return
     station.unlock()
@@ -93,11 +95,12 @@ def rewrap(app: App, yes: bool, dry_run: bool) -> None:
         done = station_room.station.rewrap(station)
     if done.damaged:
         app.warn(
-            f"{done.damaged} keys in the store cannot be decrypted with any master key; run teds-provision doctor."
+            f"{counted(done.damaged, 'key')} in the store cannot be decrypted with any master key;"
+            " run teds-provision doctor."
         )
     app.emit(
         {"keystore": kind, "rewrapped": done.keys, "damaged": done.damaged},
-        f"Rewrapped {done.keys} keys under a new master key in the {kind} keystore.",
+        f"Rewrapped {counted(done.keys, 'key')} under a new master key in the {kind} keystore.",
     )
 
 

@@ -16,6 +16,7 @@ from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, example
 from teds_provision.cli.rendering import local_time, print_json_list, shown
 from teds_provision.errors import NotFoundError
 from teds_provision.protocol.fingerprints import same_key
+from teds_provision.sanitize import counted
 from teds_provision.station.label import read_label
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
 def list_entries(app: App) -> None:
     """List every entry: UUID, pinned key, how it was proven, when it was added, and the name."""
     station = app.station()
-    entries = station.pins.all_entries()
+    entries = steps.whitelist.named(station, station.pins.all_entries())
     if app.json:
         print_json_list("whitelist", map(steps.whitelist.as_dict, entries))
         return
@@ -184,12 +185,16 @@ def export_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
     """Write all entries, sorted, to a file; an existing file is replaced in one step."""
     station = app.station()
     form = steps.whitelist.form_of(file, form)
+    entries = list(steps.whitelist.named(station, station.pins.all_entries()))
     if not dry_run:
-        write_file(file, steps.whitelist.render(station.pins.all_entries(), form))
-    listed = [steps.whitelist.as_dict(entry) for entry in station.pins.all_entries()] if app.json else []
-    count = len(listed) if app.json else sum(1 for _ in station.pins.all_entries())
+        write_file(file, steps.whitelist.render(entries, form))
+    listed = [steps.whitelist.as_dict(entry) for entry in entries] if app.json else []
+    count = len(entries)
     verb = "Would write" if dry_run else "Wrote"
-    app.emit({"whitelist": listed, "file": str(file), "format": form}, f"{verb} {count} entries as {form} to {file}.")
+    app.emit(
+        {"whitelist": listed, "file": str(file), "format": form},
+        f"{verb} {counted(count, 'entry', 'entries')} as {form} to {file}.",
+    )
 
 
 def _emit_plan(app: App, station: Station, plan: WhitelistPlan, *, dry_run: bool) -> None:

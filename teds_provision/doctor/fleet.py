@@ -11,6 +11,7 @@ from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import BadDataError, NotFoundError, StoreChangedError, StoreError, VaultError
 from teds_provision.files import read_text
 from teds_provision.limits import LIMITS, load_toml
+from teds_provision.sanitize import counted
 from teds_provision.station.node_keys import deferred_until
 from teds_provision.station.station import Station
 from teds_provision.station.store import Store, utc_now
@@ -76,7 +77,7 @@ def profiles(system: System) -> Iterator[Finding]:
             why = f"Cannot use profile {profile.name}: {profile.error}"
             yield Finding("profiles", "failed", why, f"teds-provision profile check {profile.path}")
     if not any(profile.error for profile in listed):
-        yield Finding("profiles", "ok", f"{len(listed)} profiles in {folder}.")
+        yield Finding("profiles", "ok", f"{counted(len(listed), 'profile')} in {folder}.")
 
 
 @check("store file", "store")

@@ -10,6 +10,7 @@ from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.lazy import install_command
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Roster, open_roster
+from teds_provision.sanitize import counted
 from teds_provision.station.store import Store
 from teds_provision.station.store.database import has_store
 
@@ -46,7 +47,7 @@ def registry(system: System) -> Iterator[Finding]:
         for alarm in alarms:
             yield Finding("registry", "warning", f"Alarm {alarm.code}: {alarm.why}.", "teds-provision registry status")
         conflicts = len({uuid for uuid, _, _ in store.conflicts()})
-        said = f"{store.unsent(fingerprint(facts.point))} events unsent, {conflicts} conflicts."
+        said = f"{counted(store.unsent(fingerprint(facts.point)), 'event')} unsent, {counted(conflicts, 'conflict')}."
         fix = "teds-provision registry status" if conflicts else ""
         yield Finding("registry", "warning" if conflicts else "ok", said, fix)
 

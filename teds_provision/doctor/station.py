@@ -15,6 +15,7 @@ from teds_provision import vault as vault_room
 from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import KeyringUnavailableError, NotFoundError, StoreError, VaultError
 from teds_provision.files import open_to_read
+from teds_provision.sanitize import counted
 from teds_provision.station.store import AuditFilter, Store
 from teds_provision.station.store.database import has_store
 from teds_provision.station.store.lock import holder_of
@@ -81,7 +82,7 @@ def store(system: System) -> Iterator[Finding]:
             yield Finding("store", "warning", "init was started here but not finished.", _INIT)
             return
         count = opened.count("nodes")
-        yield Finding("store", "ok", f"Intact; {count} nodes, {opened.count('whitelist')} whitelisted.")
+        yield Finding("store", "ok", f"Intact; {counted(count, 'node')}, {opened.count('whitelist')} whitelisted.")
         yield from _audit(opened)
         yield from _backups(opened, count)
     holder = holder_of(system.home)
@@ -94,7 +95,7 @@ def store(system: System) -> Iterator[Finding]:
 def _audit(opened: Store) -> Iterator[Finding]:
     verdict = opened.audit.check()
     if verdict.intact:
-        yield Finding("audit log", "ok", f"{verdict.count} entries, chain intact.")
+        yield Finding("audit log", "ok", f"{counted(verdict.count, 'entry', 'entries')}, chain intact.")
     else:
         fix = "Keep a copy, run teds-provision log, and find out who changed the file."
         yield Finding("audit log", "failed", f"The hash chain is broken: {verdict.why}.", fix)
@@ -111,7 +112,9 @@ def _backups(opened: Store, nodes: int) -> Iterator[Finding]:
         return
     days = (datetime.now(UTC) - datetime.strptime(taken[-1], "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)).days
     old = days > _BACKUP_DAYS
-    yield Finding("backup", "warning" if old else "ok", f"The last backup is {days} days old.", fix if old else "")
+    yield Finding(
+        "backup", "warning" if old else "ok", f"The last backup is {counted(days, 'day')} old.", fix if old else ""
+    )
 
 
 @check("keyring", "store")
@@ -211,7 +214,7 @@ def keys_folder(system: System) -> Iterator[Finding]:
         fix = f"git rm --cached {' '.join(private)}; remove it, and create a new key: this one is no longer secret"
         yield Finding("keys folder", "failed", f"Private keys: {', '.join(private)}.", fix)
     else:
-        yield Finding("keys folder", "ok", f"{len(files)} files, no private key.")
+        yield Finding("keys folder", "ok", f"{counted(len(files), 'file')}, no private key.")
 
 
 def holds_private_key(path: Path) -> bool:

@@ -18,6 +18,7 @@ from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError
 from teds_provision.protocol.handover.bundle import Bundle
 from teds_provision.protocol.handover.receipt import Receipt, open_receipt
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object
+from teds_provision.sanitize import counted
 from teds_provision.station.station import Station
 from teds_provision.station.store import Handover, Holder, chunks
 
@@ -178,7 +179,7 @@ def close(station: Station, octets: bytes) -> CloseResult:
         station.audit("handover", None, "receipt of an undone move", handover=row.id)
         raise PolicyError(
             f"This move was undone here, but station {peer_name(station, receipt.sender)} took"
-            f" {len(receipt.imported)} keys in all the same.",
+            f" {counted(len(receipt.imported), 'key')} in all the same.",
             hint="Rotate them at once: teds-provision agree UUID --rotate. Or export the move again.",
         )
     with station.transaction():

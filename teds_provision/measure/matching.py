@@ -147,7 +147,11 @@ def survey(station: Station, match: NodeMatch) -> MatchSurvey:
 
 def nearest_types(kind: str, station: Station) -> list[str]:
     """Return profiles with a name much like this one, the nearest first."""
-    names = [entry.name for entry in list_profiles(default_folders(station.home))]
+    names = [
+        entry.name
+        for entry in list_profiles(default_folders(station.home))
+        if not (entry.profile and entry.profile.abstract)
+    ]
     return get_close_matches(kind[:_LONGEST], names, n=2, cutoff=0.6)
 
 

@@ -11,6 +11,7 @@ from teds_provision.plant.transport import CarriedPage, Transport
 from teds_provision.protocol.plant.document import NewerFormatError, hash_of
 from teds_provision.protocol.plant.page import Page, open_page
 from teds_provision.protocol.plant.roster import Roster
+from teds_provision.sanitize import counted
 from teds_provision.station.station import Station
 
 
@@ -122,5 +123,9 @@ def _report_junk(station: Station, roster: Roster, name: str, junk: Sequence[int
         station.plant.tables.end_alarms("junk", name)
     for n in junk[:1]:
         alarm(
-            station, "junk", name, n, f"{post.where}: {len(junk)} pages of {roster.name_of(name)} that it did not sign"
+            station,
+            "junk",
+            name,
+            n,
+            f"{post.where}: {counted(len(junk), 'page')} of {roster.name_of(name)} that it did not sign",
         )

@@ -35,6 +35,7 @@ from teds_provision.protocol.plant.evidence import PASSED
 from teds_provision.protocol.plant.fold import MergedClaims
 from teds_provision.protocol.plant.page import MOST_EVENTS, MOST_PAYLOAD, Page, PageDraft, open_page, seal_page
 from teds_provision.protocol.plant.roster import Roster
+from teds_provision.sanitize import counted
 from teds_provision.station.plant import new_home
 from teds_provision.station.station import Station
 from teds_provision.station.store import StoreLock, UnitRow, WhitelistEntry, utc_now
@@ -214,7 +215,9 @@ def _own_pages(station: Station, post: Transport, roster: Roster, done: SyncResu
             hint=f"To delete them there: registry sql --mend {quote(roster.name_of(station.fingerprint))} {junk[0]}",
         )
     if junk:
-        done.told.append(f"{post.where}: {len(junk)} files in this station's folder that it did not sign; ignored")
+        done.told.append(
+            f"{post.where}: {counted(len(junk), 'file')} in this station's folder that it did not sign; ignored"
+        )
     return found
 
 

@@ -502,6 +502,13 @@ def as_dict(entry: WhitelistEntry) -> dict[str, Any]:
     }
 
 
+def named(station: Station, entries: Iterable[WhitelistEntry]) -> Iterator[WhitelistEntry]:
+    """Yield the entries with the names that people see: the node's own if the entry has none."""
+    names = {record.uuid: record.name for record in station.nodes.all() if record.name}
+    for entry in entries:
+        yield entry if entry.name else replace(entry, name=names.get(entry.uuid))
+
+
 def form_of(path: Path, form: str | None) -> str:
     """Format to write: ``form``, else by extension, else XML; raises UsageError for an extension that is none."""
     suffix = path.suffix.lower().removeprefix(".")

@@ -64,7 +64,7 @@ def read_ca(path: Path, passphrase: str) -> bytes:
         key = load_pem_private_key(pem, passphrase.encode("utf-8", "surrogateescape"))
     except (ValueError, TypeError):  # a wrong passphrase and a damaged file look alike
         raise WrongPassphraseError(
-            f"The passphrase does not open {path} (or it is damaged).", hint="Try again."
+            f"Wrong passphrase for {path}.", hint="Try again. If it is right, the file is damaged."
         ) from None
     except Exception as error:  # the library names unsupported ciphers and curves by many classes
         raise VaultError(f"{path} contains an unsupported kind of key.") from error

@@ -115,8 +115,8 @@ def unseal(passphrase: str, sealed: Mapping[str, Any], *, context: bytes) -> tup
     opened = _decrypted(key, sealed, context)
     if opened is None:
         raise WrongPassphraseError(
-            "The passphrase does not open the sealed file, or the file was changed.",
-            hint="Try again, and check the keyboard layout.",
+            "Wrong passphrase.",
+            hint="Try again, and check the keyboard layout. If it is right, the file was changed: restore a backup.",
         )
     return opened, key
 

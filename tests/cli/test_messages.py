@@ -27,6 +27,17 @@ from .shell import call, spawn
 UUID = "8d4d9da65281f7000000"
 
 
+def test_a_wrong_passphrase_is_called_so(home: Path) -> None:
+    said = call(home, "--json", "trust", "ca", "drop", "--yes", passphrase="not this one").json["error"]
+    assert (said["code"], said["message"]) == ("wrong-passphrase", "Wrong passphrase.")
+
+
+def test_no_hint_offers_a_profile_that_is_only_a_base(home: Path) -> None:
+    said = call(home, "--json", "provision", "-p", "smart-senso", "--nfc", "udp:localhost:1").json["error"]
+    assert "temperature-sensor" in said["hint"]
+    assert "smart-sensor" not in said["hint"]
+
+
 @pytest.mark.parametrize(
     ("words", "code", "said", "cure"),
     [

@@ -191,6 +191,18 @@ def test_a_narrow_terminal_drops_columns_and_never_a_digit(fleet: Path) -> None:
         assert ("remarks" in lines[0]) == (columns >= 80), lines[0]
 
 
+def test_people_find_nodes_in_the_order_of_their_names(fleet: Path) -> None:
+    with Store.open(fleet) as store:
+        store.put_node(NodeRecord(b"\x01" + b"\xbb" * 9, POINT, name="Finger-10"))
+        store.put_node(NodeRecord(b"\x00" + b"\xbb" * 9, POINT))
+    listed = call(fleet, "nodes").out.splitlines()[1:]
+    names = [line.split()[1] for line in listed[:-1]]
+    assert names == [*(f"finger-{number}" for number in range(5)), "Finger-10", "imported"]
+    assert listed[-1].startswith("00bb"), "those without a name come last"
+    scripts = [node["uuid"] for node in call(fleet, "--json", "nodes").json["nodes"]]
+    assert scripts == sorted(scripts)
+
+
 def test_csv_and_json_hold_the_same_nodes(fleet: Path) -> None:
     rows = list(csv.DictReader(call(fleet, "nodes", "--format", "csv").out.splitlines()))
     listed = json.loads(call(fleet, "nodes", "--format", "json").out)["nodes"]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store import NodeRecord, Store, WhitelistEntry
 from teds_provision.vault import forget_vaults
-from tests.bench import PASSPHRASE
+from tests.bench import PASSPHRASE, make_station
 
 from .shell import call
 
@@ -58,6 +59,24 @@ def test_export_and_import_go_round(home: Path, tmp_path: Path, form: str) -> No
     ]
     again = call(home, "--json", "whitelist", "import", path)
     assert (again.code, again.json["added"], again.json["changed"], again.json["unchanged"]) == (0, 0, 0, 2)
+
+
+@pytest.mark.parametrize("form", ["xml", "csv", "json"])
+def test_an_export_has_the_names_of_nodes_and_import_keeps_them(home: Path, tmp_path: Path, form: str) -> None:
+    """Provisioning gives the name to the node, not to its whitelist entry; other readers find an attribute."""
+    call(home, "whitelist", "add", ONE, "--fingerprint", KEY)
+    with Store.open(home) as store:
+        store.put_node(NodeRecord(bytes.fromhex(ONE), name='left "hand" <2>'))
+    path = tmp_path / f"list.{form}"
+    exported = call(home, "whitelist", "export", path)
+    assert exported.out == f"Wrote 1 entry as {form} to {path}.\n"
+    other = tmp_path / "other"
+    make_station(other).close()
+    taken = call(other, "--json", "whitelist", "import", path)
+    assert [entry["name"] for entry in taken.json["whitelist"]] == ['left "hand" <2>']
+    if form == "xml":
+        (element,) = ElementTree.parse(path).getroot()
+        assert (element.get("uuid"), element.get("name")) == (f"0x{ONE}", 'left "hand" <2>')
 
 
 def test_nothing_is_imported_by_half(home: Path, tmp_path: Path) -> None:

@@ -171,7 +171,7 @@ def require_whole(world: World) -> None:
     assert station.audit_log.check().intact
     station.close()
     other = NEW if world.passphrase == PASSPHRASE else PASSPHRASE
-    with pytest.raises(TedsProvisionError, match="passphrase does not open"):
+    with pytest.raises(TedsProvisionError, match="Wrong passphrase"):
         opened(world.home, other, use_agent=False).unlock()
     if "unlock" in done and "passphrase" not in done[done.index("unlock") :]:
         agent = opened(world.home, "nobody is asked")

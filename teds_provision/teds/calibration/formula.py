@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar, overload
 
 from teds_provision.errors import BadDataError
 from teds_provision.lazy import late
+from teds_provision.sanitize import counted
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput, Method
 
 if TYPE_CHECKING:
@@ -434,7 +435,7 @@ def sentence(calibration: Calibration) -> str:
     if left is not None:
         at, _ = left.worst
         place = f"{at:.6g} {calibration.unit.text}" if calibration.actuator else f"raw {at:.8g}"
-        text += f", {len(left.inputs)} points, largest residual {left.maximum:.3g} {unit} at {place}"
+        text += f", {counted(len(left.inputs), 'point')}, largest residual {left.maximum:.3g} {unit} at {place}"
         text += f", rms {left.rms:.3g} {unit}"
     if calibration.due is not None:
         text += f", due {calibration.due:%Y-%m-%d}"

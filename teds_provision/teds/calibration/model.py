@@ -16,6 +16,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
 
 from teds_provision.errors import BadDataError
+from teds_provision.sanitize import counted
 from teds_provision.teds.certificate import CertificateReference
 from teds_provision.teds.codec.model import DecodedTeds, Edition, Field, TimeInstance, Units
 from teds_provision.teds.units import WrittenUnit, parse_unit, recognize
@@ -151,7 +152,9 @@ class Calibration:
             due = replace(self, interval=demanded_interval).due
         if due is not None and due < now:
             late = (now - due).days
-            out.append(f"the calibration of {self.date:%Y-%m-%d} was due again on {due:%Y-%m-%d}, {late} days ago.")
+            out.append(
+                f"the calibration of {self.date:%Y-%m-%d} was due again on {due:%Y-%m-%d}, {counted(late, 'day')} ago."
+            )
         if demanded_interval and self.interval and self.interval > demanded_interval * 1.001:
             asked, given = demanded_interval / 86_400, self.interval / 86_400
             out.append(f"its interval of {given:.0f} days is longer than the {asked:.0f} days that its type asks for.")

@@ -13,6 +13,7 @@ from typing import Final
 
 from teds_provision.errors import BadDataError, UsageError
 from teds_provision.limits import LIMITS, check_count
+from teds_provision.sanitize import counted
 from teds_provision.teds.calibration.order import CalibrationOrder
 from teds_provision.teds.certificate import CertificateChoice
 from teds_provision.teds.codec.model import Units
@@ -56,7 +57,7 @@ class CertificateItem:
         if self.indicated is None:
             return f"{name}{state}: coefficients, {_unit_name(self.reference.unit)}"
         of = f"{_named(self.indicated)} and {_named(self.reference)}"
-        return f"{name}{state}: {len(self.reference.values)} points, {of}"
+        return f"{name}{state}: {counted(len(self.reference.values), 'point')}, {of}"
 
     def to_json(self) -> dict[str, object]:
         """Return the item as ``show`` gives it."""

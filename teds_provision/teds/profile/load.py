@@ -135,13 +135,21 @@ def find_profile(name_or_path: str | Path, folders: Sequence[Path] | None = None
     return _by_name(text, default_folders() if folders is None else folders)
 
 
+def _is_base(path: Path) -> bool:
+    """Return True for a profile that is only a base for others; one that cannot be read is none."""
+    try:
+        return bool(re.search(r"(?m)^\s*abstract\s*=\s*true", path.read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
 def _by_name(name: str, folders: Sequence[Path], besides: Sequence[Path] = ()) -> Path:
     if _NAME.match(name):
         for folder in folders:
             path = folder / f"{name}.toml"
             if path.is_file() and path.resolve() not in besides:
                 return path
-    known = sorted({path.stem for path in _files(folders)})
+    known = sorted({path.stem for path in _files(folders) if not _is_base(path)})
     near = get_close_matches(name[:64], known, n=1, cutoff=0.5)
     guess = f'Did you mean "{near[0]}"? ' if near else ""
     raise NotFoundError(

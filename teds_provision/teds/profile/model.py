@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -214,9 +214,13 @@ def _require_buildable(profile: Profile, calibration: Mapping[int, Calibration])
     for number in calibration:
         if profile.channel(number) is None:
             raise BadDataError(
-                f"The calibration is for channel {number}; {profile.name} has channels 1 to {len(profile.channels)}.",
+                f"The calibration is for channel {number}; {profile.name} has {_numbered(profile.channels)}.",
                 hint="Give the calibration of this type, or --no-calibration to drop the one that the node has.",
             )
+
+
+def _numbered(channels: Sequence[ChannelProfile]) -> str:
+    return "channel 1 only" if len(channels) == 1 else f"channels 1 to {len(channels)}"
 
 
 def _uuid(uuid: bytes, edition: Edition, warnings: list[str]) -> bytes:
