@@ -82,6 +82,7 @@ FAILED = (
     "wrong-", "calibration-misfit", "usage", "bad-data", "bug",
     "changed", "conflict", "fork", "incomplete-installation", "missing-field",
     "newer-format", "newer-store", "office-refused", "registry", "roster-expired", "two-histories", "unclear-item",
+    "downgrade", "firmware", "reverted", "uuid-known",
 )  # fmt: skip
 """How the outcome of an act begins that did not do what it should: words, and the codes of the errors that end one."""
 
