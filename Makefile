@@ -71,6 +71,7 @@ bench: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.teds_codec --images 0
 	$(BIN)/python -m benchmarks.scale
 	$(BIN)/python -m benchmarks.radio
+	$(BIN)/python -m benchmarks.updating
 	$(BIN)/python -m benchmarks.plant
 	$(BIN)/python -m benchmarks.plant --local 120
 	$(BIN)/python -m benchmarks.line

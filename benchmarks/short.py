@@ -38,6 +38,7 @@ LEAST: dict[str, tuple[tuple[str, ...], ...]] = {
     "sinks": (("--seconds", "1", "--kills", "1"),),
     "teds_codec": (("--images", "10"),),
     "timeline": (("--nodes", "1"),),
+    "updating": (("--kib", "4", "--boards", "2"),),
     "verifying": (("20",),),
     "wrapped": (("--seconds", "1", "--nodes", "1", "--rate", "100"),),
 }

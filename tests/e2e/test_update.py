@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -204,3 +205,23 @@ def test_update_over_nfc_says_that_it_is_slow(desk: Desk, owner: Owner) -> None:
     assert done.code == 0, done
     assert "this link is slow" in done.err
     assert "1.0.0 → 1.1.0  updated" in done.out
+
+
+@pytest.mark.realtime
+def test_a_measurement_beside_an_update_loses_nothing(desk: Desk, owner: Owner) -> None:
+    station, node = desk.station(), board(desk, owner)
+    sensor = desk.node("sensor", type_=ANGLE).start("--source", "ramp:5", nfc=False, can=True)
+    over = desk.links.over("can")
+    for one in (node, sensor):
+        station.ask("whitelist", "add", one.uuid)
+    station.run("provision", "--all", *PROVISIONED, "--yes", *over)
+    measuring = station.start("--json", "measure", sensor.uuid, "--test-pattern", "--rate", "100", *over)
+    measuring.wait_for('"data"')
+    (line,), _ = update(station, node.uuid, owner.image("1.5.0", octets=20_000))
+    assert line["result"] == "updated"
+    measuring.signal(signal.SIGINT)
+    done = measuring.end()
+    end = json.loads(done.out.splitlines()[-1])
+    (stream,) = end["nodes"][0]["streams"]
+    assert (stream["lost"], stream["bad"]) == (0, 0), end
+    assert stream["samples"] > 50

@@ -52,6 +52,7 @@ ACTS = (
     Act("provision", "new", ("provision", "--profile", ANGLE, "--yes", "TAP")),
     Act("rotate", "provisioned", ("agree", "{UUID}", "--rotate", "LINK"), verdicts=NO_SHEET),
     Act("address", "provisioned", ("address", "{UUID}", "33", "LINK")),
+    Act("update", "updatable", ("update", "{UUID}", "{FILES}/new.bin", "--yes", "--wait", "10", "LINK")),
     Act("reset", "provisioned", ("reset", "{UUID}", "--yes", "LINK"), proof=""),
     Act("trust add", "strangers", ("trust", "add", "crane", "{FILES}/crane.pem", "--yes"), node=False),
     Act("copy", "pair", ("export-keys", "--to", "crane", "--all", "--yes", "--output", "{FILES}/c.jwe"), node=False),
@@ -177,12 +178,14 @@ MIXED = (
 """Commands that may all begin in one state, for two at once."""
 
 NEXT: dict[str, tuple[str, tuple[tuple[str, tuple[str, ...]], ...]]] = {
-    # state: (from which, ((station, words), ...)); "new" and "sensor" (which can be measured) are made by hand
+    # state: (from which, ((station, words), ...)); "new", "sensor" (which can be measured) and "slots" (which takes
+    # firmware) are made by hand
     "listed": ("new", (("home", ("whitelist", "add", "{UUID}")),)),
     "keyed": ("listed", (("home", ("agree", "{UUID}", "TAP")),)),
     "built": ("keyed", (("home", ("build", "{UUID}", "--profile", ANGLE)),)),
     "signed": ("built", (("home", ("sign", "{UUID}")),)),
     "provisioned": ("new", (("home", ("provision", "--profile", ANGLE, "--yes", "TAP")),)),
+    "updatable": ("slots", (("home", ("provision", "--profile", ANGLE, "--yes", "TAP")),)),
     "founded": ("provisioned", (("home", ("registry", "create", "--name", "plant", "--yes")),)),
     "plant": ("new", (("home", ("registry", "create", "--name", "plant", "--yes")),)),
     "ordered": ("plant", (("home", _JOB),)),

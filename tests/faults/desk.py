@@ -23,6 +23,7 @@ from teds_provision.vault.passphrase import THROWAWAY
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Links
 from tests.faults.acts import MANY, NEXT, UUID
+from tests.firmware_images import make_key, sign
 from tests.zygote import FIRST_FD, Child, Zygote
 
 PASSPHRASE = "correct horse battery"
@@ -175,8 +176,8 @@ class States:
             return place
 
     def _make(self, name: str, made: Path) -> None:
-        if name in ("new", "sensor"):
-            self._new(made, *(["--profile", ANGLE] if name == "sensor" else []))
+        if name in ("new", "sensor", "slots"):
+            self._new(made, *(["--profile", ANGLE] if name == "sensor" else []), slots=name == "slots")
             return
         before, steps = NEXT[name]
         shutil.copytree(self.of(before), made)
@@ -196,7 +197,7 @@ class States:
         if name == "backed up":
             (made / "fresh").mkdir(mode=0o700)
 
-    def _new(self, folder: Path, *hardware: str) -> None:
+    def _new(self, folder: Path, *hardware: str, slots: bool = False) -> None:
         folder.mkdir()
         (folder / "files" / "stick").mkdir(parents=True)
         (folder / "files" / "sheet.csv").write_text(f"uuid,profile\n{UUID},{ANGLE}\n")
@@ -212,5 +213,9 @@ class States:
             told = json.loads(desk.run("init", home=home).stdout)
             (folder / "files" / f"{name}.pem").write_text(told["public_key"])
         words = ["node", "create", str(folder / "flash"), "--uuid", UUID, *hardware]
+        if slots:
+            key = make_key(folder / "owner.pem")
+            words += ["--firmware", str(sign(folder, "1.0.0", key)), "--firmware-key", str(key)]
+            sign(folder, "1.1.0", key).rename(folder / "files" / "new.bin")
         made = ended(self.zygote.start("teds_provision", words, clean_environment()), 60)
         assert made.returncode == 0, made

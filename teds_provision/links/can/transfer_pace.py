@@ -44,7 +44,7 @@ class TransferPace:
         self._lock = threading.Lock()
         self._streams = self._others = 0.0
         self._began, self._load = clock(), 0.0
-        self._free_at, self._counted = 0.0, 0.0
+        self._free_at, self._counted, self._left = 0.0, 0.0, self._began
 
     def count(self, frame: Frame) -> None:
         """Count a frame that was heard or sent: of a stream, or of a command or reply."""
@@ -76,9 +76,10 @@ class TransferPace:
         with self._lock:
             now = self._clock()
             used, self._counted = self._others - self._counted, self._others
-            # what was used since the last call began then at the earliest; time that nobody used is not saved up
-            self._free_at = max(self._free_at, now - used) + used / max(_LEAST, _MOST - load)
-            left = self._free_at - now
+            # what was used since the last call began then; time that was left over before it is not saved up
+            self._free_at = max(self._free_at, self._left) + used / max(_LEAST, _MOST - load)
+            left = max(0.0, self._free_at - now)
+            self._left = now + left
         if left > 0:
             self._sleep(left)
         return load > 0
