@@ -225,8 +225,24 @@ class Measurement(TypedDict):
     process: Annotated[Process | None, Meta(description="of a command; it ends with its process")]
     state: Literal["starting", "waiting", "running", "failed", "ended"]
     why: str
+    lower_rate: Annotated[float | None, Meta(description="Hz to try if it loses values; null if it loses none")]
     nodes: list[Report]
     files: list[str]
+
+
+class RateProposal(TypedDict):
+    """The rate that bus, budget and machine can carry."""
+
+    rate: Annotated[float, Meta(description="Hz, for every channel")]
+    stated: Annotated[float, Meta(description="Hz of the fastest channel by its datasheet")]
+    limit: Annotated[Literal["datasheet", "bus", "budget", "machine"], Meta(description="what makes it slower")]
+    why: str
+
+
+class Rate(TypedDict):
+    """A proposal; null if no datasheet of the nodes states a rate."""
+
+    proposal: RateProposal | None
 
 
 class Sink(TypedDict):

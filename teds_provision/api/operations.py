@@ -88,6 +88,8 @@ OPERATIONS: Final = (
     Operation("GET", "/measurements", "List the measurements.", answers.Measurements),
     Operation("POST", "/measurements", "Measure until deleted, across restarts of the station and of nodes.",
               answers.Measurement, bodies.NewMeasurement, status=201),
+    Operation("GET", "/measurements/rate", "Propose the rate that bus, budget and machine can carry.",
+              answers.Rate, query={"group": _TEXT, "uuids": _TEXT}),
     Operation("DELETE", "/measurements/{id}", "End a measurement and forget it.", answers.Measurements),
     Operation("GET", "/names", "List the name and topic of every channel.", answers.Names),
     Operation("PUT", "/names", "Rename a node or a channel.", answers.Names, bodies.NewName),

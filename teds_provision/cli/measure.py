@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -150,7 +152,10 @@ def measure(
     )
     for uuid in uuids:
         station.unlock(uuid)
-    _tell_end(app, _run(app, job, links, uuids, duration), job.request.require, file_units)
+    _propose_rate(app, job, uuids)
+    ended = _run(app, job, links, uuids, duration)
+    again = "" if ended.lower_rate is None else _at_rate(job, uuids, ended.lower_rate)
+    _tell_end(app, ended, job.request.require, file_units, again)
 
 
 def _numbers(station: Station, uuids: Sequence[bytes], channels: Sequence[int | str]) -> list[int]:
@@ -280,15 +285,48 @@ def _run(
     return ended
 
 
-def _tell_end(app: App, ended: MeasurementEnd, require: Requirements | None, file_units: FileUnits) -> None:
+def _propose_rate(app: App, job: MeasurementJob, uuids: Sequence[bytes]) -> None:
+    """Propose a rate before a measurement at one that this machine may not record without losses."""
+    rates = measure_room.rates
+    if job.kept.rate is not None or job.kept.kind == "event":
+        return
+    values, busy = rates.this_machine()
+    found = rates.propose(job.station, uuids, job.request, rates.Surroundings(values=values, busy=busy))
+    if found is not None and found.limit != "datasheet":
+        app.note(
+            f"Values may be lost at the datasheet's {found.stated:g} Hz: {found.why}. To measure at {found.rate:g} Hz: "
+            f"{_at_rate(job, uuids, found.rate)}"
+        )
+
+
+def _at_rate(job: MeasurementJob, uuids: Sequence[bytes], rate: float) -> str:
+    """Return this very command with another rate."""
+    words = sys.argv[1:]
+    if "measure" not in words:  # it was called by a program
+        words = ["measure", *([job.kept.group] if job.kept.group else [uuid.hex() for uuid in uuids])]
+    kept, skip = [], False
+    for word in words:
+        if not skip and word != "--rate" and not word.startswith("--rate="):
+            kept.append(word)
+        skip = word == "--rate"
+    return shlex.join(["teds-provision", *kept, "--rate", f"{rate:g}"])
+
+
+def _tell_end(app: App, ended: MeasurementEnd, require: Requirements | None, file_units: FileUnits, again: str) -> None:
+    """Print how it ended; ``again`` is the same command at a rate at which less would be lost, "" if nothing was."""
     result: dict[str, Any] = {"event": "end", "nodes": ended.nodes, "files": ended.files, "sinks": ended.sinks}
+    if again:
+        result["lower_rate"] = {"rate": ended.lower_rate, "command": again}
     if ended.files:
         result["unit"] = file_units
     if require is not None:
         result["fits"] = require.fits
     if ended.apart:
         result["began_apart"] = ended.apart
-    app.conclude(result, "\n".join(_end_lines(ended, require)) or "Nothing was measured.", ended.error)
+    lines = _end_lines(ended, require) or ["Nothing was measured."]
+    if again:
+        lines.append(f"Values were lost. A lower rate may help: {again}")
+    app.conclude(result, "\n".join(lines), ended.error)
 
 
 def _end_lines(ended: MeasurementEnd, require: Requirements | None) -> list[str]:

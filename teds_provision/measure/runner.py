@@ -64,6 +64,7 @@ class MeasurementEnd:
     error: TedsProvisionError | None
     apart: float = 0.0
     sinks: list[dict[str, Any]] = field(default_factory=list)
+    lower_rate: float | None = None  # Hz to try, if messages were lost
 
 
 @dataclass
@@ -386,7 +387,9 @@ class Measurement:
         sinks = [
             {"sink": sink.name, "written": sink.stats.written, "dropped": sink.stats.dropped} for sink in self.sinks
         ]
-        return MeasurementEnd(nodes, files, worst, self._common_start.spread, sinks)
+        totals = [totals for keeper in self.supervisors for totals in keeper.streams.totals.values()]
+        rates = [rate for each in totals if (rate := each.lower_rate) is not None]
+        return MeasurementEnd(nodes, files, worst, self._common_start.spread, sinks, min(rates, default=None))
 
 
 def _summary(keeper: NodeSupervisor) -> dict[str, Any]:

@@ -27,7 +27,8 @@ from teds_provision.handover.life import is_retired
 from teds_provision.measure.blocks import ChannelFacts, NodeReport, SetPointCommand, StationFacts
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.matching import ListedNodes, NodeMatch, UnsignedNodes
-from teds_provision.measure.planning import period_of, sensors_of
+from teds_provision.measure.planning import BusTime, period_of, sensors_of
+from teds_provision.measure.rates import RateProposal, Surroundings, propose, this_machine
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.running.measurement_job import MeasurementJob
@@ -273,6 +274,33 @@ class MeasurementSupervisor:
                 self._station.audit("measure", None, "begun", **facts, nodes=[node.hex() for node in nodes])
             return self._json(self._begin(kept))
 
+    def proposed_rate(self, *, group: str | None = None, uuids: Sequence[str] = ()) -> RateProposal | None:
+        """Return the rate that bus, budget and machine can carry; None if no datasheet of these nodes states one.
+
+        Raises NotFoundError (the group), UsageError (none or both are named).
+        """
+        if (group is None) == (not uuids):
+            raise UsageError("A rate is proposed for a group, or for nodes.", hint='Give "group" or "uuids".')
+        kept = KeptMeasurement("", group=group, uuids=tuple(bytes.fromhex(uuid) for uuid in uuids))
+        values, busy = this_machine()
+
+        def bus(uuid: bytes) -> tuple[str, BusTime] | None:
+            sighting = self._buses.presence.seen_at(uuid)
+            if sighting is None:
+                return None
+            found = self._buses.bus_of(sighting)
+            return found.place, found.time_for(found.share.others(uuid), sighting.address)
+
+        around = Surroundings(
+            bus,
+            BUDGET if self._sinks.publish else None,
+            rows=self._sinks.publish,
+            scalar_rate=SCALAR_RATE,
+            values=values,
+            busy=busy,
+        )
+        return propose(self._station, self._station.measurements.nodes_of(kept), MeasurementRequest(), around)
+
     def _require_unmeasured(self, uuid: bytes) -> None:
         other = self.measurement_of(uuid.hex())
         if other is not None:
@@ -479,6 +507,7 @@ class MeasurementSupervisor:
             "process": None if kept.pid is None else {"id": kept.pid, "started": kept.started},
             "state": running.state,
             "why": running.why,
+            "lower_rate": _lower_rate(running.job),
             "nodes": [
                 running.reports.get(uuid, {"uuid": uuid, "state": "waiting", "why": ""})
                 for uuid in (dict.fromkeys((*running.uuids, *left)) if kept.lasting else ())
@@ -823,3 +852,12 @@ def _counts(running: RunningMeasurement) -> dict[str, int]:
     reports = list(running.reports.values())
     found = {name: sum(int(report.get(name) or 0) for report in reports) for name in ("samples", "lost")}
     return found if reports else {}
+
+
+def _lower_rate(job: MeasurementJob | None) -> float | None:
+    """Return the rate to try if a measurement loses values, for its worst stream; None if it loses none."""
+    measurement = job.measurement if job is not None else None
+    if measurement is None:
+        return None
+    streams = [totals for keeper in list(measurement.supervisors) for totals in keeper.streams.summed()]
+    return min((rate for totals in streams if (rate := totals.lower_rate) is not None), default=None)

@@ -100,6 +100,11 @@ class DaemonSinks:
         return self.actuators and kept.actuators and bool(_ROS & {*self._specs, *kept.sinks})
 
     @property
+    def publish(self) -> bool:
+        """True if every measurement goes to topics of ROS or MQTT, which take so many messages a second and no more."""
+        return bool(self._specs)
+
+    @property
     def take_set_points(self) -> bool:
         """True if set points come by topics for a measurement that allows it and names no sink."""
         return self.actuators and bool(_ROS & set(self._specs))

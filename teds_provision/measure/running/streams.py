@@ -15,6 +15,7 @@ from teds_provision.measure.blocks import Block, InvalidValues
 from teds_provision.measure.buses import MeasuredBus
 from teds_provision.measure.clock import ClockMap, HostClock, MonotonicStamps
 from teds_provision.measure.interpreter import StreamInterpreter
+from teds_provision.measure.rates import lower_rate
 from teds_provision.measure.stream_receiver import ReceivedStream
 from teds_provision.measure.verified_session import VerifiedSession, ask_clock
 from teds_provision.protocol.operation.stream_commands import ClockReply, StreamKind, decode_stopped, stop
@@ -52,6 +53,13 @@ class StreamTotals:
         self.invalid_why = added(self.invalid_why, heard.interpreter.invalid)
         self.invalid = sum(invalid.count for invalid in self.invalid_why)
         self.clock_error = heard.bound if heard.bound is not None else self.clock_error
+
+    @property
+    def lower_rate(self) -> float | None:
+        """The rate to try if messages were lost; None if none was, or none came."""
+        if not self.lost or not self.messages or self.period <= 0:
+            return None
+        return lower_rate(1 / self.period, self.messages, self.lost)
 
     def with_run(self, heard: ReceivedStream | None) -> StreamTotals:
         """Return these totals plus those of the current run; the object itself stays unchanged."""

@@ -6,7 +6,7 @@ import asyncio
 import re
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from typing import Any, Final
 
@@ -66,6 +66,7 @@ class Resources:
             Route("/groups", self.groups, methods=["GET", "POST"]),
             Route("/groups/{name:path}", self.group, methods=["PUT", "DELETE"]),
             Route("/measurements", self.measurements, methods=["GET", "POST"]),
+            Route("/measurements/rate", self.rate),
             Route("/measurements/{id}", self.measurement, methods=["DELETE"]),
             Route("/names", self.names, methods=["GET", "PUT"]),
             Route("/virtual", self.virtual, methods=["GET", "POST"]),
@@ -360,6 +361,13 @@ class Resources:
         said["uuids"] = await self._nodes_of(body.uuids)
         caller: Caller = request.scope[CALLER]
         return JSONResponse(await changing(lambda: measuring.add(**said, owner=caller.owner)), 201)
+
+    async def rate(self, request: Request) -> Response:
+        """GET /measurements/rate: of a group, or of nodes."""
+        group, named = request.query_params.get("group"), request.query_params.get("uuids", "")
+        uuids = await self._nodes_of([text for text in named.split(",") if text][:MOST_NODES])
+        found = await reading(lambda: self._daemon.measurements.proposed_rate(group=group, uuids=uuids))
+        return JSONResponse({"proposal": None if found is None else asdict(found)})
 
     async def measurement(self, request: Request) -> Response:
         """DELETE /measurements/ID."""

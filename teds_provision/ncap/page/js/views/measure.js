@@ -5,6 +5,7 @@ import { button, chip, empty, field, fill, h, icon, keyed, say, text, toast, tro
 import { byName, channelName, count, nameOf, namesOf, verdict } from "../format.js";
 import { LivePlot, plotted } from "../plot.js";
 import { isOfCommand, measuring, membersOf, on, refresh, state } from "../state.js";
+import { RateHint } from "./rates.js";
 import { SetPoints } from "./setpoints.js";
 import { plotHead, requireRate, told } from "./values.js";
 
@@ -113,6 +114,8 @@ class GroupCard {
     this.whose = h("p", { class: "hint" });
     this.element = h("li", { class: "panel group" }, h("div", { class: "panel-head" }, h("h4", {}, name), this.state), this.whose, this.members, h("div", { class: "row" }, field("Rate, Hz", this.rate), this.start, this.stop), this.more, this.error);
     this.element.card = this;
+    this.hint = new RateHint(this.rate, () => new URLSearchParams({ group: name }), () => this.again());
+    this.error.before(this.hint.element);
     this.start.setAttribute("aria-label", `Start ${name}`);
     this.stop.setAttribute("aria-label", `Stop ${name}`);
   }
@@ -142,6 +145,7 @@ class GroupCard {
     this.drop.disabled = !may || Boolean(one);
     this.rate.disabled = this.kind.disabled = this.trigger.disabled = this.record.disabled = Boolean(one);
     this.setPoints.paint(group.uuids ?? [], one);
+    this.hint.paint(one, may && (group.uuids ?? []).length > 0);
     if (one?.error && this.errorShown !== one.error.message) fill(this.error, trouble(one.error));
     this.errorShown = one?.error?.message;
   }
@@ -173,6 +177,16 @@ class GroupCard {
       requireRate(membersOf({ group: this.name }), rate);
       return post("measurements", { group: this.name, rate, kind: this.kind.value, trigger: this.trigger.checked, sinks: record ? [record] : [], ...this.setPoints.asked });
     }, `Group ${this.name} is now measuring.`);
+  }
+
+  /** Once more, at the rate that is in the field by now; all else as it was asked for. */
+  async again() {
+    const { id, kind, trigger, sinks, actuators, dead_man } = this.measurement;
+    const names = sinks.map((sink) => sink.split("/").at(-1)); // a file is named without its folder
+    await this.does(async () => {
+      await remove(paths.measurement(id));
+      return post("measurements", { group: this.name, rate: Number(this.rate.value), kind, trigger, sinks: names, actuators, dead_man });
+    }, `Group ${this.name} is now measured at ${this.rate.value} Hz.`);
   }
 
   async halt() {

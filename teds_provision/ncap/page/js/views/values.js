@@ -6,6 +6,7 @@ import { age, channelName, count, figure as words, hertz, nameOf, range, reading
 import { LivePlot, plotted, WINDOWS } from "../plot.js";
 import { isOfCommand, isStale, lastOf, measuring, now, on, refresh, state } from "../state.js";
 import { ActuatorPanel } from "./actuator.js";
+import { RateHint } from "./rates.js";
 import { SetPoints } from "./setpoints.js";
 
 const MOVING = 12; // channels that a node's plot shows
@@ -194,6 +195,8 @@ class ModePanel {
     this.error = h("div", {});
     const both = h("div", { class: "switch", role: "group", "aria-label": "Mode" }, this.idle, this.run);
     this.element = h("section", { class: "panel mode", "aria-label": "Configure" }, h("div", { class: "row" }, h("h3", {}, "Configure"), both, field("Rate, Hz", this.rate), this.state), this.setPoints.element, this.error);
+    this.hint = new RateHint(this.rate, () => new URLSearchParams({ uuids: uuid }), () => this.again());
+    this.error.before(this.hint.element);
     this.off = on("status connection measurements", () => this.paint());
   }
 
@@ -215,6 +218,8 @@ class ModePanel {
     this.rate.disabled = Boolean(one);
     const stranger = node?.whitelisted === false;
     this.setPoints.paint([this.uuid], one);
+    if (this.element.hidden || !sensors || stranger || (one && !own)) this.hint.hide();
+    else this.hint.paint(one, may);
     if (!one && stranger) fill(this.state, "Not on the whitelist: ", h("a", { href: `#/nodes/${this.uuid}/provision` }, "provision it first"), ".");
     else if (!one) fill(this.state, sensors ? "Idle." : "This node has no sensors to measure.");
     else if (isOfCommand(one)) fill(this.state, "Measured as part of group ", h("a", { href: "#/measure" }, one.group), ` by the command measure (process ${one.process?.id}). End it there with Ctrl-C.`);
@@ -229,6 +234,18 @@ class ModePanel {
       requireRate([this.uuid], rate);
       await post("measurements", { uuids: [this.uuid], rate, kind: "periodic", trigger: false, sinks: [], ...this.setPoints.asked });
       say("Measuring.");
+      await refresh("measurements", "nodes");
+    } catch (error) {
+      fill(this.error, trouble(error));
+    }
+  }
+
+  /** Once more, at the rate that is in the field by now; all else as it was asked for. */
+  async again() {
+    const { id, uuids, channels, kind, trigger, sinks, actuators, dead_man } = this.measurement;
+    try {
+      await remove(paths.measurement(id));
+      await post("measurements", { uuids, channels, rate: Number(this.rate.value), kind, trigger, sinks: sinks.map((sink) => sink.split("/").at(-1)), actuators, dead_man });
       await refresh("measurements", "nodes");
     } catch (error) {
       fill(this.error, trouble(error));

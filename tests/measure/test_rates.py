@@ -1,0 +1,109 @@
+"""The rate that is proposed: of the slowest of datasheet, bus, budget and machine; after losses a lower one."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from teds_provision.links.can.airtime import CanAirtime
+from teds_provision.measure.planning import BusTime
+from teds_provision.measure.rates import (
+    RateProposal,
+    Surroundings,
+    lower_rate,
+    propose,
+    rounded_down,
+)
+from teds_provision.measure.request import MeasurementRequest
+from teds_provision.station.station import Station
+from tests.bench import make_station
+from tests.e2e.desk import ANGLE
+from tests.measure.hall import FAULTY, Hall, provisioned
+
+HIGH = 1e9
+
+
+@pytest.fixture(scope="module")
+def station(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Station, bytes, bytes]]:
+    """A station with an angle sensor of 10 kHz and a gripper with two sensors of 100 Hz."""
+    folder = tmp_path_factory.mktemp("rates")
+    with_keys = make_station(folder / "bench", "bench")
+    try:
+        angle, hand = (
+            provisioned(with_keys, folder / name, type_, name) for name, type_ in (("a", ANGLE), ("h", "gripper"))
+        )
+        yield with_keys, bytes.fromhex(angle), bytes.fromhex(hand)
+    finally:
+        with_keys.close()
+
+
+def proposed(station: tuple[Station, bytes, bytes], around: Surroundings, *which: int) -> RateProposal:
+    found = propose(station[0], [station[number] for number in which], MeasurementRequest(), around)  # type: ignore[misc]
+    assert found is not None
+    return found
+
+
+def test_rates_are_rounded_down_and_a_loss_leaves_room() -> None:
+    rates = [10_000, 9_999, 3_846, 2_000, 1_999, 100, 99.9, 7, 0.35, 0.01]
+    assert [rounded_down(rate) for rate in rates] == [10_000, 5_000, 2_000, 2_000, 1_000, 100, 50, 5, 0.2, 0.1]
+    assert lower_rate(10_000, messages=900, lost=100) == 5_000
+    assert lower_rate(100, messages=1, lost=99) == 0.5
+    assert lower_rate(100, messages=0, lost=9) == 0.1
+
+
+def test_what_is_slowest_decides(station: tuple[Station, bytes, bytes]) -> None:
+    idle = Surroundings(values=HIGH)
+    whole = proposed(station, idle, 1)
+    assert (whole.limit, whole.rate) == ("datasheet", whole.stated)
+    fastest = whole.stated
+    assert fastest >= 1_000
+    busy = proposed(station, replace(idle, values=fastest / 2.6, busy="this machine is busy (load 5 on 2 cores)"), 1)
+    assert (busy.limit, busy.rate, busy.why) == (
+        "machine",
+        rounded_down(fastest / 2.6),
+        "this machine is busy (load 5 on 2 cores)",
+    )
+    slow = BusTime(CanAirtime(20_000, None))
+    narrow = proposed(station, replace(idle, bus=lambda _uuid: ("can0", slow)), 1)
+    assert narrow.limit == "bus"
+    assert narrow.rate < fastest
+    taken = proposed(station, replace(idle, bus=lambda _uuid: ("can0", replace(slow, taken=0.55))), 1)
+    assert taken.rate < narrow.rate, "others use the bus too"
+    topics = proposed(station, replace(idle, budget=1_000, rows=True), 1)
+    assert (topics.limit, topics.rate) == ("budget", 200), "two messages a row, and 10 a second of the channel"
+
+
+def test_one_rate_for_all_is_no_faster_than_the_slowest_channel(station: tuple[Station, bytes, bytes]) -> None:
+    both = proposed(station, Surroundings(values=1_000), 1, 2)
+    assert (both.limit, both.rate) == ("machine", 100), "else it would be refused"
+    assert propose(station[0], [bytes(10)], MeasurementRequest(), Surroundings()) is None, "nothing is known of it"
+
+
+@pytest.mark.link
+def test_a_run_that_lost_values_gives_the_command_for_a_lower_rate(tmp_path: Path) -> None:
+    hall = Hall(tmp_path, {"gaps": "gripper"})
+    try:
+        node = hall.nodes["gaps"]
+        hall.desk.start(hall.can, f"gaps={node.folder}", program=FAULTY).wait_for('"ready": true')
+        lines = hall.measure(node.uuid, "--rate", 50, "--duration", 2)
+        end = lines[-1]
+        assert end["nodes"][0]["streams"][0]["lost"] > 0
+        assert end["lower_rate"]["rate"] == 20, "four fifths of what came through"
+        words = shlex.split(end["lower_rate"]["command"])
+        assert words[0] == "teds-provision"
+        assert words[-2:] == ["--rate", "20"]
+        assert words.count("--rate") == 1, "the one that lost values is gone"
+        outcome = hall.station.start(*words[1:-2], "--rate", 20).end()  # and it works
+        assert outcome.code == 0, outcome
+        again = [word for word in words[1:-2] if word != "--json"]
+        human = hall.station.start(*again, "--rate=20").end()
+        assert re.search(
+            r"Values were lost\. A lower rate may help: teds-provision .*measure .* --rate 10", human.out
+        ), human
+    finally:
+        hall.close()
