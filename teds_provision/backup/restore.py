@@ -23,7 +23,7 @@ from teds_provision.errors import (
 )
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.node_keys import RESTORED
-from teds_provision.station.plant import new_home
+from teds_provision.station.plant.plant import new_home
 from teds_provision.station.station import Station
 from teds_provision.station.store import Store, StoreLock
 from teds_provision.station.store.database import has_store
@@ -116,15 +116,16 @@ def rebuild(
                     copy.put_facts(replace(facts, keystore=kind, keystore_why=why))
                 due = _demand_rotations(copy, content, known)
                 # Have a home that belongs to a plant look for its own pages before it states anything there
-                if copy.plant() is not None:
-                    station = Station(copy, known)
+                station = Station(copy, known)
+                in_plant = station.plant.record() is not None
+                if in_plant:
                     station.adopt(vault)
                     station.plant.begin_restored()
                 detail = {"created": content.created, "keystore": vault.kind, "rotations_due": due}
                 copy.audit.append("restore", None, "rebuilt", detail)
             aside = set_aside(home) if has_store(home) else None
             place(copy, home)
-            if copy.plant() is not None:
+            if in_plant:
                 new_home(home)
         return RestoreResult("rebuilt", None, totals(copy), (), kind, aside, due)
 

@@ -291,11 +291,11 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
     """Show each waiting parcel with its reason; take in those that the user confirms."""
     plant.apply_pages.require_roster(station)
     station.unlock()
-    tables, told = station.plant.parcels, list[dict[str, Any]]()
-    for row in tables.parcels("in", "waiting", "later"):
+    parcels, told = station.plant.parcels, list[dict[str, Any]]()
+    for row in parcels.all("in", "waiting", "later"):
         if row.kind != "bundle":
             continue
-        octets = tables.parcel_document(row.id, "in")
+        octets = parcels.document(row.id, "in")
         try:
             shown = handover_room.incoming.plan_import(station, octets)
         except TedsProvisionError as error:

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from teds_provision.plant.yield_stats import StationYield
     from teds_provision.protocol.plant.job import CalibrationRule, Job
     from teds_provision.protocol.plant.roster import Roster
+    from teds_provision.station.plant.line import EvidenceRow
     from teds_provision.station.station import Station
-    from teds_provision.station.store import EvidenceRow
 
 
 # -- job ---------------------------------------------------------------------------------------------------------------
@@ -623,7 +623,7 @@ def export(app: App, folder: Path, uuids: tuple[str, ...], job: str | None, dry_
     One file per board and attempt; a file with the same content is left alone.
     """
     station = app.station()
-    files = plant.evidence.export(station.plant.line, _rows(station, uuids, job), folder, write=not dry_run)
+    files = plant.evidence.export(station, _rows(station, uuids, job), folder, write=not dry_run)
     told = {"folder": str(folder), "files": len(files), "written": sum(files.values())}
     word = "Would write" if dry_run else "Wrote"
     app.emit(told, f"{word} {told['written']} of {told['files']} files to {folder}.")

@@ -132,7 +132,7 @@ def _with_plant(station: Station, described: Iterable[dict[str, Any]]) -> Iterat
         yield from described
         return
     found: dict[str, list[dict[str, str]]] = {}
-    for uuid, name, why in station.plant.tables.conflicts():
+    for uuid, name, why in station.plant.claims.conflicts():
         found.setdefault(uuid.hex(), []).append({"name": name, "why": why})
     rest = iter(described)
     while page := list(islice(rest, PAGE)):

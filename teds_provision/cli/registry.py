@@ -492,7 +492,7 @@ def sync(app: App, files: Path | None) -> None:
         doors = plant.connecting.check_database(station, post)
     finally:
         post.close()
-    alarms = [alarm for alarm in station.plant.tables.alarms() if not alarm.seen]
+    alarms = [alarm for alarm in station.plant.alarms.all() if not alarm.seen]
     told = {
         "pushed": done.pushed,
         "fetched": done.fetched,
@@ -570,7 +570,7 @@ def status(app: App) -> None:
         "alarms": [_alarm(station, alarm) for alarm in found.alarms],
         "to_rotate": plant.removed_members.rotations_due(station),
         "heads": list(found.heads),
-        "open_doors": station.plant.tables.doors(),
+        "open_doors": station.plant.doors(),
     }
     app.emit(told, _shown(station, found))
     if found.exit_code:
@@ -612,7 +612,7 @@ def _shown(station: Station, found: PlantStatus) -> str:
         need = "needs" if review.alone == 1 else "need"
         lines.append(f"{_count(review.alone, 'node')} {need} a tap: only a station that left held the key")
     lines += [f"ALARM {_alarm_line(station, alarm)}" for alarm in found.alarms if not alarm.seen]
-    doors = station.plant.tables.doors()
+    doors = station.plant.doors()
     if doors:
         lines.append(f"The database allows what it should not: {', '.join(doors)}")
     if found.expired:

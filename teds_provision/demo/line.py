@@ -178,7 +178,7 @@ def _proof(demo: Demo, office: Station, bench: Station) -> EvidenceTotals:
     with demo.steps.step("evidence") as step:
         for station in (bench, office):
             rows = station.plant.line.evidence()
-            for path in export(station.plant.line, rows, demo.folder / "evidence" / station.name):
+            for path in export(station, rows, demo.folder / "evidence" / station.name):
                 totals.add(judge_file(EvidenceAnchors(office.ca, roster=plant.jobs.roster_of(office)), path))
         if totals.exit_code:
             raise LinkError(f"The demo's evidence is not valid: {totals.words}")

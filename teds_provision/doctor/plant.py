@@ -8,10 +8,9 @@ from importlib.util import find_spec
 
 from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.lazy import install_command
-from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Roster, open_roster
 from teds_provision.sanitize import counted
-from teds_provision.station.store import Store
+from teds_provision.station.station import Station
 from teds_provision.station.store.database import has_store
 
 _SYNC = "teds-provision registry sync"
@@ -24,30 +23,24 @@ def registry(system: System) -> Iterator[Finding]:
     """Roster, last sync, what waits and what is to be decided; nothing for a station that joined none."""
     if not has_store(system.home):
         return
-    with Store.open(system.home) as store:
-        record, row, facts = store.plant(), store.held_roster(), store.facts()
-        if (
-            record is None
-            or record.left is not None
-            or row is None
-            or facts is None
-            or facts.ca is None
-            or facts.point is None
-        ):
+    with Station.inspect(system.home) as station:
+        plant, record = station.plant, station.plant.joined
+        row = plant.held_roster()
+        if record is None or row is None or not station.identity.is_complete():
             return
-        now, roster = datetime.now(UTC), open_roster(row.octets, facts.ca)
+        now, roster = datetime.now(UTC), open_roster(row.octets, station.ca)
         yield _roster(roster, now)
         if record.url is not None and record.url.startswith("postgres") and find_spec("psycopg") is None:
             yield Finding("registry", "failed", "psycopg is missing.", install_command("teds-provision[registry]"))
         synced = datetime.fromisoformat(record.synced) if record.synced is not None else None
         if synced is None or now - synced > _LATE:
             yield Finding("registry", "warning", f"The last sync was {record.synced or 'never'}.", _SYNC)
-        yield from _clocks(roster, store.page_newest(), now)
-        alarms = [alarm for alarm in store.alarms() if not alarm.seen]
+        yield from _clocks(roster, plant.pages.newest(), now)
+        alarms = [alarm for alarm in plant.alarms.all() if not alarm.seen]
         for alarm in alarms:
             yield Finding("registry", "warning", f"Alarm {alarm.code}: {alarm.why}.", "teds-provision registry status")
-        conflicts = len({uuid for uuid, _, _ in store.conflicts()})
-        said = f"{counted(store.unsent(fingerprint(facts.point)), 'event')} unsent, {counted(conflicts, 'conflict')}."
+        conflicts = len({uuid for uuid, _, _ in plant.claims.conflicts()})
+        said = f"{counted(plant.unsent(), 'event')} unsent, {counted(conflicts, 'conflict')}."
         fix = "teds-provision registry status" if conflicts else ""
         yield Finding("registry", "warning" if conflicts else "ok", said, fix)
 

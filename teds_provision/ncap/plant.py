@@ -100,7 +100,7 @@ class PlantWatch:
             ],
             "conflicts": [
                 {"uuid": uuid.hex(), "conflict": name, "detail": detail}
-                for uuid, name, detail in self._station.plant.tables.conflicts()
+                for uuid, name, detail in self._station.plant.claims.conflicts()
             ],
             "alarms": [
                 {"code": alarm.code, "about": roster.name_of(alarm.about) if alarm.about else "", "why": alarm.why,
@@ -205,10 +205,10 @@ class PlantWatch:
     def _say_daily(self) -> None:
         """Write an empty page each day: a station without a page for seven days counts as silent."""
         station, roster = self._station, self._station.plant.roster
-        chain = station.plant.tables.chains().get(station.fingerprint)
+        chain = station.plant.pages.chains().get(station.fingerprint)
         if roster is None or chain is None or not chain.counted[0]:
             return
-        page = station.plant.tables.page(chain.chain, *chain.counted)
+        page = station.plant.pages.get(chain.chain, *chain.counted)
         if (
             page is not None
             and (datetime.now(UTC) - datetime.fromisoformat(page.created)).total_seconds() > _EMPTY_PAGE

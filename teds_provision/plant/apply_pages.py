@@ -26,9 +26,11 @@ from teds_provision.protocol.plant.event import Event
 from teds_provision.protocol.plant.fold import BY_CONTACT, BanStatement, LocalState, MergedClaims, merge_claims
 from teds_provision.protocol.plant.page import Page
 from teds_provision.protocol.plant.roster import MOST_AHEAD, Roster, Taking, open_roster, taking
+from teds_provision.station.plant.alarms import Alarm
+from teds_provision.station.plant.pages import Chain, PageRow
+from teds_provision.station.plant.plant import RosterRow
 from teds_provision.station.station import Station
 from teds_provision.station.store import KeyRecord, NodeRecord, WhitelistEntry, utc_now
-from teds_provision.station.store.tables.plant import Alarm, Chain, PageRow, RosterRow
 
 AT_ONCE: Final = 500
 """Nodes that are judged in one transaction: others write in between."""
@@ -56,7 +58,7 @@ def alarm(station: Station, code: str, about: str, n: int, why: str, *, again: b
     ``again``: it happened once more, so an alarm that was seen is raised again.
     """
     with station.transaction():
-        if station.plant.tables.put_alarm(Alarm(code, about, n, why), again=again):
+        if station.plant.alarms.put(Alarm(code, about, n, why), again=again):
             station.audit("registry", None, f"alarm: {code}", about=about[:16], n=n, why=why)
             station.plant.record_event("alarm", code=code, about=about or None, n=n)
 
@@ -81,7 +83,7 @@ def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster,
             continue
         if roster.registry == registry:
             read.setdefault(roster.hash, roster)
-    known = {row.hash for row in station.plant.tables.rosters()}
+    known = {row.hash for row in station.plant.rosters()}
     for roster in sorted(read.values(), key=lambda roster: (roster.version, roster.hash)):
         own = station.plant.roster
         how, why = taking(roster, own, registry)
@@ -94,14 +96,14 @@ def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster,
         if how.startswith("taken"):
             put_roster(station, roster)
         elif how == "two rosters":
-            station.plant.tables.put_roster(RosterRow(roster.version, roster.hash, roster.octets, False, utc_now()))
+            station.plant.put_roster(RosterRow(roster.version, roster.hash, roster.octets, False, utc_now()))
         if "two rosters" in how:
             alarm(station, "two-rosters", "", roster.version, why)
     held = station.plant.roster
     if held is not None:  # the next version is the cure
-        for raised in station.plant.tables.alarms():
+        for raised in station.plant.alarms.all():
             if raised.code == "two-rosters" and raised.n < held.version and not raised.seen:
-                station.plant.tables.end_alarm(raised)
+                station.plant.alarms.end(raised)
     return told
 
 
@@ -109,15 +111,14 @@ def put_roster(station: Station, roster: Roster) -> None:
     """Have a roster count from now on, and bring in order which pages of each station count by it."""
     before = station.plant.roster
     with station.transaction():
-        mac = station.row_macs.note("roster", roster.hash)
-        station.plant.tables.put_roster(RosterRow(roster.version, roster.hash, roster.octets, True, utc_now(), mac))
+        station.plant.put_roster(RosterRow(roster.version, roster.hash, roster.octets, True, utc_now()))
         for member in roster.members:  # so that it can be handed keys without the CA key being here
             station.identity.keep_certificate(station.ca, member.point, member.certificate)
         station.audit("registry", None, "roster", version=roster.version, hash=roster.hash)
-        for station_id, chain in station.plant.tables.chains().items():
+        for station_id, chain in station.plant.pages.chains().items():
             if before is None or _last(before, station_id) != _last(roster, station_id):
                 recount(station, chain, roster)
-        station.plant.tables.queue_judging_of_all()
+        station.plant.claims.queue_all()
 
 
 def _last(roster: Roster, station: str) -> tuple[int, str] | None:
@@ -132,12 +133,11 @@ def take_pages(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
     """Keep pages of one station (their signatures were checked) and fold what counts of them, in one transaction."""
     if not pages:
         return
-    tables = station.plant.tables
     with station.transaction():
-        chain = tables.chain(pages[0].station)
+        chain = station.plant.pages.chain(pages[0].station)
         for page in pages:
-            tables.add_page(chain.chain, row_of(page))
-            tables.put_heads(chain.chain, page.heads)
+            station.plant.pages.add(chain.chain, row_of(page))
+            station.plant.pages.put_heads(chain.chain, page.heads)
         fresh = recount(station, chain, roster)
         for page in pages:
             if (page.number, page.hash) not in fresh:  # on no branch that counts; what it bans is banned all the same
@@ -154,28 +154,27 @@ def recount(station: Station, chain: Chain, roster: Roster) -> set[tuple[int, st
 
     Returns the pages that were folded now.
     """
-    tables = station.plant.tables
-    names = tables.page_names(chain.chain)
+    names = station.plant.pages.names(chain.chain)
     counts = counting(names, last=_last(roster, chain.station), accepted=chain.accepted)
     if counts.two is not None:
         why = "two histories part at this page" if chain.station != station.fingerprint else "of this very station"
         alarm(station, "two-histories", chain.station, counts.two, why)
     else:
-        tables.end_alarms("two-histories", chain.station)
+        station.plant.alarms.end_about("two-histories", chain.station)
     folded = chain.folded
     if folded[0] and folded not in counts.pages:
-        tables.forget_claims(chain.chain)
+        station.plant.claims.forget(chain.chain)
         folded = (0, "")
         for n, hash, _ in names:
-            if (n, hash) not in counts.pages and (page := tables.page(chain.chain, n, hash)) is not None:
+            if (n, hash) not in counts.pages and (page := station.plant.pages.get(chain.chain, n, hash)) is not None:
                 _keep_bans(station, chain, _events_of(page), counts=False)
     fresh = [place for place in counts.pages if place[0] > folded[0]]
     for n, hash in fresh:
-        row = tables.page(chain.chain, n, hash)
+        row = station.plant.pages.get(chain.chain, n, hash)
         assert row is not None
         _fold_page(station, chain, n, _events_of(row))
     if counts.newest != chain.counted or counts.newest != chain.folded:
-        tables.put_chain(replace(chain, counted=counts.newest, folded=counts.newest))
+        station.plant.pages.put_chain(replace(chain, counted=counts.newest, folded=counts.newest))
     return set(fresh)
 
 
@@ -186,13 +185,12 @@ def _events_of(page: PageRow) -> list[object]:
 
 def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object]) -> None:
     """Add the events of the next page that counts to what its station claims."""
-    tables = station.plant.tables
     read = [stated for stated in map(event.read, values) if stated is not None]
     wrong = [stated for stated in read if isinstance(stated, str)]
     events = [stated for stated in read if isinstance(stated, Event)]
-    known = tables.known_ids(chain.chain, [_number(stated.id) for stated in events])
+    known = station.plant.claims.known_ids(chain.chain, [_number(stated.id) for stated in events])
     by_node: dict[bytes, list[Event]] = {}
-    digests: list[tuple[bytes, int, bool, bytes | None]] = []
+    digests: list[tuple[bytes, int, bool]] = []
     for stated in events:
         number = _number(stated.id)
         if number in known:
@@ -201,25 +199,22 @@ def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object])
         known.add(number)
         if stated.act in ("signed", "vouched"):
             digest = stated.members["teds_sha256"]
-            digests.append(
-                (bytes.fromhex(digest), n, stated.act == "vouched", seal_of_digest(station, chain, n, stated))
-            )
+            digests.append((bytes.fromhex(digest), n, stated.act == "vouched"))
         elif stated.act == "lifted":
-            hash = stated.members["of"]
-            tables.put_lifting(hash, chain.chain, station.row_macs.note("plant lifted", f"{hash} {chain.station}"))
+            station.plant.claims.put_lifting(stated.members["of"], chain)
         if stated.uuid is not None:
             by_node.setdefault(stated.uuid, []).append(stated)
-    tables.add_ids(chain.chain, known)
-    tables.put_digests(chain.chain, digests)
+    station.plant.claims.add_ids(chain.chain, known)
+    station.plant.claims.put_digests(chain, digests)
     _keep_bans(station, chain, events, counts=True)
-    there = tables.claims_of_chain(chain.chain, list(by_node))
+    there = station.plant.claims.of_station(chain.chain, list(by_node))
     claims: dict[bytes, str] = {}
     for uuid, said in by_node.items():
         claim = Claim.from_json(there[uuid]) if uuid in there else Claim()
         for stated in said:
             claim.apply_event(stated)
         claims[uuid] = claim.to_json()
-    tables.put_claims(chain.chain, claims)
+    station.plant.claims.put(chain.chain, claims)
     if wrong:
         why = f"{len(wrong)} events were skipped: {wrong[0]}"
         alarm(station, "bad-event", chain.station, n, why)
@@ -230,11 +225,6 @@ def _number(id: str) -> int:
     return int.from_bytes(bytes.fromhex(id), "big", signed=True)
 
 
-def seal_of_digest(station: Station, chain: Chain, n: int, stated: Event) -> bytes:
-    """Return the MAC of the row of a digest that was signed, or vouched for, on page ``n``."""
-    return station.row_macs.note("digest", f"{stated.members['teds_sha256']} {chain.station} {n} {stated.act}")
-
-
 def _keep_bans(station: Station, chain: Chain, values: Iterable[object], *, counts: bool) -> None:
     for value in values:
         one = value if isinstance(value, Event) else event.read(value)
@@ -242,12 +232,12 @@ def _keep_bans(station: Station, chain: Chain, values: Iterable[object], *, coun
             text = one.members["statement"]
             if text.isascii():
                 hash = event.hash_of_statement(text)
-                station.plant.tables.put_ban(hash, chain.chain, counts=counts, uuid=one.uuid, statement=text)
+                station.plant.claims.put_ban(hash, chain.chain, counts=counts, uuid=one.uuid, statement=text)
 
 
 def counted_places(station: Station, roster: Roster, chain: Chain) -> frozenset[tuple[int, str]]:
     """Return number and H of the pages of a chain that count; of another history none above where the two part."""
-    names = station.plant.tables.page_names(chain.chain)
+    names = station.plant.pages.names(chain.chain)
     return frozenset(counting(names, last=_last(roster, chain.station), accepted=chain.accepted).pages)
 
 
@@ -304,17 +294,18 @@ def merged_views(station: Station, roster: Roster, uuids: Sequence[bytes]) -> di
 def _judged(
     station: Station, roster: Roster, uuids: Sequence[bytes], here: _LocalRows
 ) -> dict[bytes, tuple[MergedClaims, list[BanStatement]]]:
-    tables = station.plant.tables
-    claims = tables.claims_of(uuids)
+    claims = station.plant.claims.of_nodes(uuids)
     said: dict[bytes, list[BanStatement]] = {}
-    for uuid, hash, page_of, counts, text in tables.bans_of(uuids):
+    for uuid, hash, page_of, counts, text in station.plant.claims.bans_of(uuids):
         try:
             read = open_revocation(text, lambda kid: roster.point_of(kid) or station.policy.station_points().get(kid))
         except TedsProvisionError:  # of an unknown signer, or not what it seems: it bans nothing
             continue
         if read.uuid == uuid:
             said.setdefault(uuid, []).append(BanStatement(hash, page_of, counts, read))
-    lifted = {statement.hash: _lifters(station, statement.hash) for every in said.values() for statement in every}
+    lifted = {
+        statement.hash: station.plant.claims.lifters(statement.hash) for every in said.values() for statement in every
+    }
     judged = {}
     for uuid in uuids:
         statements = said.get(uuid, [])
@@ -324,11 +315,6 @@ def _judged(
     return judged
 
 
-def _lifters(station: Station, hash: str) -> set[str]:
-    rows = station.plant.tables.liftings_of(hash)
-    return {lifter for lifter, mac in rows if station.row_macs.noted("plant lifted", f"{hash} {lifter}", mac)}
-
-
 def apply_claims(station: Station) -> int:
     """Update whitelist, deny list and conflicts for every node with new statements; return how many.
 
@@ -336,17 +322,17 @@ def apply_claims(station: Station) -> int:
     goes.
     """
     done = 0
-    while uuids := station.plant.tables.to_judge(AT_ONCE):
+    while uuids := station.plant.claims.to_judge(AT_ONCE):
         roster = require_roster(station)
         with station.transaction():
             here = _LocalRows.read(station, uuids)
             judged = _judged(station, roster, uuids, here)
-            station.plant.tables.put_conflicts({uuid: seen.conflicts for uuid, (seen, _) in judged.items()})
+            station.plant.claims.put_conflicts({uuid: seen.conflicts for uuid, (seen, _) in judged.items()})
             _pin(station, judged, here)
             for uuid, (seen, statements) in judged.items():
                 if statements or station.policy.revocation(uuid) is not None:
                     _ban(station, uuid, seen, statements)
-            station.plant.tables.note_judged(uuids)
+            station.plant.claims.note_judged(uuids)
         done += len(uuids)
     return done
 
@@ -390,7 +376,7 @@ def _is_lifted(station: Station, statement: str, hash: str) -> bool:
         signer = open_revocation(statement, lambda kid: roster.point_of(kid) or _own(station, kid)).sender
     except TedsProvisionError:
         return False
-    return any(lifter == signer or "keeper" in roster.roles_of(lifter) for lifter in _lifters(station, hash))
+    return any(lifter == signer or "keeper" in roster.roles_of(lifter) for lifter in station.plant.claims.lifters(hash))
 
 
 def _own(station: Station, kid: str) -> bytes | None:
@@ -407,7 +393,7 @@ def heads_digest(station: Station) -> tuple[str, int]:
     """
     lines = sorted(
         f"{station_id} {chain.counted[0]} {chain.counted[1]}\n".encode()
-        for station_id, chain in station.plant.tables.chains().items()
+        for station_id, chain in station.plant.pages.chains().items()
         if chain.counted[0]
     )
     return hashlib.sha256(b"".join(lines)).hexdigest()[:16], len(lines)

@@ -51,7 +51,7 @@ def check_database(station: Station, post: Transport) -> list[str]:
     doors += [
         f"login of {left[open_login]}, which was removed" for open_login in post.open_logins() if open_login in left
     ]
-    station.plant.tables.put_doors(doors)
+    station.plant.put_doors(doors)
     return doors
 
 

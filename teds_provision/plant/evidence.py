@@ -14,7 +14,9 @@ from teds_provision.protocol.keys import prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.plant.evidence import NONCE_OCTETS, EvidenceClaim, seal
 from teds_provision.protocol.wire_agreement import Credentials
-from teds_provision.station.store import EvidenceRow, LineTables, utc_now
+from teds_provision.station.plant.line import EvidenceRow
+from teds_provision.station.station import Station
+from teds_provision.station.store import utc_now
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.teds.codec import security
 
@@ -62,7 +64,7 @@ def prove_claim(node: Conversation, claim: EvidenceClaim, nonce: bytes) -> bytes
     return proof
 
 
-def export(tables: LineTables, rows: Iterable[EvidenceRow], folder: Path, *, write: bool = True) -> dict[Path, bool]:
+def export(station: Station, rows: Iterable[EvidenceRow], folder: Path, *, write: bool = True) -> dict[Path, bool]:
     """Write documents as ``UUID.N.json``; return every file, and True for each new one.
 
     N counts all documents of a board that are kept here, whichever are chosen. Each file is written whole; raises
@@ -74,7 +76,9 @@ def export(tables: LineTables, rows: Iterable[EvidenceRow], folder: Path, *, wri
         make_folder(folder)
     for row in rows:
         if row.uuid not in numbers:
-            ordered = sorted(tables.evidence(uuid=row.uuid), key=lambda row: (row.finished, row.attempt, row.sha256))
+            ordered = sorted(
+                station.plant.line.evidence(uuid=row.uuid), key=lambda row: (row.finished, row.attempt, row.sha256)
+            )
             numbers = {row.uuid: {row.sha256: number for number, row in enumerate(ordered, 1)}}
         path = folder / f"{row.uuid.hex()}.{numbers[row.uuid][row.sha256]}.json"
         files[path] = not holds(path, row.document)

@@ -59,8 +59,8 @@ def fetch(station: Station, post: Transport, roster: Roster) -> int:
     for fingerprint in roster.by_key:
         if fingerprint == station.fingerprint or fingerprint not in heads:
             continue
-        chain = station.plant.tables.chain(fingerprint)
-        newest = max((n for n, _, _ in station.plant.tables.page_names(chain.chain)), default=0)
+        chain = station.plant.pages.chain(fingerprint)
+        newest = max((n for n, _, _ in station.plant.pages.names(chain.chain)), default=0)
         taken = take_carried(station, roster, fingerprint, post.pages(fingerprint, newest))
         fetched += taken.pages
         _report_junk(station, roster, fingerprint, [carried.number for carried in taken.junk], post)
@@ -79,7 +79,7 @@ def take_carried(
 
     A page that the station did not sign is no page: it ends nothing and may be asked for again.
     """
-    names = station.plant.tables.page_names(station.plant.tables.chain(author).chain)
+    names = station.plant.pages.names(station.plant.pages.chain(author).chain)
     known, numbers = {hash for _, hash, _ in names}, {n for n, _, _ in names} | {0}
     taken = Taken()
     batch: list[Page] = []
@@ -110,17 +110,17 @@ def take_carried(
 
 def note_waiting(station: Station, author: str, taken: Taken) -> None:
     """Note that a chain waits for a newer version of this program, or that it does so no longer."""
-    chain = station.plant.tables.chain(author)
+    chain = station.plant.pages.chain(author)
     if taken.waits is not None:
-        newest = max((n for n, _, _ in station.plant.tables.page_names(chain.chain)), default=0)
+        newest = max((n for n, _, _ in station.plant.pages.names(chain.chain)), default=0)
         alarm(station, "newer-format", author, newest + 1, taken.waits)
     if taken.waits != chain.waits:
-        station.plant.tables.put_chain(replace(chain, waits=taken.waits))
+        station.plant.pages.put_chain(replace(chain, waits=taken.waits))
 
 
 def _report_junk(station: Station, roster: Roster, name: str, junk: Sequence[int], post: Transport) -> None:
     if not junk:
-        station.plant.tables.end_alarms("junk", name)
+        station.plant.alarms.end_about("junk", name)
     for n in junk[:1]:
         alarm(
             station,

@@ -14,8 +14,8 @@ from teds_provision.plant import parcels
 from teds_provision.protocol.plant.document import JOB, is_form
 from teds_provision.protocol.plant.job import Job, open_job
 from teds_provision.protocol.plant.roster import Roster
+from teds_provision.station.plant.line import JobRow
 from teds_provision.station.station import Station
-from teds_provision.station.store import JobRow
 from teds_provision.teds.profile.load import default_folders, files_digest, find_profile
 
 CLOSED: Final = "closed"
@@ -101,7 +101,7 @@ def take_received(station: Station) -> None:
         except (BadDataError, NotAuthenticError, PolicyError) as error:
             station.notice(f"A received job was rejected: {error.message}")
         with station.durable("job"):
-            station.plant.parcels.drop_parcel(row.id, "in")
+            station.plant.parcels.drop(row.id, "in")
 
 
 def job_id(station: Station, text: str) -> str:

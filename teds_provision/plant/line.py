@@ -22,8 +22,9 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant.evidence import FAILED, PASSED, BoardFacts, EvidenceClaim, blocks_of
 from teds_provision.protocol.plant.job import WORTH, Job
 from teds_provision.station.label import label_of, read_label, write_label
+from teds_provision.station.plant.line import EvidenceRow, UnitRow
 from teds_provision.station.station import Station
-from teds_provision.station.store import EvidenceRow, UnitRow, WhitelistEntry, utc_now
+from teds_provision.station.store import WhitelistEntry, utc_now
 from teds_provision.steps.batch_sheet import BoardResult
 from teds_provision.steps.board_type import WrongBoardError
 from teds_provision.steps.build import BuildOrder, PreparedOrder, Proposal, prepare, profile_files_digest
@@ -246,11 +247,11 @@ class LineRun:
             attempt = self.station.plant.line.last_attempt(who.uuid) + 1
             return LineUnit(self, prepared, None, attempt, assurance, begun)
         if self.only_verify:
-            tables = self.station.plant.line
-            mine = sum(1 for _ in tables.evidence(uuid=who.uuid, job=job.id))
+            line = self.station.plant.line
+            mine = sum(1 for _ in line.evidence(uuid=who.uuid, job=job.id))
             with self._turn:
                 self._units_as_json[who.uuid] = {"job": job.id, "attempt": mine + 1}
-            return LineUnit(self, prepared, tables.unit(job.id, who.uuid), mine + 1, assurance, begun)
+            return LineUnit(self, prepared, line.unit(job.id, who.uuid), mine + 1, assurance, begun)
         if WORTH.get(assurance, 0) < WORTH[job.assurance]:
             raise PolicyError(
                 f"The job requires assurance '{job.assurance}'; board {who.uuid.hex()} was identified by"
@@ -270,12 +271,12 @@ class LineRun:
 
     def _row(self, job: Job, uuid: bytes) -> UnitRow:
         """Return the unit of this board with one more attempt; called in the transaction that keeps it."""
-        tables = self.station.plant.line
-        kept = tables.unit(job.id, uuid)
+        line = self.station.plant.line
+        kept = line.unit(job.id, uuid)
         if kept is not None:
             return replace(kept, attempts=kept.attempts + 1)
         require_adopted(self.station)
-        given, _, greatest = tables.count_units(job.id)
+        given, _, greatest = line.count_units(job.id)
         allotment = job.stations[self._own] if job.count is not None else len(job.boards)
         if given >= allotment:
             raise PolicyError(
@@ -288,11 +289,11 @@ class LineRun:
     def keep(self, document: bytes, claim: EvidenceClaim, finished: str, unit: LineUnit) -> None:
         """Keep the evidence of a claim, whole, and whether the unit passed."""
         digest, uuid, facts = hashlib.sha256(document).hexdigest(), claim.uuid, claim.facts
-        passed, tables = facts.failure is None, self.station.plant.line
+        passed, line = facts.failure is None, self.station.plant.line
         verdict = PASSED if passed else FAILED
         row = EvidenceRow(digest, uuid, facts.job, facts.unit, facts.attempt, verdict, finished, document)
         with self.station.durable("evidence"):
-            tables.add_evidence(row)
+            line.add_evidence(row)
             self.note(uuid, unit, passed=passed)
             self.station.audit("evidence", uuid, verdict, sha256=digest, attempt=facts.attempt)
             told = {"sha256": digest, "job": facts.job, "unit": facts.unit}

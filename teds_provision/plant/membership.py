@@ -15,9 +15,9 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant.chain import counting
 from teds_provision.protocol.plant.document import MemberRequest, hash_of, open_request
 from teds_provision.protocol.plant.roster import MOST_AHEAD, Roster, open_roster
+from teds_provision.station.plant.pages import Chain
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now
-from teds_provision.station.store.tables.plant import Chain
 from teds_provision.steps.verify import Verification, snapshot_trust, verify_image
 from teds_provision.teds.codec import security
 
@@ -89,7 +89,7 @@ def disconnect(station: Station) -> None:
     with station.transaction():
         record = station.plant.joined
         assert record is not None
-        station.plant.tables.put_plant(replace(record, left=utc_now(), url=None))
+        station.plant.put_record(replace(record, left=utc_now(), url=None))
         station.audit("registry", None, "left", registry=record.registry)
 
 
@@ -128,8 +128,8 @@ def vouch(station: Station, found: Sequence[tuple[bytes, str, str]]) -> int:
     fresh = 0
     with station.transaction():
         for uuid, digest, _ in found:
-            words = station.plant.tables.digest_words(bytes.fromhex(digest))
-            if any(vouched and who == station.fingerprint for who, _, vouched, _ in words):
+            words = station.plant.claims.signers(bytes.fromhex(digest))
+            if any(vouched and who == station.fingerprint for who, _, vouched in words):
                 continue
             station.plant.record_event("vouched", uuid, teds_sha256=digest)
             fresh += 1
@@ -142,10 +142,9 @@ def accept(station: Station, of: str, hash: str | None, post: Transport | None) 
     Local: others decide for themselves, and a roster's ``last`` goes before it. Returns the page that was taken.
     """
     n, wanted = branch(station, of, hash, post)
-    tables = station.plant.tables
     with station.transaction():
-        tables.put_chain(replace(tables.chain(of), accepted=(n, wanted)))
-        recount(station, tables.chain(of), require_roster(station))
+        station.plant.pages.put_chain(replace(station.plant.pages.chain(of), accepted=(n, wanted)))
+        recount(station, station.plant.pages.chain(of), require_roster(station))
         station.audit("registry", None, "accepted", station=of, n=n, hash=wanted)
     return n, wanted
 
@@ -156,9 +155,8 @@ def branch(station: Station, of: str, hash: str | None, post: Transport | None) 
     An earlier choice can be changed: name the other branch by its ``hash``. Raises NotFoundError, PolicyError.
     """
     roster = require_roster(station)
-    tables = station.plant.tables
-    chain: Chain = tables.chain(of)
-    names = tables.page_names(chain.chain)
+    chain: Chain = station.plant.pages.chain(of)
+    names = station.plant.pages.names(chain.chain)
     partings = [chain.counted[0] + 1]  # the one that is undecided
     if chain.accepted is not None:  # and the one that was decided, which a person may decide differently
         partings.append(counting(names, last=None, accepted=None).two or 0)

@@ -33,8 +33,9 @@ from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.job import Job
 from teds_provision.protocol.plant.roster import MOST_AHEAD
 from teds_provision.protocol.plant.signing import Answer, SignRequest, open_answer, open_request, seal_answer
+from teds_provision.station.plant.line import SignRequestRow, UnitRow
 from teds_provision.station.station import Station
-from teds_provision.station.store import SignRequestRow, UnitRow, WhitelistEntry, utc_now
+from teds_provision.station.store import WhitelistEntry, utc_now
 from teds_provision.steps.build import check_name, guard
 from teds_provision.steps.sign import sign
 from teds_provision.teds.calibration.files import read_calibrations
@@ -218,14 +219,14 @@ def _require_its_key(station: Station, job: Job, request: SignRequest) -> None:
 
 def _require_room(station: Station, job: Job, request: SignRequest) -> UnitRow:
     """Return the unit that the board has or gets, with one more answer; raises _Refused if there is none."""
-    tables = station.plant.line
-    kept = tables.unit(job.id, request.uuid)
+    line = station.plant.line
+    kept = line.unit(job.id, request.uuid)
     if kept is None:
-        given, _, greatest = tables.count_units(job.id)
+        given, _, greatest = line.count_units(job.id)
         if given >= job.total:
             raise _RefusedError("full", f"all {job.total} units of the job are assigned")
         return UnitRow(job.id, request.uuid, greatest + 1, utc_now())
-    answers = sum(row.sequence is not None for row in tables.sign_requests(job.id, request.uuid, "in"))
+    answers = sum(row.sequence is not None for row in line.sign_requests(job.id, request.uuid, "in"))
     if station.identity.fingerprint not in job.stations:
         answers = max(answers, kept.attempts)  # pages told a home that a backup rebuilt; it has no requests of since
     if answers >= MOST_ANSWERS:

@@ -34,8 +34,8 @@ from teds_provision.protocol.plant.roster import (
     read_roster,
     seal_roster,
 )
+from teds_provision.station.plant.plant import PlantRecord
 from teds_provision.station.station import Station
-from teds_provision.station.store.tables.plant import PlantRecord
 
 FIRST_ROLES: frozenset[Role] = frozenset({"keeper", "sign", "line", "base"})
 
@@ -78,12 +78,12 @@ def join(station: Station, roster: Roster, *, url: str | None, told: Sequence[To
     station.unlock()
     with station.transaction():
         mac = station.row_macs.note("plant", roster.registry)
-        before = station.plant.tables.plant()
+        before = station.plant.record()
         if before is not None and before.registry != roster.registry:
-            station.plant.tables.forget_plant()
+            station.plant.forget()
             before = None
         record = before or PlantRecord(roster.registry)
-        station.plant.tables.put_plant(replace(record, left=None, url=url or record.url, mac=mac))
+        station.plant.put_record(replace(record, left=None, url=url or record.url, mac=mac))
         put_roster(station, roster)
         for act, uuid, members in told:
             station.plant.record_event(act, uuid, **members)
@@ -150,7 +150,7 @@ def with_roles(station: Station, name: str, roles: frozenset[Role], last: Place 
     if "sign" in roles:
         place = None
     elif "sign" in member.roles:
-        place = last if last is not None else station.plant.tables.chain(member.fingerprint).counted
+        place = last if last is not None else station.plant.pages.chain(member.fingerprint).counted
     changed = replace(member, roles=roles, signed=place)
     return following(station, members=tuple(changed if current is member else current for current in own.members))
 
@@ -165,7 +165,7 @@ def draft_removal(station: Station, name: str, why: Why, last: int | None) -> Ro
     if isinstance(gone, RemovedMember) and gone.why == why and last in (None, gone.last[0]):
         return following(station)
     member = require_member(own, name)
-    chain = station.plant.tables.chain(member.fingerprint)
+    chain = station.plant.pages.chain(member.fingerprint)
     if last is None and why != "retired":
         raise UsageError(
             f"Which is the last page of {member.name} that you trust?",
@@ -187,11 +187,11 @@ def page_place(station: Station, of: str, n: int) -> Place:
     """Return number and H of a page that counts here; raises NotFoundError."""
     if n == 0:
         return NOWHERE
-    chain = station.plant.tables.chain(of)
-    found = [hash for number, hash, _ in station.plant.tables.page_names(chain.chain) if number == n]
+    chain = station.plant.pages.chain(of)
+    found = [hash for number, hash, _ in station.plant.pages.names(chain.chain) if number == n]
     if not found or n > chain.counted[0]:
         raise NotFoundError(f"Page {n} of that station is missing here or does not count.", hint="See: registry status")
-    for number, hash, previous in station.plant.tables.page_names(chain.chain):
+    for number, hash, previous in station.plant.pages.names(chain.chain):
         if number == n + 1 and len(found) > 1 and previous in found:
             return n, previous
         if number == n and len(found) == 1:

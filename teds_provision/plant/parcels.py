@@ -29,10 +29,10 @@ from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.document import JOB, SIGN_REQUEST, SIGNED, open_document
 from teds_provision.protocol.plant.fold import MergedClaims
 from teds_provision.protocol.plant.roster import Roster
+from teds_provision.station.plant.alarms import Alarm
+from teds_provision.station.plant.parcels import ParcelKind, ParcelRow
 from teds_provision.station.station import Station
 from teds_provision.station.store import TrustRecord, chunks
-from teds_provision.station.store.tables.parcels import ParcelKind, ParcelRow
-from teds_provision.station.store.tables.plant import Alarm
 
 NODES: Final = 10_000
 """So many nodes go into one copy."""
@@ -67,15 +67,13 @@ def take_in(station: Station, post: Transport, views: Views, now: datetime) -> P
         return ParcelCounts(0, 0)
     _drop_outlived(station, now)
     reader = _Reader(station, roster, views, now)
-    taken = sum(reader.again(row) for row in station.plant.parcels.parcels("in", "later"))
+    taken = sum(reader.again(row) for row in station.plant.parcels.all("in", "later"))
     for parcel in post.parcels(station.fingerprint):
         done = reader.process_parcel(parcel)
         if done is not None:
             post.drop(parcel.id, station.fingerprint)
             taken += done
-    return ParcelCounts(
-        taken, sum(row.kind == "bundle" for row in station.plant.parcels.parcels("in", "waiting", "later"))
-    )
+    return ParcelCounts(taken, sum(row.kind == "bundle" for row in station.plant.parcels.all("in", "waiting", "later")))
 
 
 def _drop_outlived(station: Station, now: datetime) -> None:
@@ -84,15 +82,15 @@ def _drop_outlived(station: Station, now: datetime) -> None:
     A sender makes an expired copy again, a line repeats its request; what stayed would take the room of new ones (64 of
     one).
     """
-    tables, oldest = station.plant.parcels, time_text(now - timedelta(days=_DAYS_OF_A_LINE))
-    for row in tables.parcels("in", "waiting", "later"):
+    parcels, oldest = station.plant.parcels, time_text(now - timedelta(days=_DAYS_OF_A_LINE))
+    for row in parcels.all("in", "waiting", "later"):
         if row.kind == "bundle":
             over = bool(row.expires) and row.expires <= time_text(now)
         else:
             over = row.kind in ("sign-request", "signed") and row.created < oldest
         if over:
             with station.durable(_COMMAND):
-                tables.drop_parcel(row.id, "in")
+                parcels.drop(row.id, "in")
                 station.audit("import", None, "expired", parcel=row.id, handover=row.about)
 
 
@@ -108,26 +106,26 @@ class _Reader:
 
         A sender that is still unknown is for an operator.
         """
-        octets = self.station.plant.parcels.parcel_document(row.id, "in")
+        octets = self.station.plant.parcels.document(row.id, "in")
         with self.station.lock(_COMMAND):
             try:
                 plan = incoming.plan_import(self.station, octets, self.now)
             except TedsProvisionError as error:
                 if isinstance(error, incoming.NothingImportedError):
                     self._refuse(error)
-                self.station.plant.parcels.drop_parcel(row.id, "in")
+                self.station.plant.parcels.drop(row.id, "in")
                 return True
             why = "" if isinstance(plan, incoming.ImportResult) else self._why_not(plan)
             if why:
-                self.station.plant.parcels.turn_parcel(row.id, "in", "waiting", why)
+                self.station.plant.parcels.turn(row.id, "in", "waiting", why)
                 return False
             import_parcel(self.station, row, plan)
             return True
 
     def process_parcel(self, parcel: Parcel) -> bool | None:
         """Process a parcel: True if it is done, False if it is kept here, None if it stays in the registry."""
-        tables = self.station.plant.parcels
-        if tables.parcel(parcel.id, "in") is not None:
+        parcels = self.station.plant.parcels
+        if parcels.get(parcel.id, "in") is not None:
             return False
         try:
             typ, inner = _inner(parcel.octets, self.station)
@@ -209,13 +207,13 @@ class _Reader:
         with self.station.lock(_COMMAND):
             closed = pending.close(self.station, parcel.octets)
             receipt = closed.receipt
-            tables = self.station.plant.parcels
+            parcels = self.station.plant.parcels
             with self.station.transaction():
-                for row in tables.parcels("out", "ready", "sent"):
+                for row in parcels.all("out", "ready", "sent"):
                     if row.kind == "bundle" and row.about == receipt.id and row.peer == receipt.sender:
-                        tables.turn_shared(row.id, "taken")
-                        tables.turn_shared(row.id, "refused", [refused.uuid for refused in receipt.refused])
-                        tables.drop_parcel(row.id, "out")
+                        parcels.turn_shared(row.id, "taken")
+                        parcels.turn_shared(row.id, "refused", [refused.uuid for refused in receipt.refused])
+                        parcels.drop(row.id, "out")
         return True
 
     def _keep_document(self, parcel: Parcel, typ: str, inner: bytes) -> bool | None:
@@ -237,11 +235,11 @@ class _Reader:
         return None if member is None else member.point
 
     def _keep(self, row: ParcelRow, parcel: Parcel) -> bool | None:
-        tables = self.station.plant.parcels
-        if sum(parcel_row.peer == row.peer for parcel_row in tables.parcels("in", "waiting", "later")) >= _KEPT:
+        parcels = self.station.plant.parcels
+        if sum(parcel_row.peer == row.peer for parcel_row in parcels.all("in", "waiting", "later")) >= _KEPT:
             return None
         with self.station.transaction():
-            tables.put_parcel(row, parcel.octets)
+            parcels.put(row, parcel.octets)
         return False
 
     def _refuse(self, error: incoming.NothingImportedError) -> None:
@@ -264,7 +262,7 @@ class _Reader:
         with self.station.durable(_COMMAND):
             if suspicious:
                 why = f"a parcel was discarded: {error.message.rstrip('.')}"
-                self.station.plant.tables.put_alarm(Alarm("parcel", parcel.sender, 0, why), again=True)
+                self.station.plant.alarms.put(Alarm("parcel", parcel.sender, 0, why), again=True)
             self.station.audit("import", None, "parcel discarded", parcel=parcel.id, why=error.message)
         return True
 
@@ -306,15 +304,15 @@ def import_parcel(
     """Take a bundle in and put its receipt among what leaves, all in one transaction; the caller holds the lock."""
     with station.transaction():
         done = plan if isinstance(plan, incoming.ImportResult) else incoming.import_bundle(station, plan)
-        station.plant.parcels.drop_parcel(row.id, "in")
+        station.plant.parcels.drop(row.id, "in")
         _put_out(station, "receipt", done.row.peers[0], done.receipt.strip(), done.row.id)
     return done
 
 
 def received(station: Station, kind: ParcelKind) -> list[tuple[ParcelRow, bytes]]:
     """Return the waiting parcels of a kind, oldest first, each with its document."""
-    tables = station.plant.parcels
-    return [(row, tables.parcel_document(row.id, "in")) for row in tables.parcels("in", "waiting") if row.kind == kind]
+    parcels = station.plant.parcels
+    return [(row, parcels.document(row.id, "in")) for row in parcels.all("in", "waiting") if row.kind == kind]
 
 
 # -- out ---------------------------------------------------------------------------------------------------------------
@@ -326,7 +324,7 @@ def send_export(station: Station, plan: outgoing.ExportPlan, now: datetime) -> s
     The same order again, while its parcel waits, gives the same parcel.
     """
     peer = plan.receivers[0].fingerprint
-    for row in station.plant.parcels.parcels("out", "ready", "sent"):
+    for row in station.plant.parcels.all("out", "ready", "sent"):
         if row.kind == "bundle" and row.about == plan.id and row.peer == peer and row.expires > time_text(now):
             return row.id
     sealed = outgoing.seal_export(station, plan, now)
@@ -354,7 +352,7 @@ def send_out(station: Station, post: Transport, views: Views, now: datetime) -> 
 
 def waiting_out(station: Station) -> int:
     """How many parcels were made and not receipted."""
-    return sum(row.kind != "receipt" for row in station.plant.parcels.parcels("out", "ready", "sent"))
+    return sum(row.kind != "receipt" for row in station.plant.parcels.all("out", "ready", "sent"))
 
 
 def _put_out(
@@ -367,39 +365,39 @@ def _put_out(
 ) -> str:
     parcel = str(uuids.uuid4())
     until = time_text(expires or datetime.now(UTC) + timedelta(days=DAYS))
-    station.plant.parcels.put_parcel(ParcelRow(parcel, "out", to, kind, "ready", until, about), document)
+    station.plant.parcels.put(ParcelRow(parcel, "out", to, kind, "ready", until, about), document)
     return parcel
 
 
 def _send(station: Station, roster: Roster, post: Transport) -> int:
-    tables, sent = station.plant.parcels, 0
-    for row in tables.parcels("out", "ready"):
+    parcels, sent = station.plant.parcels, 0
+    for row in parcels.all("out", "ready"):
         if roster.member(row.peer) is None:
             continue  # a removed station gets nothing; a move to it is a person's to take back
         try:
-            post.send(Parcel(row.id, row.peer, tables.parcel_document(row.id, "out"), row.expires, station.fingerprint))
+            post.send(Parcel(row.id, row.peer, parcels.document(row.id, "out"), row.expires, station.fingerprint))
         except PolicyError:
             break  # too much waits there: the rest goes with the next sync
         with station.durable(_COMMAND):
             if row.kind == "bundle":
-                tables.turn_parcel(row.id, "out", "sent")
+                parcels.turn(row.id, "out", "sent")
             else:
-                tables.drop_parcel(row.id, "out")
+                parcels.drop(row.id, "out")
         sent += 1
     return sent
 
 
 def _expire(station: Station, now: datetime) -> None:
     """Replace what was not receipted in time: a copy by another one, a move under its old id."""
-    tables = station.plant.parcels
-    for row in tables.parcels("out", "ready", "sent"):
+    parcels = station.plant.parcels
+    for row in parcels.all("out", "ready", "sent"):
         if row.expires > time_text(now):
             continue
         with station.lock(_COMMAND):
             handover = station.handovers.get(row.about, "out") if row.kind == "bundle" else None
             with station.transaction():
-                tables.forget_shared(row.id)
-                tables.drop_parcel(row.id, "out")
+                parcels.forget_shared(row.id)
+                parcels.drop(row.id, "out")
             if handover is not None and handover.mode == "move" and handover.state == pending.OPEN:
                 nodes = tuple(
                     bytes.fromhex(uuid_hex) for uuid_hex in pending.BundleNotes.from_json(handover.nodes).uuids
@@ -411,17 +409,17 @@ def _expire(station: Station, now: datetime) -> None:
 
 def _note_refused(station: Station) -> None:
     """Record which copies their receivers report, on a page, as refused: they are not made again."""
-    tables, me = station.plant.parcels, station.fingerprint
-    for row in tables.parcels("out", "sent"):
-        held = tables.shared_in(row.id) if row.kind == "bundle" else []
+    parcels, me = station.plant.parcels, station.fingerprint
+    for row in parcels.all("out", "sent"):
+        held = parcels.shared_in(row.id) if row.kind == "bundle" else []
         if not held:
             continue
-        claims = station.plant.tables.claims_of([held[0][0]]).get(held[0][0], {})
+        claims = station.plant.claims.of_nodes([held[0][0]]).get(held[0][0], {})
         claim = Claim.from_json(claims[row.peer]) if row.peer in claims else Claim()
         if any(bundle == row.about and peer == me for bundle, peer, _ in claim.refused):
             with station.durable(_COMMAND):
-                tables.turn_shared(row.id, "refused")
-                tables.drop_parcel(row.id, "out")
+                parcels.turn_shared(row.id, "refused")
+                parcels.drop(row.id, "out")
 
 
 def _make_copies(station: Station, roster: Roster, views: Views, now: datetime) -> None:
@@ -444,13 +442,13 @@ def _due(
     station: Station, roster: Roster, views: Views, receiver: str, quiet: set[str]
 ) -> tuple[list[bytes], list[bytes]]:
     """Nodes of which a receiver gets a copy from here; those that stations do not agree on apart."""
-    me, tables = station.fingerprint, station.plant.parcels
+    me, parcels = station.fingerprint, station.plant.parcels
     shares = [share for share in roster.share if receiver in sharing.receivers(roster, me, share)]
     clear: list[bytes] = []
     disputed: list[bytes] = []
-    own = _with_views(views, tables.unshared(receiver))
+    own = _with_views(views, parcels.unshared(receiver))
     gone = quiet or roster.removed  # else the maker of a key shares it
-    others = _with_views(views, tables.unshared(receiver, imported=True)) if gone else iter(())
+    others = _with_views(views, parcels.unshared(receiver, imported=True)) if gone else iter(())
     mine = (other for other in others if sharing.sharer(roster, other[3], (other[1], other[2]), quiet) == me)
     for uuid, _, _, view in chain(own, mine):
         if sharing.shares_any(shares, view, me) and not sharing.gave_away(view, receiver):
@@ -467,10 +465,10 @@ def _with_views(views: Views, rows: Sequence[tuple[bytes, int, str]]) -> Iterato
 
 def _forget(station: Station, roster: Roster, views: Views) -> None:
     """Delete the keys of which all receivers of a share with ``forget`` have sent a receipt; a tap brings one back."""
-    me, tables = station.fingerprint, station.plant.parcels
+    me, parcels = station.fingerprint, station.plant.parcels
     if not any(share.forget for share in roster.share):
         return
-    for page in chunks(tables.receipted()):
+    for page in chunks(parcels.receipted()):
         seen = views([uuid for uuid, _, _ in page])
         for uuid, epoch, taken in page:
             shares = [share for share in roster.share if sharing.shares_any([share], seen[uuid], me)]
@@ -489,10 +487,10 @@ def _delete(station: Station, uuid: bytes, epoch: int) -> None:
 
 def silent_stations(station: Station, roster: Roster, now: datetime) -> set[str]:
     """Members, but this one, of which no page came that was made within the last seven days."""
-    tables, created = station.plant.tables, dict[str, datetime | None]()
-    for digits, said in tables.chains().items():
+    created = dict[str, datetime | None]()
+    for digits, said in station.plant.pages.chains().items():
         if roster.member(digits) is not None and digits != station.fingerprint:
-            page = tables.page(said.chain, *said.counted) if said.counted[0] else None
+            page = station.plant.pages.get(said.chain, *said.counted) if said.counted[0] else None
             at = page.created if page is not None else ""
             created[digits] = datetime.fromisoformat(at) if at else None
     return sharing.silent(created, now)

@@ -109,7 +109,7 @@ def _mark(
     ours: Mapping[str, datetime],
 ) -> None:
     """Mark those of a page of nodes whose key a station that left has had, and note whose turn the rotation is."""
-    claims = station.plant.tables.claims_of(list(keys))
+    claims = station.plant.claims.of_nodes(list(keys))
     marked = station.keys.due_among(list(keys))
     wanted: dict[bytes, str] = {}
     for uuid, key in keys.items():
@@ -182,12 +182,12 @@ def _beyond(station: Station, roster: Roster) -> dict[tuple[bytes, int, str], se
     """Keys (UUID, epoch, key id) that who left names on pages that do not count: later ones, and another history's."""
     found: dict[tuple[bytes, int, str], set[str]] = {}
     for removed in roster.removed:
-        chain = station.plant.tables.chains().get(removed.fingerprint)
+        chain = station.plant.pages.chains().get(removed.fingerprint)
         if chain is None:
             continue
         counted = counted_places(station, roster, chain)
-        for n, hash, _ in station.plant.tables.page_names(chain.chain):
-            page = None if (n, hash) in counted else station.plant.tables.page(chain.chain, n, hash)
+        for n, hash, _ in station.plant.pages.names(chain.chain):
+            page = None if (n, hash) in counted else station.plant.pages.get(chain.chain, n, hash)
             if page is None:
                 continue
             for value in load_exact(page.content, "A page").get("events", ()):
@@ -201,7 +201,7 @@ def _beyond(station: Station, roster: Roster) -> dict[tuple[bytes, int, str], se
 def _first_removals(station: Station) -> dict[str, datetime]:
     """Since when the removal of each station that left is known here."""
     since: dict[str, datetime] = {}
-    for row in station.plant.tables.rosters():
+    for row in station.plant.rosters():
         for fingerprint in _removed_in(row.octets, station.ca):
             at = datetime.fromisoformat(row.at)
             since[fingerprint] = min(since.get(fingerprint, at), at)
@@ -219,7 +219,7 @@ def _removed_in(octets: bytes, ca: bytes) -> frozenset[str]:
 def _alone(station: Station, roster: Roster) -> int:
     """Return the number of nodes whose key only the removed station had: a tap is needed."""
     count, after = 0, b""
-    while page := station.plant.tables.claimed_nodes(after, _PAGE):
+    while page := station.plant.claims.nodes(after, _PAGE):
         after = page[-1]
         held = _keys_held(station, page).keys()
         seen = merged_views(station, roster, page)

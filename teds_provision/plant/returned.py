@@ -19,8 +19,8 @@ from teds_provision.plant.fetching import note_waiting, read_pages, take_carried
 from teds_provision.plant.transport import CarriedPage, Offer, Returned
 from teds_provision.protocol.plant.page import Page
 from teds_provision.protocol.plant.roster import Roster
+from teds_provision.station.plant.pages import Chain
 from teds_provision.station.station import Station
-from teds_provision.station.store.tables.plant import Chain
 
 FORGED: Final = "forged"
 """Alarm: a member handed in a page that its author did not sign."""
@@ -34,12 +34,12 @@ def is_new(station: Station, database: Returned, roster: Roster) -> bool:
     That is after any change since the last comparison.
     """
     digest = _digest(station, database, roster)
-    return digest != "" and digest != station.plant.tables.returned_state()
+    return digest != "" and digest != station.plant.returned_state()
 
 
 def note(station: Station, database: Returned, roster: Roster) -> None:
     """Note that the comparison was made."""
-    station.plant.tables.put_returned_state(_digest(station, database, roster))
+    station.plant.put_returned_state(_digest(station, database, roster))
 
 
 def _digest(station: Station, database: Returned, roster: Roster) -> str:
@@ -47,10 +47,10 @@ def _digest(station: Station, database: Returned, roster: Roster) -> str:
     states = {name: state for name in sorted(roster.by_key) if (state := database.state(name))}
     if not states:
         return ""
-    chains = station.plant.tables.chains()
+    chains = station.plant.pages.chains()
     told = hashlib.sha256(f"{roster.hash} {database.takes_pages}\n".encode())
     for name, state in states.items():
-        names = station.plant.tables.page_names(chains[name].chain) if name in chains else []
+        names = station.plant.pages.names(chains[name].chain) if name in chains else []
         told.update(f"{state} {' '.join(hash for _, hash, _ in names)}\n".encode())
     return told.hexdigest()
 
@@ -82,7 +82,7 @@ def take(station: Station, database: Returned, roster: Roster) -> int:
     for author in sorted(roster.by_key):
         if author == station.fingerprint or not database.was_handed_in(author):
             continue
-        names = station.plant.tables.page_names(station.plant.tables.chain(author).chain)
+        names = station.plant.pages.names(station.plant.pages.chain(author).chain)
         known = {hash for _, hash, _ in names}
         offers = [offer for offer in database.offers(author) if offer.hash not in known]
         liars: set[str] = set()
@@ -98,7 +98,7 @@ def take(station: Station, database: Returned, roster: Roster) -> int:
         if offers:
             note_waiting(station, author, taken)
     if not forged:
-        station.plant.tables.end_alarms_of(FORGED)
+        station.plant.alarms.end_all_of(FORGED)
     return taken_pages
 
 
@@ -124,7 +124,7 @@ def hand_in(station: Station, database: Returned, roster: Roster) -> tuple[int, 
     Returns how many, and a sentence for each author of which the database does not take them.
     """
     handed_in, refused = 0, []
-    chains = station.plant.tables.chains()
+    chains = station.plant.pages.chains()
     for author in sorted(roster.by_key):
         chain = chains.get(author)
         if author == station.fingerprint or chain is None or database.is_open(author):
@@ -153,8 +153,8 @@ def _lacking(
 ) -> Iterator[tuple[int, bytes]]:
     """Yield number and octets of the pages here that are not there: those that count before all others."""
     counted = counted_places(station, roster, chain)
-    names = [(n, hash) for n, hash, _ in station.plant.tables.page_names(chain.chain)]
+    names = [(n, hash) for n, hash, _ in station.plant.pages.names(chain.chain)]
     for n, hash in sorted(names, key=lambda place: (place not in counted, place)):
-        row = station.plant.tables.page(chain.chain, n, hash)
+        row = station.plant.pages.get(chain.chain, n, hash)
         if row is not None and (n, hashlib.sha256(octets_of(row)).hexdigest()) not in there:
             yield n, octets_of(row)

@@ -50,8 +50,9 @@ from teds_provision.protocol.plant.signing import (
     open_request,
     seal_request,
 )
+from teds_provision.station.plant.line import SignRequestRow
 from teds_provision.station.station import Station
-from teds_provision.station.store import Draft, SignRequestRow
+from teds_provision.station.store import Draft
 from teds_provision.steps.build import own_name
 from teds_provision.steps.commands import at_node
 from teds_provision.steps.sign import SignResult
@@ -128,12 +129,11 @@ class Inbox:
     def collect(self) -> list[Delivery]:
         """Return what came since; raises LinkError."""
         station, own = self._station, self._station.identity.fingerprint
-        tables = station.plant.parcels
         found = []
         for row, document in parcels.received(station, parcels.OF_A_LINE[self._kind.typ]):
             if row.id not in self._known:
                 self._known.add(row.id)
-                found.append(Delivery(document, partial(self._drop, row.id, tables.drop_parcel, "in")))
+                found.append(Delivery(document, partial(self._drop, row.id, station.plant.parcels.drop, "in")))
         for parcel in self._transport.new_parcels(own, self._known):
             self._known.add(parcel.id)
             opened = self._opened(parcel.octets)

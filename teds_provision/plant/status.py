@@ -12,8 +12,10 @@ from teds_provision.plant.apply_pages import AT_ONCE, counted_places, heads_dige
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Member, Roster
+from teds_provision.station.plant.alarms import Alarm
+from teds_provision.station.plant.pages import Chain
+from teds_provision.station.plant.plant import PlantRecord
 from teds_provision.station.station import Station
-from teds_provision.station.store.tables.plant import Alarm, Chain, PlantRecord
 
 SILENT: Final = timedelta(days=7)
 """A station whose newest page that counts is older than this is silent."""
@@ -71,14 +73,14 @@ def moment(roster: Roster) -> datetime:
 def status(station: Station, record: PlantRecord, roster: Roster) -> PlantStatus:
     """Look at the store alone; no connection is opened."""
     at = moment(roster)
-    chains = station.plant.tables.chains()
+    chains = station.plant.pages.chains()
     return PlantStatus(
         record,
         roster,
         tuple(_standing(station, member, chains.get(member.fingerprint), at) for member in roster.by_key.values()),
-        station.plant.tables.unsent(station.fingerprint),
-        len({uuid for uuid, _, _ in station.plant.tables.conflicts()}),
-        tuple(station.plant.tables.alarms()),
+        station.plant.unsent(),
+        len({uuid for uuid, _, _ in station.plant.claims.conflicts()}),
+        tuple(station.plant.alarms.all()),
         heads_digest(station),
         at,
     )
@@ -88,7 +90,7 @@ def _standing(station: Station, member: Any, chain: Chain | None, at: datetime) 
     n = chain.counted[0] if chain is not None else 0
     age = None
     if chain is not None and n:
-        created = next((c for number, h, c, _ in station.plant.tables.page_times(chain.chain, 50)
+        created = next((c for number, h, c, _ in station.plant.pages.times(chain.chain, 50)
                         if (number, h) == chain.counted and c), None)  # fmt: skip
         age = max(0, int((at - datetime.fromisoformat(created)).total_seconds())) if created else None
     if not isinstance(member, Member):
@@ -98,7 +100,7 @@ def _standing(station: Station, member: Any, chain: Chain | None, at: datetime) 
     elif chain is not None and chain.waits is not None:
         state = "newer version"
     elif any(
-        alarm.code == "two-histories" and alarm.about == member.fingerprint for alarm in station.plant.tables.alarms()
+        alarm.code == "two-histories" and alarm.about == member.fingerprint for alarm in station.plant.alarms.all()
     ):
         state = "two histories"
     else:
@@ -122,11 +124,11 @@ def log(
 ) -> Iterator[StatedEvent]:
     """Yield what stations stated, chain by chain in the order of their pages: verified when the page came in."""
     roster = require_roster(station)
-    for fingerprint, chain in sorted(station.plant.tables.chains().items()):
+    for fingerprint, chain in sorted(station.plant.pages.chains().items()):
         if of is not None and fingerprint != of:
             continue
         counted = counted_places(station, roster, chain)
-        for page in station.plant.tables.each_page(chain.chain):
+        for page in station.plant.pages.each(chain.chain):
             if since is not None and page.created < since:
                 continue
             for value in load_exact(page.content, "A page").get("events", ()):
@@ -178,7 +180,7 @@ def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator
     """
     after, wanted = b"", (text or "").lower()
     digits = wanted.removeprefix("0x")
-    while uuids := station.plant.tables.claimed_nodes(after, AT_ONCE):
+    while uuids := station.plant.claims.nodes(after, AT_ONCE):
         after = uuids[-1]
         for uuid, seen in merged_views(station, roster, uuids).items():
             name = seen.name or ""
@@ -209,5 +211,5 @@ def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator
 
 def page_list(station: Station, of: str, most: int = 20) -> list[tuple[int, str, str]]:
     """Return number, H and time of the newest pages of a station, newest first: to choose a last one from."""
-    chain = station.plant.tables.chain(of)
-    return [(n, hash, created) for n, hash, created, _ in station.plant.tables.page_times(chain.chain, most)]
+    chain = station.plant.pages.chain(of)
+    return [(n, hash, created) for n, hash, created, _ in station.plant.pages.times(chain.chain, most)]

@@ -36,10 +36,11 @@ from teds_provision.protocol.plant.fold import MergedClaims
 from teds_provision.protocol.plant.page import MOST_EVENTS, MOST_PAYLOAD, Page, PageDraft, open_page, seal_page
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.sanitize import counted
-from teds_provision.station.plant import new_home
+from teds_provision.station.plant.line import UnitRow
+from teds_provision.station.plant.pages import Chain
+from teds_provision.station.plant.plant import new_home
 from teds_provision.station.station import Station
-from teds_provision.station.store import StoreLock, UnitRow, WhitelistEntry, utc_now
-from teds_provision.station.store.tables.plant import Chain
+from teds_provision.station.store import StoreLock, WhitelistEntry, utc_now
 
 LOCK_FILE: Final = "registry.lock"
 _ROOM: Final = 20_000
@@ -95,13 +96,13 @@ def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncRe
         done.fetched += fetching.fetch(station, post, roster)
         _return_pages(station, post, roster, done)
         done.judged = apply_claims(station)
-        acknowledged = station.plant.tables.seen_heads()
+        acknowledged = station.plant.pages.seen_heads()
         done.told += [said for head, said in unseen_heads(station, roster).items() if head not in acknowledged]
         _parcels(station, post, roster, done)
         with station.transaction():
             joined = station.plant.joined
             assert joined is not None
-            station.plant.tables.put_plant(replace(joined, synced=utc_now()))
+            station.plant.put_record(replace(joined, synced=utc_now()))
         return done
 
 
@@ -131,7 +132,7 @@ def _rosters(station: Station, post: Transport, done: SyncResult) -> list[tuple[
     for roster, how, why in told:
         if how not in ("taken", "older"):  # each member posts the newest that it knows: some are behind
             done.told.append(f"roster {roster.version}: {how}: {why}")
-    held = station.plant.tables.held_roster()
+    held = station.plant.held_roster()
     if held is not None:
         post.post_roster(held.version, held.hash, held.octets)
     return [(told_roster, str(how), why) for told_roster, how, why in told]
@@ -155,7 +156,7 @@ def _parcels(station: Station, post: Transport, roster: Roster, done: SyncResult
 
 def own_chain(station: Station) -> Chain:
     """Return the chain of this station."""
-    return station.plant.tables.chain(station.fingerprint)
+    return station.plant.pages.chain(station.fingerprint)
 
 
 def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResult, *, connected: bool) -> None:
@@ -163,14 +164,14 @@ def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResul
     chain, joined = own_chain(station), station.plant.joined
     assert joined is not None
     restored = station.plant.restored
-    known = {(n, hash) for n, hash, _ in station.plant.tables.page_names(chain.chain)}
+    known = {(n, hash) for n, hash, _ in station.plant.pages.names(chain.chain)}
     above = max(0, joined.acknowledged - 1) if connected and not restored else 0
     appended = _own_pages(station, post, roster, done, above)
     found = appended + returned.own(station, post.returned, roster, {page.hash for page in appended})
     new = [page for page in found if (page.number, page.hash) not in known]
     if new and restored and _follows(chain, new):
         adopt(station, roster, new)
-        station.plant.tables.end_alarms("fork", station.fingerprint)
+        station.plant.alarms.end_about("fork", station.fingerprint)
         back = "1 page that this station wrote before its backup is"
         if len(new) > 1:
             back = f"{len(new)} pages that this station wrote before its backup are"
@@ -239,9 +240,7 @@ def _require_resumed(station: Station) -> None:
     A folder that shows less of it ends nothing.
     """
     found = [
-        raised
-        for raised in station.plant.tables.alarms()
-        if raised.code == "fork" and raised.about == station.fingerprint
+        raised for raised in station.plant.alarms.all() if raised.code == "fork" and raised.about == station.fingerprint
     ]
     if found:
         raise ForkError(
@@ -267,7 +266,7 @@ def adopt(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
     with station.transaction():
         take_pages(station, roster, sorted(pages, key=lambda page: page.number))
         ids = [stated.get("id") for page in pages for stated in page.events if isinstance(stated, dict)]
-        station.plant.tables.drop_events([id_ for id_ in ids if isinstance(id_, str)])
+        station.plant.drop_events([id_ for id_ in ids if isinstance(id_, str)])
         for page in pages:
             _know_again(station, page)
         station.audit("registry", None, "adopted", pages=[page.number for page in pages])
@@ -303,7 +302,7 @@ def _know_again(station: Station, page: Page) -> None:
         elif uuid in signed:  # no sequence is used twice, whether the board is known here or not
             station.nodes.remember(uuid, sequence=sequence)
     # Pin boards that this station signed for under the key that it said itself: no other board gets their units.
-    for uuid, text in station.plant.tables.claims_of_chain(own_chain(station).chain, sorted(signed)).items():
+    for uuid, text in station.plant.claims.of_station(own_chain(station).chain, sorted(signed)).items():
         pin = Claim.from_json(text).pin
         if pin is not None and station.pins.entry(uuid) is None:
             station.pins.put(WhitelistEntry(uuid, pin[0], assurance=pin[1]))  # type: ignore[arg-type]
@@ -314,18 +313,18 @@ def _know_unit(station: Station, uuid: bytes, said: event.Event, job: str, unit:
 
     If another board has that unit by now, this one has the next: an office counts what it gave, not its numbers.
     """
-    tables = station.plant.line
-    kept = tables.unit(job, uuid)
-    if kept is None and any(row.unit == unit for row in tables.units(job)):
+    line = station.plant.line
+    kept = line.unit(job, uuid)
+    if kept is None and any(row.unit == unit for row in line.units(job)):
         station.notice(
             f"Unit {unit} of the job {job} was assigned twice: also to {uuid.hex()}, before this home was restored."
         )
         if said.act == "evidence":
             return
-        unit = tables.count_units(job)[2] + 1
+        unit = line.count_units(job)[2] + 1
     row = UnitRow(job, uuid, unit, said.at) if kept is None else replace(kept, attempts=kept.attempts + 1)
     passed = row.attempts if said.members.get("verdict") == PASSED and not row.passed else row.passed
-    tables.put_unit(replace(row, passed=passed))
+    line.put_unit(replace(row, passed=passed))
 
 
 def _require_all_seen(station: Station, roster: Roster, there: set[int]) -> None:
@@ -334,7 +333,7 @@ def _require_all_seen(station: Station, roster: Roster, there: set[int]) -> None
     Missing are pages that are neither here nor in the registry.
     """
     newest = max({own_chain(station).counted[0]} | there)
-    for who, about, n, _ in station.plant.tables.heads():
+    for who, about, n, _ in station.plant.pages.heads():
         if about == station.fingerprint and n > newest and roster.member(who) is not None:
             raise PolicyError(
                 f"This home was restored from a backup. {roster.name_of(who)} has seen its page {n}, but the"
@@ -359,18 +358,17 @@ def resume(station: Station, post: Transport) -> int:
         with station.transaction():
             if new:
                 newest = max(new, key=lambda page: (page.number, page.hash))
-                tables = station.plant.tables
                 theirs = {(page.number, page.hash) for page in found}
-                counted = [(n, hash) for n, hash, _ in tables.page_names(chain.chain) if n <= chain.counted[0]]
+                counted = [(n, hash) for n, hash, _ in station.plant.pages.names(chain.chain) if n <= chain.counted[0]]
                 lost = [place for place in counted if place not in theirs and place[0] >= new[0].number]
-                tables.put_chain(replace(chain, accepted=(newest.number, newest.hash)))
+                station.plant.pages.put_chain(replace(chain, accepted=(newest.number, newest.hash)))
                 adopt(station, roster, new)
                 _tell_again(station, chain, lost, new)
-            station.plant.tables.end_alarms("fork", station.fingerprint)
+            station.plant.alarms.end_about("fork", station.fingerprint)
             station.plant.end_restored()
             joined = station.plant.joined
             assert joined is not None
-            station.plant.tables.put_plant(replace(joined, acknowledged=0))
+            station.plant.put_record(replace(joined, acknowledged=0))
             station.audit("registry", None, "resumed", adopted=len(new))
         new_home(station.home)
     return len(new)
@@ -388,14 +386,14 @@ def _under_our_key(station: Station, post: Transport, roster: Roster) -> list[Pa
 
 
 def _strange(station: Station, found: Sequence[Page]) -> list[Page]:
-    known = {(n, hash) for n, hash, _ in station.plant.tables.page_names(own_chain(station).chain)}
+    known = {(n, hash) for n, hash, _ in station.plant.pages.names(own_chain(station).chain)}
     return [page for page in found if (page.number, page.hash) not in known]
 
 
 def _tell_again(station: Station, chain: Chain, lost: Sequence[tuple[int, str]], new: Sequence[Page]) -> None:
     adopted = {stated.get("id") for page in new for stated in page.events if isinstance(stated, dict)}
     for n, hash in lost:
-        row = station.plant.tables.page(chain.chain, n, hash)
+        row = station.plant.pages.get(chain.chain, n, hash)
         for item in load_exact(row.content, "A page")["events"] if row is not None else ():
             if item["id"] not in adopted:
                 station.plant.queue_event(item)
@@ -403,10 +401,9 @@ def _tell_again(station: Station, chain: Chain, lost: Sequence[tuple[int, str]],
 
 def close_page(station: Station, roster: Roster, *, empty: bool = False) -> Page | None:
     """Put what waits into the next page, in one transaction; None if nothing does (unless ``empty``)."""
-    tables = station.plant.tables
     with station.transaction():
         chain = own_chain(station)
-        waiting = tables.outbox(MOST_EVENTS)
+        waiting = station.plant.outbox(MOST_EVENTS)
         if (not waiting and not empty) or station.plant.restored:
             return None
         events: list[tuple[str, dict[str, object]]] = []
@@ -424,16 +421,16 @@ def close_page(station: Station, roster: Roster, *, empty: bool = False) -> Page
         octets = seal_page(draft, [made for _, made in events], station.vault.identity())
         page = open_page(octets, roster.registry, lambda kid: station.point)
         take_pages(station, roster, [page])
-        tables.drop_events([id for id, _ in events])
+        station.plant.drop_events([id for id, _ in events])
     return page
 
 
 def _fresh_heads(station: Station, own: Chain) -> dict[str, tuple[int, str]]:
     """Return what this station verified of others and did not report yet."""
-    said = {about: (n, hash) for who, about, n, hash in station.plant.tables.heads() if who == own.station}
+    said = {about: (n, hash) for who, about, n, hash in station.plant.pages.heads() if who == own.station}
     return {
         fingerprint: chain.counted
-        for fingerprint, chain in station.plant.tables.chains().items()
+        for fingerprint, chain in station.plant.pages.chains().items()
         if fingerprint != own.station and chain.counted[0] and said.get(fingerprint) != chain.counted
     }
 
@@ -444,16 +441,16 @@ def _fresh_heads(station: Station, own: Chain) -> dict[str, tuple[int, str]]:
 def _push(station: Station, post: Transport, roster: Roster, done: SyncResult, *, connected: bool) -> None:
     """Append missing pages: one's own, and in a folder those of all stations."""
     heads = post.heads()
-    for fingerprint, chain in station.plant.tables.chains().items():
+    for fingerprint, chain in station.plant.pages.chains().items():
         own = fingerprint == station.fingerprint
         if not own and not post.everybody:
             continue
         there = {hash_of(carried.octets) for carried in post.pages(fingerprint, 0)} if post.everybody else set()
         above = 0 if post.everybody else heads.get(fingerprint, 0)
-        for n, hash, previous in station.plant.tables.page_names(chain.chain):
+        for n, hash, previous in station.plant.pages.names(chain.chain):
             if n <= above or hash in there or (own and not post.everybody and n > chain.counted[0]):
                 continue
-            row = station.plant.tables.page(chain.chain, n, hash)
+            row = station.plant.pages.get(chain.chain, n, hash)
             assert row is not None
             post.append(fingerprint, n, previous, hash, octets_of(row))
             done.pushed += own
@@ -462,7 +459,7 @@ def _push(station: Station, post: Transport, roster: Roster, done: SyncResult, *
     # to a station that uses folders each of them is the registry: a stick has another path on each machine
     by_folder = post.everybody and (joined.url or "").startswith(FILES)
     if (connected or by_folder) and joined.acknowledged != newest:
-        station.plant.tables.put_plant(replace(joined, acknowledged=newest))
+        station.plant.put_record(replace(joined, acknowledged=newest))
 
 
 def unseen_heads(station: Station, roster: Roster) -> dict[tuple[str, str, int, str], str]:
@@ -471,12 +468,12 @@ def unseen_heads(station: Station, roster: Roster) -> dict[tuple[str, str, int, 
     By who reports, of whom, the number and H of the page; those that a person has acknowledged are among them.
     """
     found: dict[tuple[str, str, int, str], str] = {}
-    chains = station.plant.tables.chains()
-    for who, about, n, hash in station.plant.tables.heads():
+    chains = station.plant.pages.chains()
+    for who, about, n, hash in station.plant.pages.heads():
         chain = chains.get(about)
         if roster.member(who) is None or about not in roster.by_key or who == station.fingerprint:
             continue
-        names = station.plant.tables.page_names(chain.chain) if chain is not None else []
+        names = station.plant.pages.names(chain.chain) if chain is not None else []
         if any((n, hash) == (number, named) for number, named, _ in names):
             continue
         here = chain.counted[0] if chain is not None else 0
@@ -491,10 +488,10 @@ def unseen_heads(station: Station, roster: Roster) -> dict[tuple[str, str, int, 
 
 def acknowledge(station: Station) -> tuple[int, int]:
     """Note that a person knows of all alarms and reported heads up to now; returns how many of each were new."""
-    tables, heads = station.plant.tables, unseen_heads(station, require_roster(station))
+    heads = unseen_heads(station, require_roster(station))
     with station.transaction():
-        fresh = len(heads.keys() - tables.seen_heads())
-        tables.see_heads(heads)
-        alarms = tables.see_alarms()
+        fresh = len(heads.keys() - station.plant.pages.seen_heads())
+        station.plant.pages.see_heads(heads)
+        alarms = station.plant.alarms.see()
         station.audit("registry", None, "seen", alarms=alarms, heads=fresh)
     return alarms, fresh

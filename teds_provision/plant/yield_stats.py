@@ -114,18 +114,18 @@ def attempts_of(station: Station, job: str, files: Iterable[bytes] = ()) -> list
 
 def _of_requests(station: Station, job: str) -> Iterator[Attempt]:
     """Yield the boards that this office signed for a line whose pages and evidence are not here yet."""
-    tables = station.plant.line
-    for unit in tables.units(job):
-        peers = {row.peer for row in tables.sign_requests(job, unit.uuid, "in") if row.sequence is not None}
+    line = station.plant.line
+    for unit in line.units(job):
+        peers = {row.peer for row in line.sign_requests(job, unit.uuid, "in") if row.sequence is not None}
         for peer in sorted(peers):
             yield Attempt(peer, unit.uuid, unit.unit, 1, UNREPORTED, "")
 
 
 def _of_pages(station: Station, job: str) -> Iterator[tuple[str, Attempt]]:
     """Yield the attempts that pages report, in their order, each with the SHA-256 of its evidence."""
-    tables, counts = station.plant.tables, Counter[tuple[str, bytes]]()
-    for name, pages in tables.chains().items():
-        for page in tables.each_page(pages.chain):
+    counts = Counter[tuple[str, bytes]]()
+    for name, pages in station.plant.pages.chains().items():
+        for page in station.plant.pages.each(pages.chain):
             for value in json.loads(page.content).get("events", []):
                 told = event.read(value)
                 if not isinstance(told, event.Event) or told.act != "evidence" or told.uuid is None:

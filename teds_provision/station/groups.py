@@ -14,7 +14,7 @@ from typing import Final
 from teds_provision.errors import FrozenError, NotFoundError, UsageError
 from teds_provision.files import open_lock
 from teds_provision.portable import lock
-from teds_provision.station.plant import Plant
+from teds_provision.station.plant.plant import Plant
 from teds_provision.station.store import Store
 from teds_provision.station.store.records import Group
 

@@ -16,7 +16,7 @@ from teds_provision.errors import (
     WrongPassphraseError,
 )
 from teds_provision.station.identity import StationIdentity
-from teds_provision.station.plant import Plant
+from teds_provision.station.plant.plant import Plant
 from teds_provision.station.row_macs import RowMacs
 from teds_provision.station.store import Holder, KeyFlags, KeyRecord, Store, chunks, utc_now
 from teds_provision.station.store.records import KeySource

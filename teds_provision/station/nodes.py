@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadDataError, StoreError
 from teds_provision.lazy import late
-from teds_provision.station.plant import Plant
+from teds_provision.station.plant.plant import Plant
 from teds_provision.station.row_macs import RowMacs
 from teds_provision.station.store import (
     DatasheetRecord,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 from teds_provision.lazy import late
 from teds_provision.protocol.fingerprints import is_whole, same_key
 from teds_provision.station.node_keys import NodeKeys
-from teds_provision.station.plant import Plant
+from teds_provision.station.plant.plant import Plant
 from teds_provision.station.row_macs import RowMacs
 from teds_provision.station.store import ExportEligibility, NodeRecord, Store, WhitelistEntry
 

@@ -12,7 +12,7 @@ from teds_provision.protocol.fingerprints import same_key
 from teds_provision.station.identity import StationIdentity
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.pins import Pins
-from teds_provision.station.plant import Plant, SignerRules
+from teds_provision.station.plant.plant import Plant, SignerRules
 from teds_provision.station.row_macs import RowMacs
 from teds_provision.station.store import RevocationRecord, Store, Tombstone, TrustRecord, WhitelistEntry
 from teds_provision.station.store.records import TrustRole

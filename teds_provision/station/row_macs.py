@@ -36,6 +36,8 @@ _KEY_OCTETS = 32
 _SHOWN = 5
 _DIGITS = 16
 _Values = tuple[str | bytes | None, ...]
+MacRow = tuple[str, bytes | None, str, _Values]
+"""A row with a MAC: its name for people, its MAC, the kind and the values that the MAC is over."""
 
 
 class RowMacs:
@@ -48,6 +50,8 @@ class RowMacs:
         self._keyed: hmac.HMAC | None = None
         self.broken_trust: tuple[str, ...] = ()
         """Names of trusted keys whose seal does not hold; they do not count."""
+        self.sources: list[Callable[[], Iterator[MacRow]]] = []
+        """Of each topic, its rows with a MAC: what doctor checks."""
 
     @property
     def active(self) -> bool:
@@ -144,7 +148,7 @@ class RowMacs:
             if not self._holds(mac, kind, values):
                 yield name
 
-    def _sealed_rows(self) -> Iterator[tuple[str, bytes | None, str, _Values]]:
+    def _sealed_rows(self) -> Iterator[MacRow]:
         """Every row that must have a seal: its name, its seal, the kind and the values that the seal is over."""
         facts = self._store.facts()
         if facts is not None:
@@ -163,24 +167,10 @@ class RowMacs:
             if reported.in_session:
                 yield f"the firmware report of {reported.uuid.hex()}", reported.mac, "firmware", _firmware(reported)
         yield from self._decisions()
-        yield from self._plant()
+        for rows in self.sources:
+            yield from rows()
 
-    def _plant(self) -> Iterator[tuple[str, bytes | None, str, _Values]]:
-        """Yield the plant's rows that this station believes without verifying their signer again."""
-        record, row = self._store.plant(), self._store.held_roster()
-        if record is not None:
-            yield "the registry that was joined", record.mac, "plant", (record.registry,)
-            if record.restored is not None:
-                yield "the note of a restored home", record.restored_mac, "restored", (record.restored,)
-        if row is not None:
-            yield f"roster {row.version}", row.mac, "roster", (row.hash,)
-        for digest, station, n, vouched, mac in self._store.all_digests():
-            said = f"{digest.hex()} {station} {n} {'vouched' if vouched else 'signed'}"
-            yield f"the digest {digest.hex()[:_DIGITS]} of a page", mac, "digest", (said,)
-        for hash, station, mac in self._store.all_liftings():
-            yield f"the lifting of ban {hash[:_DIGITS]} in a page", mac, "plant lifted", (f"{hash} {station}",)
-
-    def _decisions(self) -> Iterator[tuple[str, bytes | None, str, _Values]]:
+    def _decisions(self) -> Iterator[MacRow]:
         for statement, mac in self._store.lifted().items():
             yield f"the lifting of ban {statement[:_DIGITS]}", mac, "lifted", (statement,)
         for ca, mac in self._store.ended_cas().items():

@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from teds_provision import vault as vaults
@@ -43,7 +44,7 @@ from teds_provision.station.measurements import Measurements
 from teds_provision.station.node_keys import NodeKey, NodeKeys
 from teds_provision.station.nodes import Nodes
 from teds_provision.station.pins import Pins
-from teds_provision.station.plant import Plant
+from teds_provision.station.plant.plant import Plant
 from teds_provision.station.policy import Policy
 from teds_provision.station.row_macs import RowMacs
 from teds_provision.station.store import AuditLog, BulkRows, Handover, KeyRecord, NodeLock, Store, StoreLock
@@ -132,6 +133,7 @@ class Station:
         self.row_macs = RowMacs(store, self._opened, tell)
         self.identity = StationIdentity(store, self._opened, self.row_macs)
         self.plant = Plant(store, self.current_vault, self.identity, self.row_macs)
+        self.row_macs.sources.append(self.plant.mac_rows)
         self.keys = NodeKeys(store, self._opened, self.identity, self.row_macs, self._reopened, self.plant)
         self.pins = Pins(store, self.keys, self.row_macs, self.plant)
         self.policy = Policy(store, self.identity, self.keys, self.pins, self.row_macs, self.plant)
@@ -155,9 +157,25 @@ class Station:
             raise not_certified() if asked else not_initialised(home)
         return station
 
+    @classmethod
+    def inspect(cls, home: Path, *, ask: Ask | None = None) -> Station:
+        """Open the station of ``home`` to look at it, also one whose init was not finished.
+
+        Without ``ask`` no passphrase is asked for: what needs the vault raises NoPassphraseError. Raises StoreError.
+        """
+        return cls(Store.open(home), ask or _ask_no_one)
+
     def close(self) -> None:
         """Close the store."""
         self._store.close()
+
+    def __enter__(self) -> Station:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
     # -- who it is -------------------------------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ from teds_provision.protocol.keys import fingerprint, node_key_good
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.plant.signer import SignerVerdict
 from teds_provision.protocol.wire_agreement import other_key
-from teds_provision.station.plant import SignerRules
+from teds_provision.station.plant.plant import SignerRules
 from teds_provision.station.station import Station
 from teds_provision.station.store import RevocationRecord, WhitelistEntry
 from teds_provision.steps.sign import known_image

@@ -10,9 +10,9 @@ import pytest
 from teds_provision import plant
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.station.node_keys import REMOVED
+from teds_provision.station.plant.alarms import Alarm
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry
-from teds_provision.station.store.tables.plant import Alarm
 from tests.plant.stations import ask, certified, request_of
 
 from .lab import Lab, opened
@@ -43,9 +43,7 @@ def test_the_plant_is_shown_with_conflicts_alarms_and_what_is_to_rotate(browser:
             plant.sync.sync(station, FolderTransport(stick))
         plant.owner.join(north, signed, url=f"{plant.membership.FILES}{stick}", told=[])
         north.keys.demand_rotation(bytes(10), f"{REMOVED}station west (lost) has held this key")
-        north.plant.tables.put_alarm(
-            Alarm("rolled-back", south.fingerprint, 3, "page 3 was there, and now 1 is the last")
-        )
+        north.plant.alarms.put(Alarm("rolled-back", south.fingerprint, 3, "page 3 was there, and now 1 is the last"))
         south.close()
     fresh.run("--registry")
     with opened(browser, fresh, route="station") as page:

@@ -16,9 +16,9 @@ from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.fold import LocalState, MergedClaims, merge_claims
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster, Share, open_roster, seal_roster
+from teds_provision.station.plant.plant import PlantRecord, RosterRow
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry, utc_now
-from teds_provision.station.store.tables.plant import PlantRecord, RosterRow
 from teds_provision.steps.agree import agree
 from teds_provision.steps.identify import identify
 from tests.bench import PASSPHRASE, Board, make_station, talk
@@ -147,11 +147,8 @@ class Plant:
         for name in roles:
             station = self[name]
             with station.transaction():
-                station.plant.tables.put_plant(PlantRecord(REGISTRY))
-                mac = station.row_macs.note("roster", self.roster_.hash)
-                station.plant.tables.put_roster(
-                    RosterRow(self.roster_.version, self.roster_.hash, octets, True, utc_now(), mac)
-                )
+                station.plant.put_record(PlantRecord(REGISTRY))
+                station.plant.put_roster(RosterRow(self.roster_.version, self.roster_.hash, octets, True, utc_now()))
         return self.roster_
 
     def trusted(self) -> None:
@@ -175,7 +172,7 @@ class Plant:
             for word, station in self.stations.items():
                 if word in self.deaf and word != name:
                     continue
-                for _, _, text in station.plant.tables.outbox(10_000):
+                for _, _, text in station.plant.outbox(10_000):
                     told = event.read(json.loads(text))
                     if isinstance(told, event.Event) and told.uuid == uuid:
                         claims.setdefault(station.fingerprint, Claim()).apply_event(told)

@@ -10,8 +10,8 @@ from typing import Any
 
 from teds_provision.protocol.plant.job import CalibrationRule, Job, seal_job
 from teds_provision.protocol.plant.roster import Member, Roster, open_roster, seal_roster
+from teds_provision.station.plant.plant import PlantRecord, RosterRow
 from teds_provision.station.station import Station
-from teds_provision.station.store.tables.plant import PlantRecord, RosterRow
 from teds_provision.teds.profile.load import default_folders, files_digest, find_profile
 from teds_provision.vault.base import Vault
 from tests.bench import make_station
@@ -49,9 +49,8 @@ def join(station: Station, roster: Roster) -> None:
     """What `registry connect` does: this roster holds here."""
     station.unlock()
     with station.transaction():
-        station.plant.tables.put_plant(PlantRecord(REGISTRY))
-        mac = station.row_macs.note("roster", roster.hash)
-        station.plant.tables.put_roster(RosterRow(roster.version, roster.hash, roster.octets, True, "", mac))
+        station.plant.put_record(PlantRecord(REGISTRY))
+        station.plant.put_roster(RosterRow(roster.version, roster.hash, roster.octets, True, ""))
 
 
 def alone(home: Path) -> Station:

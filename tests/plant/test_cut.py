@@ -91,15 +91,15 @@ def carried_on(folder: Path) -> list[object]:
         station.unlock()
         roster = station.plant.roster
         assert roster is not None
-        assert station.plant.tables.alarms() == []
-        assert station.plant.tables.unsent(station.fingerprint) == 0
-        assert station.plant.tables.to_judge(1) == []
+        assert station.plant.alarms.all() == []
+        assert station.plant.unsent() == 0
+        assert station.plant.claims.to_judge(1) == []
         said = merged_views(station, roster, NODES)
         seen.append((heads_digest(station)[1], {uuid: sorted(view.pins.values()) for uuid, view in said.items()}))
         entry = station.pins.entry(NODES[0])
         assert entry is not None
         assert entry.fingerprint == KEY
-        assert all(chain.counted == chain.folded for chain in station.plant.tables.chains().values())
+        assert all(chain.counted == chain.folded for chain in station.plant.pages.chains().values())
         station.close()
     assert seen[0] == seen[1]
     return seen

@@ -19,12 +19,13 @@ def test_an_auditors_word_counts_for_nothing_and_a_keeper_knows_its_own_chain(
     made = Plant(tmp_path)
     thief, witness, south = made.member("thief", "sign"), made.member("witness", role), made.member("south", "base")
     made.round()
-    last = made.north.plant.tables.chain(thief.fingerprint).counted[0]
+    last = made.north.plant.pages.chain(thief.fingerprint).counted[0]
     made.change(plant.owner.draft_removal(made.north, "thief", "stolen", last))
     for station in (made.north, south):
         made.sync(station)
-        tables = station.plant.tables
-        tables.put_heads(tables.chain(witness.fingerprint).chain, {made.north.fingerprint: (10_000, "ab" * 32)})
+        station.plant.pages.put_heads(
+            station.plant.pages.chain(witness.fingerprint).chain, {made.north.fingerprint: (10_000, "ab" * 32)}
+        )
         rules = station.plant.signer_rules()
         assert rules is not None
         said = rules.signing(station.ca, thief.point, os.urandom(32))

@@ -35,8 +35,8 @@ from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.job import CalibrationRule, Job, open_job, require_pattern, seal_job
+from teds_provision.station.plant.parcels import ParcelRow
 from teds_provision.station.station import Station
-from teds_provision.station.store.tables.parcels import ParcelRow
 from teds_provision.steps.board_type import WrongBoardError
 from teds_provision.steps.build import BuildOrder, PreparedOrder, prepare
 from teds_provision.steps.provision import ProvisionResult, provision, verify_only
@@ -145,7 +145,7 @@ def test_a_job_that_comes_while_the_roster_has_expired_waits_for_the_renewed_one
     job = open_job(job_of(station), lambda kid: station.point)
     me = station.identity.fingerprint
     row = ParcelRow(str(uuid.uuid4()), "in", me, "job", "waiting", "")
-    station.plant.parcels.put_parcel(row, job.octets)
+    station.plant.parcels.put(row, job.octets)
     take_received(station)
     assert station.plant.line.jobs() == []
     plant.apply_pages.put_roster(station, roster_of(station, own, version=2, previous=expired.hash))
@@ -319,7 +319,7 @@ def test_the_event_and_the_evidence_of_a_board_name_the_jobs_profile_by_the_same
     files = [find_profile(name).read_bytes() for name in ("smart-sensor", ANGLE)]
     framed = b"".join(len(octets).to_bytes(4, "big") + octets for octets in files)
     assert line.job.profile_sha256 == hashlib.sha256(framed).hexdigest()
-    events = [json.loads(text) for _, _, text in owner.plant.tables.outbox(100)]
+    events = [json.loads(text) for _, _, text in owner.plant.outbox(100)]
     assert [event["profile_sha256"] for event in events if event["act"] == "written"] == [line.job.profile_sha256]
     (row,) = owner.plant.line.evidence(uuid=one.uuid)
     assert codec.read(row.document).facts.profile_sha256 == line.job.profile_sha256

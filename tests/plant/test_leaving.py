@@ -47,7 +47,7 @@ class Scene:
         return uuid
 
     def remove(self, station: Station, why: Why) -> None:
-        last = self.north.plant.tables.chain(station.fingerprint).counted[0]
+        last = self.north.plant.pages.chain(station.fingerprint).counted[0]
         self.plant.change(plant.owner.draft_removal(self.north, station.identity.name, why, last))
         self.sync(self.north)
 
@@ -213,7 +213,7 @@ def test_a_key_that_a_thief_names_on_another_history_is_rotated_too(scene: Scene
         scene.west.plant.record_event("named", bytes(10), name="two")
     scene.sync(scene.west, scene.north)
     scene.plant.sync(scene.north, other)
-    branch = scene.west.plant.tables.chain(scene.west.fingerprint).counted[1]
+    branch = scene.west.plant.pages.chain(scene.west.fingerprint).counted[1]
     plant.membership.accept(scene.north, scene.west.fingerprint, branch, None)
     scene.remove(scene.west, "stolen")
     assert scene.north.keys.rotation_due(board.uuid), "what he says that he has, he has"

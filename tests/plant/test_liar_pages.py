@@ -69,7 +69,7 @@ def plants(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
 
 def lied(plants: Plant, liar: Station, change: dict[str, Any]) -> int:
     """The liar signs its next page with something in it that no program of ours writes; returns its number."""
-    chain = plants.north.plant.tables.chain(liar.fingerprint)
+    chain = plants.north.plant.pages.chain(liar.fingerprint)
     n, previous = chain.counted
     members = {
         "format": PAGE.format, "registry": plants.roster.registry, "station": liar.fingerprint, "n": n + 1,
@@ -96,7 +96,7 @@ def test_no_page_of_a_liar_stops_a_reader_or_takes_anything(plants: Plant, name:
     record, roster = north.plant.joined, north.plant.roster
     assert record is not None
     assert roster is not None
-    assert north.plant.tables.chain(west.fingerprint).counted[0] == n, "its chain goes on"
+    assert north.plant.pages.chain(west.fingerprint).counted[0] == n, "its chain goes on"
     shown = plant.status.status(north, record, roster)
     assert {standing.name for standing in shown.standings} == {"north", "west"}
     told = list(plant.status.log(north, of=west.fingerprint))

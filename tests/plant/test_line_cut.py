@@ -139,12 +139,12 @@ def cut_office(folder: Path, steps: range, patch: pytest.MonkeyPatch) -> int:
 
     done = 0
     for homes in cut(folder, ("north", "west"), steps, patch, line_of):
-        tables = homes["north"].plant.line
-        assert [row.unit for row in tables.units(job.id)] == [1, 2]
-        for row in tables.units(job.id):
-            answered = [request.sequence for request in tables.sign_requests(job.id, row.uuid, "in")]
+        line = homes["north"].plant.line
+        assert [row.unit for row in line.units(job.id)] == [1, 2]
+        for row in line.units(job.id):
+            answered = [request.sequence for request in line.sign_requests(job.id, row.uuid, "in")]
             assert len(set(answered)) == len(answered), "each request has a sequence of its own"
-            for request in tables.sign_requests(job.id, row.uuid, "in"):
+            for request in line.sign_requests(job.id, row.uuid, "in"):
                 assert answer(homes["north"], request.request) == request.answer, (
                     "the same request gets the same answer"
                 )

@@ -410,7 +410,7 @@ def test_an_answer_waits_for_the_line_that_asked_and_for_no_person(desk: Desk) -
     assert (done.parcels_in, done.waiting) == (0, 0)
     (kept,) = parcels.received(desk.line, "signed")
     assert kept[1] == sealed
-    desk.line.plant.parcels.drop_parcel(kept[0].id, "in")
+    desk.line.plant.parcels.drop(kept[0].id, "in")
     build(run, one)
     send(desk.office, post, me, sealed, str(uuid.uuid4()))
     assert desk.plant.sync(desk.line).waiting == 0

@@ -124,5 +124,5 @@ def test_a_registry_that_was_away_hears_everything_once(plant: Office) -> None:
         (first.uuid, 1, 2, None),
         (second.uuid, 2, 1, None),
     ]
-    assert west.plant.tables.unsent(west.fingerprint) == 0
+    assert west.plant.unsent() == 0
     away.close()

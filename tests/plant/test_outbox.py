@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
+from teds_provision.station.plant.plant import PlantRecord
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry
 from teds_provision.station.store.connection import Connection
-from teds_provision.station.store.tables.plant import PlantRecord
 from teds_provision.steps.agree import agree
 from teds_provision.steps.identify import identify
 from tests.bench import Board, make_station, talk
@@ -31,11 +31,11 @@ def station(tmp_path: Path) -> Iterator[Station]:
 
 def test_who_joined_no_registry_tells_nothing(station: Station) -> None:
     station.plant.record_event("named", UUID, name="grip")
-    assert station.plant.tables.unsent(station.fingerprint) == 0
+    assert station.plant.unsent() == 0
 
 
 def test_an_event_shares_the_fate_of_its_act(station: Station) -> None:
-    station.plant.tables.put_plant(PlantRecord(REGISTRY))
+    station.plant.put_record(PlantRecord(REGISTRY))
 
     def fails() -> None:
         with station.transaction():
@@ -44,19 +44,19 @@ def test_an_event_shares_the_fate_of_its_act(station: Station) -> None:
 
     with pytest.raises(KeyError):
         fails()
-    assert station.plant.tables.unsent(station.fingerprint) == 0
+    assert station.plant.unsent() == 0
     with station.transaction():
         station.plant.record_event("named", UUID, name="grip")
-    ((_, name, text),) = station.plant.tables.outbox(10)
+    ((_, name, text),) = station.plant.outbox(10)
     told = json.loads(text)
     assert (told["id"], told["act"], told["name"]) == (name, "named", "grip")
-    assert station.plant.tables.to_judge(10) == [UUID]
+    assert station.plant.claims.to_judge(10) == [UUID]
 
 
 def test_who_left_tells_nothing_any_more(station: Station) -> None:
-    station.plant.tables.put_plant(PlantRecord(REGISTRY, left="2026-01-31T12:00:00Z"))
+    station.plant.put_record(PlantRecord(REGISTRY, left="2026-01-31T12:00:00Z"))
     station.plant.record_event("named", UUID, name="grip")
-    assert station.plant.tables.unsent(station.fingerprint) == 0
+    assert station.plant.unsent() == 0
 
 
 def test_a_registry_costs_no_further_commit(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,6 +81,6 @@ def test_a_registry_costs_no_further_commit(station: Station, monkeypatch: pytes
         return len(seen)
 
     alone = commits()
-    station.plant.tables.put_plant(PlantRecord(REGISTRY))
+    station.plant.put_record(PlantRecord(REGISTRY))
     assert commits() == alone > 0
-    assert station.plant.tables.unsent(station.fingerprint) >= 3, "pinned, agreed, pinned"
+    assert station.plant.unsent() >= 3, "pinned, agreed, pinned"

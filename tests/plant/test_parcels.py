@@ -51,7 +51,7 @@ def holds(station: Station, uuid: bytes) -> list[tuple[int, str]]:
 
 
 def waits(station: Station) -> list[str]:
-    return [row.detail for row in station.plant.parcels.parcels("in", "waiting")]
+    return [row.detail for row in station.plant.parcels.all("in", "waiting")]
 
 
 def test_a_key_goes_to_who_shares_it_and_its_receipt_comes_back(plant: Plant) -> None:
@@ -226,16 +226,16 @@ def test_a_bundle_of_which_nothing_is_taken_is_refused_and_never_sent_again(plan
     other = board_of(plant["south"], board.uuid)
     assert other.key.point != board.key.point
     sync(plant, "west", "south")
-    [row] = plant["west"].plant.parcels.parcels("out", "sent")
+    [row] = plant["west"].plant.parcels.all("out", "sent")
     claims = plant.views("west")
     with plant["west"].transaction():  # as the fold would have it
-        tables, told = plant["west"].plant.tables, plant["south"].plant.tables.outbox(100)
+        told = plant["south"].plant.outbox(100)
         assert any('"refused"' in text and row.about in text for _, _, text in told)
         from teds_provision.protocol.plant.claim import Claim
 
-        chain = tables.chain(plant["south"].fingerprint).chain
+        chain = plant["west"].plant.pages.chain(plant["south"].fingerprint).chain
         refused = {(row.about, plant["west"].fingerprint, "no")}
-        tables.put_claims(chain, {board.uuid: Claim(refused=refused).to_json()})
+        plant["west"].plant.claims.put(chain, {board.uuid: Claim(refused=refused).to_json()})
     parcels.send_out(plant["west"], plant.post, claims, now())
     assert parcels.waiting_out(plant["west"]) == 0
     parcels.send_out(plant["west"], plant.post, claims, now(8))
@@ -264,9 +264,9 @@ def test_a_move_without_receipt_goes_again_under_its_old_id(plant: Plant) -> Non
         order = outgoing.ExportOrder(("south",), (board.uuid,), "move")
         parcels.send_export(station, outgoing.plan_export(station, order), now())
     sync(plant, "west")
-    [first] = station.plant.parcels.parcels("out", "sent")
+    [first] = station.plant.parcels.all("out", "sent")
     sync(plant, "west", at=now(8))
-    [again] = station.plant.parcels.parcels("out", "sent")
+    [again] = station.plant.parcels.all("out", "sent")
     assert (again.about, again.id != first.id) == (first.about, True)
 
 
@@ -308,7 +308,7 @@ def test_junk_and_what_is_for_others_is_thrown_away_and_told(plant: Plant) -> No
         plant.post.send(Parcel(os.urandom(4).hex(), station.fingerprint, octets, "2027-01-01T00:00:00Z"))
     sync(plant, "south")
     assert plant.post.there == {}
-    assert [alarm.code for alarm in station.plant.tables.alarms()] == ["parcel"]
+    assert [alarm.code for alarm in station.plant.alarms.all()] == ["parcel"]
 
 
 @pytest.mark.parametrize("course", ["stolen", "expired"])
@@ -322,7 +322,7 @@ def test_what_comes_from_a_removed_station_or_too_late_is_thrown_away_without_an
         plant.roster({"north": "keeper", "south": "base"}, everything(plant, "south"), removed={"west": (0, "")})
     sync(plant, "south", at=now(8 if course == "expired" else 0))
     assert plant.post.there == {}
-    assert plant["south"].plant.tables.alarms() == []
+    assert plant["south"].plant.alarms.all() == []
     assert not plant["south"].keys.held(board.uuid)
     assert [entry.outcome for entry in plant["south"].audit_log.entries() if entry.act == "import"] == [
         "parcel discarded"

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from teds_provision import plant
+from teds_provision.station.plant.pages import PageRow
 from teds_provision.station.station import Station
 from teds_provision.station.store import Holder, Store
-from teds_provision.station.store.tables.plant import PageRow
 from tests.bench import PASSPHRASE
 from tests.cli.shell import Outcome, call, spawn
 from tests.plant.stations import ask, certified, owner

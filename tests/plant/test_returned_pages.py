@@ -46,7 +46,7 @@ class Loss(Office):
             station.plant.record_event("named", os.urandom(10), name="a board")
 
     def remove(self, station: Station, why: Why = "stolen") -> None:
-        last = self.north.plant.tables.chain(station.fingerprint).counted[0]
+        last = self.north.plant.pages.chain(station.fingerprint).counted[0]
         self.plant.change(plant_room.owner.draft_removal(self.north, station.identity.name, why, last))
         self.sync(self.north)
         self.database.sql(close_sql(station.fingerprint))
@@ -62,8 +62,7 @@ class Loss(Office):
             self.database.sql(member_sql(station.fingerprint, verifier(self.secrets[station.fingerprint])))
 
     def pages_here(self, station: Station, of: Station) -> list[str]:
-        tables = station.plant.tables
-        return [hash for _, hash, _ in tables.page_names(tables.chain(of.fingerprint).chain)]
+        return [hash for _, hash, _ in station.plant.pages.names(station.plant.pages.chain(of.fingerprint).chain)]
 
     def handed_in(self, of: Station) -> list[list[str]]:
         return self.database.sql(f"select n, hash from registry.found where author = '\\x{of.fingerprint}' order by n")
@@ -141,7 +140,7 @@ def test_a_row_that_was_lost_is_filled_until_its_station_is_added_again(loss: Lo
 
 def test_an_older_database_gets_what_it_lacks_of_a_removed_station(loss: Loss) -> None:
     west = loss.leaver("line")
-    newest = loss.north.plant.tables.chain(west.fingerprint).counted[0]
+    newest = loss.north.plant.pages.chain(west.fingerprint).counted[0]
     loss.remove(west)
     loss.database.sql(mend_sql(west.fingerprint, newest))  # as the dump of yesterday has it
     loss.sync(loss.north)
@@ -178,8 +177,8 @@ def test_a_sync_that_was_cut_hands_in_the_rest(loss: Loss) -> None:
 
 def test_forged_pages_and_a_wrong_author_are_passed_over_and_the_member_is_named(loss: Loss) -> None:
     west = loss.leaver("line")
-    page = loss.north.plant.tables.page(
-        loss.north.plant.tables.chain(west.fingerprint).chain, 1, loss.pages_here(loss.north, west)[0]
+    page = loss.north.plant.pages.get(
+        loss.north.plant.pages.chain(west.fingerprint).chain, 1, loss.pages_here(loss.north, west)[0]
     )
     assert page is not None
     genuine = plant_room.apply_pages.octets_of(page).decode()
@@ -196,7 +195,7 @@ def test_forged_pages_and_a_wrong_author_are_passed_over_and_the_member_is_named
     later = loss.member("later", "base")
     loss.sync(loss.north, later)
     assert loss.pages_here(later, west) == loss.pages_here(loss.north, west)
-    alarms = [alarm for alarm in later.plant.tables.alarms() if alarm.code == FORGED]
+    alarms = [alarm for alarm in later.plant.alarms.all() if alarm.code == FORGED]
     assert [alarm.about for alarm in alarms] == [liar.fingerprint]
     assert alarms[0].why == "liar handed in a page of west that west did not sign"
     loss.database.sql(f"delete from registry.found where by = '\\x{liar.fingerprint}'; delete from registry.handed")
@@ -205,7 +204,7 @@ def test_forged_pages_and_a_wrong_author_are_passed_over_and_the_member_is_named
         " from registry.found group by author, by"
     )
     loss.sync(later)
-    assert [alarm for alarm in later.plant.tables.alarms() if alarm.code == FORGED] == []
+    assert [alarm for alarm in later.plant.alarms.all() if alarm.code == FORGED] == []
 
 
 def test_of_a_member_that_floods_with_forged_pages_only_the_first_few_are_read(loss: Loss) -> None:
@@ -230,7 +229,7 @@ def test_of_a_member_that_floods_with_forged_pages_only_the_first_few_are_read(l
 def test_another_history_that_a_thief_wrote_gives_way_to_the_rosters_last(loss: Loss, tmp_path: Path) -> None:
     """The thief signs another page 2 with the stolen key and has an accomplice hand it in first."""
     west = loss.leaver("line")
-    chain = loss.north.plant.tables.chain(west.fingerprint)
+    chain = loss.north.plant.pages.chain(west.fingerprint)
     first = loss.pages_here(loss.north, west)[0]
     west.unlock()
     roster = loss.north.plant.roster
@@ -242,17 +241,17 @@ def test_another_history_that_a_thief_wrote_gives_way_to_the_rosters_last(loss: 
     loss.remove(west)
     loss.lose(loss.north, loss.south)
     liar = loss.member("liar", "audit")
-    genuine = loss.north.plant.tables.page(chain.chain, 1, first)
+    genuine = loss.north.plant.pages.get(chain.chain, 1, first)
     assert genuine is not None
     with loss.login(liar).connect() as connection:
         restore(connection, west.fingerprint, 1, plant_room.apply_pages.octets_of(genuine).decode())
         restore(connection, west.fingerprint, 2, other.decode())
     later = loss.member("later", "base")
     loss.sync(later)
-    assert later.plant.tables.chain(west.fingerprint).counted[0] == 1
+    assert later.plant.pages.chain(west.fingerprint).counted[0] == 1
     loss.sync(loss.north, later)
-    counted = later.plant.tables.chain(west.fingerprint).counted
-    assert counted == loss.north.plant.tables.chain(west.fingerprint).counted
+    counted = later.plant.pages.chain(west.fingerprint).counted
+    assert counted == loss.north.plant.pages.chain(west.fingerprint).counted
     assert counted[0] >= 2
 
 
@@ -296,14 +295,13 @@ def test_a_newer_schema_is_refused_whatever_tables_it_has(loss: Loss) -> None:
 def test_a_home_from_a_backup_finds_its_own_pages_among_those_handed_in(loss: Loss) -> None:
     """The database is lost and a station's home, too: others have its pages, under its own key."""
     west = loss.leaver("line")
-    tables = west.plant.tables
-    chain = tables.chain(west.fingerprint)
+    chain = west.plant.pages.chain(west.fingerprint)
     loss.lose(loss.north, loss.south)
     loss.sync(loss.south)
     newest = chain.counted[0]
     hash = chain.counted[1]
     with west.transaction():  # as a backup from before its last page has it
-        tables._database.execute("DELETE FROM pages WHERE chain = ? AND hash = ?", (chain.chain, hash))
+        west.plant._database.execute("DELETE FROM pages WHERE chain = ? AND hash = ?", (chain.chain, hash))
         roster = west.plant.roster
         assert roster is not None
         plant_room.apply_pages.recount(west, chain, roster)

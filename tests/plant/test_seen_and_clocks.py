@@ -21,10 +21,11 @@ def test_a_report_of_pages_that_are_missing_is_shown_until_a_person_has_seen_it(
     made = Plant(tmp_path)
     witness, south = made.member("witness", "base"), made.member("south", "base")
     made.round()
-    tables = south.plant.tables
 
     def report(n: int) -> None:
-        tables.put_heads(tables.chain(witness.fingerprint).chain, {made.north.fingerprint: (n, "ab" * 32)})
+        south.plant.pages.put_heads(
+            south.plant.pages.chain(witness.fingerprint).chain, {made.north.fingerprint: (n, "ab" * 32)}
+        )
 
     report(10_000)
     said = "witness saw page 10000 of north; the last one here is 0"
@@ -42,13 +43,13 @@ def test_an_alarm_that_was_seen_is_raised_anew_by_one_more_occurrence_and_not_by
     tmp_path: Path,
 ) -> None:
     made = Plant(tmp_path)
-    about, tables = made.north.fingerprint, made.north.plant.tables
+    about = made.north.fingerprint
     for again, left in ((False, []), (True, ["later"])):
         alarm(made.north, "junk", about, 3, "first", again=again)
         assert acknowledge(made.north) == (1, 0)
         alarm(made.north, "junk", about, 3, "later", again=again)
-        assert [raised.why for raised in tables.alarms() if not raised.seen] == left
-        tables.end_alarms("junk", about)
+        assert [raised.why for raised in made.north.plant.alarms.all() if not raised.seen] == left
+        made.north.plant.alarms.end_about("junk", about)
     made.close()
 
 
@@ -70,13 +71,13 @@ def test_a_sync_with_a_stick_at_another_path_is_a_sync(tmp_path: Path) -> None:
     other.mkdir()
     joined = made.north.plant.joined
     assert joined is not None
-    made.north.plant.tables.put_plant(replace(joined, url=f"{FILES}{made.stick}"))
+    made.north.plant.put_record(replace(joined, url=f"{FILES}{made.stick}"))
     made.north.plant.record_event("named", bytes(10), name="finger")
     sync(made.north, FolderTransport(other), connected=False)
     after = made.north.plant.joined
     assert after is not None
     assert after.synced is not None
-    assert made.north.plant.tables.unsent(made.north.fingerprint) == 0
+    assert made.north.plant.unsent() == 0
     made.close()
 
 

@@ -60,8 +60,8 @@ def survived(office: Office, cluster: Cluster, *steps: int) -> int:
         assert office.database.sql("select count(*) = max(n) from registry.page group by station") == [["t"], ["t"]]
         assert office.database.sql("select count(distinct jws) from registry.roster") == [["1"]], step
         for any_station in (office.north, south):
-            assert any_station.plant.tables.alarms() == [], step
-            assert any_station.plant.tables.unsent(any_station.fingerprint) == 0, step
+            assert any_station.plant.alarms.all() == [], step
+            assert any_station.plant.unsent() == 0, step
         assert plant_room.parcels.waiting_out(office.north) == 0, step
         plant_room.apply_pages.put_roster(office.north, plant_room.owner.signed(
             office.north, plant_room.owner.unshared(office.north, ("all", ""))))  # fmt: skip

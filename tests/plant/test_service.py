@@ -42,7 +42,7 @@ def by_url(office: Office, station: Station) -> Station:
     office.database.sql(member_sql(asked.fingerprint, asked.login))
     record = station.plant.joined
     assert record is not None
-    station.plant.tables.put_plant(replace(record, url=office.database.url))
+    station.plant.put_record(replace(record, url=office.database.url))
     return station
 
 
@@ -74,7 +74,7 @@ def test_what_another_station_pushes_arrives_without_waiting_for_the_minute(offi
         pushed = time.monotonic()
         until(lambda: len(changed) > before, "it was not woken", 30)
         assert changed[before] - pushed < 10, "only by the minute"
-        assert north.fingerprint in south.plant.tables.claims_of([board.uuid])[board.uuid]
+        assert north.fingerprint in south.plant.claims.of_nodes([board.uuid])[board.uuid]
         status = watch.status()
         assert status is not None
         assert [station["name"] for station in status["stations"]] == ["north", "south"]
@@ -102,10 +102,10 @@ def test_a_registry_that_is_gone_is_told_once_and_stops_nothing(office: Office, 
 
 
 def test_an_alarm_is_told(office: Office) -> None:
-    from teds_provision.station.store.tables.plant import Alarm
+    from teds_provision.station.plant.alarms import Alarm
 
     south = by_url(office, office.plant.stations[1])
-    south.plant.tables.put_alarm(Alarm("junk", office.north.fingerprint, 1, "something is there"))
+    south.plant.alarms.put(Alarm("junk", office.north.fingerprint, 1, "something is there"))
     watch, told, _ = watching(south)
     watch.start()
     try:

@@ -49,7 +49,7 @@ def verdict(station: Station, image: Image) -> str:
 
 
 def newest(plants: Plant, station: Station) -> int:
-    return plants.north.plant.tables.chain(station.fingerprint).counted[0]
+    return plants.north.plant.pages.chain(station.fingerprint).counted[0]
 
 
 def test_a_stolen_lines_datasheets_count_up_to_its_last_page_and_none_after(plants: Plant) -> None:
@@ -148,6 +148,6 @@ def test_who_joined_waits_for_the_disk_no_more_often(plants: Plant, tmp_path: Pa
         _, commits = watched.run(Board(bytes([len(waited) + 1] * 10)))
         waited.append((commits, watched.waited))
         station._store._connection.set_trace_callback(None)
-    assert plants.north.plant.tables.unsent(plants.north.fingerprint) >= 4
+    assert plants.north.plant.unsent() >= 4
     assert waited[0] == waited[1]
     alone.close()

@@ -28,10 +28,10 @@ def station(tmp_path: Path) -> Iterator[Station]:
 
 def held(station: Station, roster: Roster, monkeypatch: pytest.MonkeyPatch) -> None:
     """Have a roster of the test's CA count in a station of another one."""
-    from teds_provision.station.store.tables.plant import PlantRecord
+    from teds_provision.station.plant.plant import PlantRecord
 
     monkeypatch.setattr(type(station.identity), "ca", property(lambda self: CA.point))
-    station.plant.tables.put_plant(PlantRecord(REGISTRY, mac=station.row_macs.note("plant", REGISTRY)))
+    station.plant.put_record(PlantRecord(REGISTRY, mac=station.row_macs.note("plant", REGISTRY)))
     put_roster(station, open_roster(seal_roster(roster, CA), CA.point))
 
 
@@ -50,7 +50,7 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
     while waiting:  # a page comes when one before it is here, as a sync asks for them
         chance.shuffle(waiting)
         for page in list(waiting):
-            names = station.plant.tables.page_names(station.plant.tables.chain(page.station).chain)
+            names = station.plant.pages.names(station.plant.pages.chain(page.station).chain)
             if page.number == 1 or any(n == page.number - 1 for n, _, _ in names):
                 roster = station.plant.roster
                 assert roster is not None
@@ -74,7 +74,7 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
         entry = station.pins.entry(uuid)
         assert (entry.fingerprint if entry is not None else None) == (None if due.bans else due.pin)
         assert (station.policy.revocation(uuid) is not None) == bool(due.bans)
-        assert {name for _, name, _ in station.plant.tables.conflicts(uuid)} == set(due.conflicts)
+        assert {name for _, name, _ in station.plant.claims.conflicts(uuid)} == set(due.conflicts)
     rules = station.plant.signer_rules()
     assert rules is not None
     for speaker in speakers:
@@ -82,7 +82,7 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
             found = rules.signing(CA.point, speaker.key.point, bytes.fromhex(digest))
             assert found == oracle.signing(speaker.fingerprint, digest)
     for speaker in speakers:  # said anew, nothing changes
-        recount(station, station.plant.tables.chain(speaker.fingerprint), roster)
+        recount(station, station.plant.pages.chain(speaker.fingerprint), roster)
     assert merged_views(station, roster, NODES) == seen
     assert plant.apply_pages.heads_digest(station)[1] == sum(
         counts.newest[0] > 0 for counts in oracle.counting.values()

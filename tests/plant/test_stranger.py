@@ -92,7 +92,7 @@ def test_who_has_psql_and_jose_alone_comes_to_the_same_claims(office: Office, tm
                 pins[place] = event.get("fingerprint")
             elif event["act"] in ("agreed", "took"):
                 keys[place] = max(keys.get(place, (-1, "")), (event["epoch"], event["key_id"]))
-    claimed = south.plant.tables.claims_of([board.uuid for board in boards])
+    claimed = south.plant.claims.of_nodes([board.uuid for board in boards])
     for board in boards:
         for station, text in claimed[board.uuid].items():
             claim, place = json.loads(text), (board.uuid.hex(), station)

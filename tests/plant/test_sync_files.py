@@ -38,7 +38,7 @@ def pin(station: Station, uuid: bytes = UUID, key: str = KEY) -> None:
 
 
 def alarms(station: Station) -> list[str]:
-    return [alarm.code for alarm in station.plant.tables.alarms()]
+    return [alarm.code for alarm in station.plant.alarms.all()]
 
 
 def test_what_one_station_says_reaches_all_and_all_see_the_same(plants: Plant) -> None:
@@ -74,7 +74,7 @@ def test_a_pin_of_ones_own_stays_whatever_a_keeper_says(plants: Plant) -> None:
     entry = south.pins.entry(UUID)
     assert entry is not None
     assert entry.fingerprint == "cd" * 32
-    assert [name for _, name, _ in south.plant.tables.conflicts(UUID)] == ["other pin"]
+    assert [name for _, name, _ in south.plant.claims.conflicts(UUID)] == ["other pin"]
 
 
 def test_a_second_sync_with_nothing_new_does_nothing(plants: Plant) -> None:
@@ -89,7 +89,7 @@ def test_a_removed_station_hears_of_it_and_is_asked_for_nothing_more(plants: Pla
     plants.round()
     plants.change(
         plant.owner.draft_removal(
-            plants.north, "west", "lost", plants.north.plant.tables.chain(west.fingerprint).counted[0]
+            plants.north, "west", "lost", plants.north.plant.pages.chain(west.fingerprint).counted[0]
         )
     )
     plants.sync(plants.north)
@@ -124,7 +124,7 @@ def test_junk_ends_nothing_and_is_asked_for_again(plants: Plant) -> None:
     page.write_bytes(good)
     plants.sync(plants.north)
     assert alarms(plants.north) == []
-    assert plants.north.plant.tables.chain(west.fingerprint).counted[0] == 1
+    assert plants.north.plant.pages.chain(west.fingerprint).counted[0] == 1
 
 
 def test_a_copy_of_a_home_at_work_finds_itself_out(plants: Plant) -> None:
@@ -140,7 +140,7 @@ def test_a_copy_of_a_home_at_work_finds_itself_out(plants: Plant) -> None:
     pin(west, bytes([1] * 10))
     with pytest.raises(ForkError, match="copy of this home"):
         plants.sync(west)
-    assert west.plant.tables.unsent(west.fingerprint) >= 1
+    assert west.plant.unsent() >= 1
     assert resume(west, plant.folder_transport.FolderTransport(plants.stick)) == 1
     plants.sync(west)
     plants.sync(plants.north)
@@ -169,7 +169,7 @@ def test_two_histories_on_two_sticks_are_found_where_they_meet(plants: Plant) ->
     plants.sync(plants.north)
     plants.sync(plants.north, other)
     assert alarms(plants.north) == ["two-histories"]
-    chain = plants.north.plant.tables.chain(west.fingerprint)
+    chain = plants.north.plant.pages.chain(west.fingerprint)
     assert chain.counted[0] == 1, "the part that both share goes on counting"
     roster = plants.north.plant.roster
     assert roster is not None
@@ -196,7 +196,7 @@ def test_a_home_that_a_backup_rebuilt_takes_its_pages_back_before_it_says_more(p
     pin(back, bytes([2] * 10))
     plants.sync(back)
     assert not back.plant.restored
-    assert back.plant.tables.chain(back.fingerprint).counted[0] == 3
+    assert back.plant.pages.chain(back.fingerprint).counted[0] == 3
     assert not alarms(back)
     back.close()
 
@@ -229,14 +229,14 @@ def test_a_rebuilt_home_waits_where_somebody_has_seen_more_of_it(plants: Plant) 
 
 
 def test_a_person_names_the_branch_or_the_roster_does(plants: Plant) -> None:
-    chain = replace(plants.north.plant.tables.chain("f" * 64), accepted=(3, "a" * 64))
-    plants.north.plant.tables.put_chain(chain)
-    assert plants.north.plant.tables.chain("f" * 64) == chain
+    chain = replace(plants.north.plant.pages.chain("f" * 64), accepted=(3, "a" * 64))
+    plants.north.plant.pages.put_chain(chain)
+    assert plants.north.plant.pages.chain("f" * 64) == chain
 
 
 def test_a_roster_that_lies_behind_is_no_news(plants: Plant) -> None:
     plants.member("south", "base")
-    first = (plants.north.plant.tables.held_roster() or pytest.fail("no roster")).version
+    first = (plants.north.plant.held_roster() or pytest.fail("no roster")).version
     plants.sync(plants.north)
     plants.change(plant.owner.renewed(plants.north, timedelta(days=30)))
     west = plants.member("west", "line")  # it never saw the first ones
@@ -275,14 +275,14 @@ def test_a_page_of_a_clock_a_year_ahead_counts_and_no_name_of_it_wins_for_ever(p
     south = plants.member("south", "base")
     plants.round()
     pin(south)
-    chain, roster = south.plant.tables.chain(south.fingerprint), south.plant.roster
+    chain, roster = south.plant.pages.chain(south.fingerprint), south.plant.roster
     assert roster is not None
     ahead = datetime.now(UTC) + timedelta(days=365)
     draft = PageDraft(roster.registry, chain.counted[0] + 1, chain.counted[1], "0" * 16, ahead, {}, (1, "0" * 64))
     octets = seal_page(draft, [], south.vault.identity())
     FolderTransport(plants.stick).append(south.fingerprint, draft.number, draft.previous, hash_of(octets), octets)
     plants.sync(plants.north)
-    assert plants.north.plant.tables.chain(south.fingerprint).counted[0] == draft.number
+    assert plants.north.plant.pages.chain(south.fingerprint).counted[0] == draft.number
     assert alarms(plants.north) == []
 
 
@@ -311,7 +311,7 @@ def test_syncs_at_once_in_one_home_write_every_event_once(plants: Plant) -> None
     plants.sync(plants.north)
     said = [stated.event["uuid"] for stated in plant.status.log(plants.north)]
     assert sorted(said) == [uuid.hex() for uuid in nodes]
-    assert plants.north.plant.tables.unsent(plants.north.fingerprint) == 0
+    assert plants.north.plant.unsent() == 0
     assert alarms(plants.north) == []
     for station in homes:
         station.close()

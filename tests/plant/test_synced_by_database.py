@@ -81,10 +81,10 @@ def test_pages_and_rosters_reach_everybody(office: Office) -> None:
     south = office.member("south", "base")
     board = board_of(office.north, os.urandom(10))
     office.sync(office.north, south)
-    assert south.plant.tables.chains()[office.north.fingerprint].counted == (
-        office.north.plant.tables.chains()[office.north.fingerprint].counted
+    assert south.plant.pages.chains()[office.north.fingerprint].counted == (
+        office.north.plant.pages.chains()[office.north.fingerprint].counted
     )
-    assert office.north.fingerprint in south.plant.tables.claims_of([board.uuid])[board.uuid]
+    assert office.north.fingerprint in south.plant.claims.of_nodes([board.uuid])[board.uuid]
     west = office.member("west", "line")
     office.sync(office.north, south)
     assert south.plant.roster is not None
@@ -138,13 +138,13 @@ def test_a_database_of_yesterday_is_brought_up_to_today(office: Office) -> None:
     office.sync(office.north, south)
     board_of(office.north, os.urandom(10))
     office.sync(office.north)
-    newest = office.north.plant.tables.chains()[office.north.fingerprint].counted[0]
+    newest = office.north.plant.pages.chains()[office.north.fingerprint].counted[0]
     office.database.sql(mend_sql(office.north.fingerprint, newest))  # as if it had not come yet
     told = office.sync(office.north).told
     assert any(f"page {newest} was there, and now {newest - 1} is the last" in line for line in told), told
-    assert [alarm.code for alarm in office.north.plant.tables.alarms()] == ["rolled-back"]
+    assert [alarm.code for alarm in office.north.plant.alarms.all()] == ["rolled-back"]
     office.sync(south)
-    assert south.plant.tables.chains()[office.north.fingerprint].counted[0] >= newest
+    assert south.plant.pages.chains()[office.north.fingerprint].counted[0] >= newest
 
 
 def test_rows_that_a_stolen_login_wrote_stop_the_push_until_they_are_mended(office: Office) -> None:
@@ -173,7 +173,7 @@ def test_a_database_without_room_is_told_and_nothing_is_lost(office: Office) -> 
         office.sync(office.north)
     office.database.sql("drop trigger no_room on registry.page")
     assert office.sync(office.north).pushed > 0
-    assert office.north.plant.tables.unsent(office.north.fingerprint) == 0
+    assert office.north.plant.unsent() == 0
 
 
 def test_a_sync_that_is_cut_anywhere_is_followed_by_the_same_sync(office: Office) -> None:
@@ -238,7 +238,7 @@ def test_a_copy_of_a_home_at_work_beside_it_stops_both_until_a_person_decides(of
     with pytest.raises(ForkError):
         office.sync(copy)
     office.sync(office.north)
-    assert [alarm.code for alarm in office.north.plant.tables.alarms()] == []
+    assert [alarm.code for alarm in office.north.plant.alarms.all()] == []
     events = [stated.event for stated in plant_room.status.log(office.north, of=south.fingerprint)]
     said = {event["uuid"] for event in events if event["act"] == "pinned"}
     assert said == {bytes([n] * 10).hex() for n in (1, 2)}

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
         utc_now,
     )
     from teds_provision.station.store.store import Store
-    from teds_provision.station.store.tables.line import EvidenceRow, JobRow, LineTables, SignRequestRow, UnitRow
     from teds_provision.station.store.tables.nodes import BulkRows, chunks
     from teds_provision.station.store.tables.overview import NodeOverview, Search
 else:
@@ -43,7 +42,6 @@ else:
             " StationRecord Tombstone TrustRecord WhitelistEntry utc_now",
             "store": "Store",
             "tables.overview": "NodeOverview Search",
-            "tables.line": "EvidenceRow JobRow LineTables SignRequestRow UnitRow",
             "tables.nodes": "BulkRows chunks",
         },
     )
@@ -56,31 +54,26 @@ __all__ = [
     "BulkRows",
     "DatasheetRecord",
     "Draft",
-    "EvidenceRow",
     "ExportEligibility",
     "ExportedNode",
     "FirmwareRecord",
     "Group",
     "Handover",
     "Holder",
-    "JobRow",
     "KeptMeasurement",
     "KeyFlags",
     "KeyRecord",
-    "LineTables",
     "NodeLock",
     "NodeOverview",
     "NodeReading",
     "NodeRecord",
     "RevocationRecord",
     "Search",
-    "SignRequestRow",
     "StationRecord",
     "Store",
     "StoreLock",
     "Tombstone",
     "TrustRecord",
-    "UnitRow",
     "WhitelistEntry",
     "chunks",
     "is_failure",

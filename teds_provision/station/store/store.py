@@ -14,12 +14,9 @@ from teds_provision.station.store.tables.datasheets import DatasheetTables
 from teds_provision.station.store.tables.facts import FactTables
 from teds_provision.station.store.tables.handovers import HandoverTables
 from teds_provision.station.store.tables.keys import KeyTables
-from teds_provision.station.store.tables.line import LineTables
 from teds_provision.station.store.tables.measurements import MeasurementTables
 from teds_provision.station.store.tables.nodes import BulkTables, NodeTables
 from teds_provision.station.store.tables.overview import OverviewTables
-from teds_provision.station.store.tables.parcels import ParcelTables
-from teds_provision.station.store.tables.plant import PlantTables
 
 if TYPE_CHECKING:
     import sqlite3
@@ -37,9 +34,6 @@ class Store(
     FactTables,
     MeasurementTables,
     OverviewTables,
-    PlantTables,
-    LineTables,
-    ParcelTables,
 ):
     """The file of one station: its identifier, its audit log, transactions and statements.
 

@@ -6,8 +6,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Literal
 
-from teds_provision.station.store.database import Database, places
+from teds_provision.station.store.database import places
 from teds_provision.station.store.records import Direction, utc_now
+from teds_provision.station.store.store import Store
 
 ParcelKind = Literal["bundle", "receipt", "job", "sign-request", "signed"]
 ParcelState = Literal["ready", "sent", "later", "waiting"]
@@ -35,46 +36,47 @@ class ParcelRow:
 _ROW = ", ".join(column.name for column in fields(ParcelRow))
 
 
-class ParcelTables:
-    """The part of the store that is about parcels; see :class:`teds_provision.station.store.Store`."""
+class Parcels:
+    """The parcels of one station, and the copies of keys that it made for others."""
 
-    _database: Database
+    def __init__(self, store: Store) -> None:
+        self._store = store
 
-    def parcels(self, direction: Direction, *states: ParcelState) -> list[ParcelRow]:
+    def all(self, direction: Direction, *states: ParcelState) -> list[ParcelRow]:
         """Return parcels without their documents, oldest first."""
-        return self._database.read(
+        return self._store.read(
             ParcelRow,
             f"SELECT {_ROW} FROM parcels WHERE direction = ? AND state IN ({places(states)}) ORDER BY created, id",
             (direction, *states),
         )
 
-    def parcel(self, id: str, direction: Direction) -> ParcelRow | None:
+    def get(self, id: str, direction: Direction) -> ParcelRow | None:
         """Return one parcel, without its document."""
-        return self._database.read_one(
+        return self._store.read_one(
             ParcelRow, f"SELECT {_ROW} FROM parcels WHERE id = ? AND direction = ?", (id, direction)
         )
 
-    def parcel_document(self, id: str, direction: Direction) -> bytes:
+    def document(self, id: str, direction: Direction) -> bytes:
         """Return the octets of a parcel, empty if it is done or not known."""
-        rows = self._database.execute("SELECT document FROM parcels WHERE id = ? AND direction = ?", (id, direction))
+        rows = self._store.execute("SELECT document FROM parcels WHERE id = ? AND direction = ?", (id, direction))
         return bytes(rows[0][0]) if rows else b""
 
-    def put_parcel(self, row: ParcelRow, document: bytes) -> None:
+    def put(self, row: ParcelRow, document: bytes) -> None:
         """Add or replace a parcel."""
         values = tuple(getattr(row, column.name) for column in fields(ParcelRow))
-        self._database.execute(
+        self._store.execute(
             f"INSERT OR REPLACE INTO parcels({_ROW}, document) VALUES({places(values)}, ?)", (*values, document)
         )
 
-    def turn_parcel(self, id: str, direction: Direction, state: ParcelState, detail: str = "") -> None:
+    def turn(self, id: str, direction: Direction, state: ParcelState, detail: str = "") -> None:
         """Note what became of a parcel."""
-        self._database.execute(
+        self._store.execute(
             "UPDATE parcels SET state = ?, detail = ? WHERE id = ? AND direction = ?", (state, detail, id, direction)
         )
 
-    def drop_parcel(self, id: str, direction: Direction) -> None:
+    def drop(self, id: str, direction: Direction) -> None:
         """Forget a parcel."""
-        self._database.execute("DELETE FROM parcels WHERE id = ? AND direction = ?", (id, direction))
+        self._store.execute("DELETE FROM parcels WHERE id = ? AND direction = ?", (id, direction))
 
     # -- copies that were made ---------------------------------------------------------------------------------------
 
@@ -83,7 +85,7 @@ class ParcelTables:
 
         UUID, epoch and key id, by UUID.
         """
-        return self._database.execute(
+        return self._store.execute(
             "SELECT uuid, epoch, key_id FROM keys WHERE state = 'active' AND (source = 'agreement') = ? AND NOT EXISTS"
             " (SELECT 1 FROM shared WHERE shared.uuid = keys.uuid AND shared.epoch = keys.epoch AND receiver = ?)"
             " ORDER BY uuid",
@@ -92,7 +94,7 @@ class ParcelTables:
 
     def put_shared(self, rows: Iterable[tuple[bytes, int]], receiver: str, parcel: str, state: str) -> None:
         """Note that a copy of these keys (UUID, epoch) is made for a receiver: ``sent``, ``taken`` or ``refused``."""
-        self._database.execute_many(
+        self._store.execute_many(
             "INSERT OR REPLACE INTO shared VALUES(?, ?, ?, ?, ?)",
             ((uuid, epoch, receiver, parcel, state) for uuid, epoch in rows),
         )
@@ -100,23 +102,23 @@ class ParcelTables:
     def turn_shared(self, parcel: str, state: str, uuids: Sequence[bytes] | None = None) -> None:
         """Note what became of the copies in a parcel, of all or of some nodes."""
         if uuids is None:
-            self._database.execute("UPDATE shared SET state = ? WHERE parcel = ?", (state, parcel))
+            self._store.execute("UPDATE shared SET state = ? WHERE parcel = ?", (state, parcel))
             return
-        self._database.execute_many(
+        self._store.execute_many(
             "UPDATE shared SET state = ? WHERE parcel = ? AND uuid = ?", ((state, parcel, uuid) for uuid in uuids)
         )
 
     def forget_shared(self, parcel: str) -> None:
         """Queue the copies of a parcel without a receipt for another export."""
-        self._database.execute("DELETE FROM shared WHERE parcel = ? AND state = 'sent'", (parcel,))
+        self._store.execute("DELETE FROM shared WHERE parcel = ? AND state = 'sent'", (parcel,))
 
     def shared_in(self, parcel: str) -> list[tuple[bytes, int, str]]:
         """Return what a parcel holds: UUID, epoch, state."""
-        return self._database.execute("SELECT uuid, epoch, state FROM shared WHERE parcel = ? ORDER BY uuid", (parcel,))
+        return self._store.execute("SELECT uuid, epoch, state FROM shared WHERE parcel = ? ORDER BY uuid", (parcel,))
 
     def receipted(self) -> list[tuple[bytes, int, set[str]]]:
         """Return keys that are still held here and of which receivers sent a receipt: UUID, epoch, who."""
-        rows = self._database.execute(
+        rows = self._store.execute(
             "SELECT uuid, epoch, group_concat(receiver) FROM shared WHERE shared.state = 'taken' AND EXISTS"
             " (SELECT 1 FROM keys WHERE keys.uuid = shared.uuid AND keys.epoch = shared.epoch AND state = 'active')"
             " GROUP BY uuid, epoch"
@@ -127,9 +129,9 @@ class ParcelTables:
 
     def review(self) -> str | None:
         """Return what was found when the keys were looked through last, JSON."""
-        row = self._database.one("SELECT value FROM meta WHERE name = 'plant-review'")
+        row = self._store.one("SELECT value FROM meta WHERE name = 'plant-review'")
         return None if row is None else str(row[0])
 
     def put_review(self, text: str) -> None:
         """Keep what was found."""
-        self._database.execute("INSERT OR REPLACE INTO meta VALUES('plant-review', ?)", (text,))
+        self._store.execute("INSERT OR REPLACE INTO meta VALUES('plant-review', ?)", (text,))

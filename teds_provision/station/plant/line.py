@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from teds_provision.station.store.database import PAGE, Database, places
+from teds_provision.station.store.database import PAGE, places
 from teds_provision.station.store.records import utc_now
+from teds_provision.station.store.store import Store
 
 
 @dataclass(frozen=True)
@@ -70,49 +71,50 @@ _EVIDENCE = ", ".join(column.name for column in fields(EvidenceRow))
 _REQUEST = ", ".join(column.name for column in fields(SignRequestRow))
 
 
-class LineTables:
-    """The part of the store that is about a line; see :class:`teds_provision.station.store.Store`."""
+class Line:
+    """Jobs, units, evidence and sign requests of one station."""
 
-    _database: Database
+    def __init__(self, store: Store) -> None:
+        self._store = store
 
     # -- jobs and their units --------------------------------------------------------------------------------------
 
     def job(self, id: str) -> JobRow | None:
         """Return a job that was taken."""
-        return self._database.read_one(JobRow, "SELECT id, hash, octets, state, at FROM jobs WHERE id = ?", (id,))
+        return self._store.read_one(JobRow, "SELECT id, hash, octets, state, at FROM jobs WHERE id = ?", (id,))
 
     def jobs(self) -> list[JobRow]:
         """Return every job, oldest first."""
-        return self._database.read(JobRow, "SELECT id, hash, octets, state, at FROM jobs ORDER BY at, id")
+        return self._store.read(JobRow, "SELECT id, hash, octets, state, at FROM jobs ORDER BY at, id")
 
     def add_job(self, row: JobRow) -> None:
         """Keep a job; one of this id that is there stays as it is."""
         values = (row.id, row.hash, row.octets, row.state, row.at)
-        self._database.execute("INSERT OR IGNORE INTO jobs(id, hash, octets, state, at) VALUES(?, ?, ?, ?, ?)", values)
+        self._store.execute("INSERT OR IGNORE INTO jobs(id, hash, octets, state, at) VALUES(?, ?, ?, ?, ?)", values)
 
     def set_job_state(self, id: str, state: str) -> None:
         """Open or close a job."""
-        self._database.execute("UPDATE jobs SET state = ? WHERE id = ?", (state, id))
+        self._store.execute("UPDATE jobs SET state = ? WHERE id = ?", (state, id))
 
     def end_seen(self, id: str) -> bool:
         """Return True if this station's clock was once past the end of the job."""
-        return self._database.one("SELECT 1 FROM meta WHERE name = ?", (f"job-over-{id}",)) is not None
+        return self._store.one("SELECT 1 FROM meta WHERE name = ?", (f"job-over-{id}",)) is not None
 
     def put_end_seen(self, id: str) -> None:
         """Record that this station's clock was past the end of the job."""
-        self._database.execute("INSERT OR IGNORE INTO meta VALUES(?, ?)", (f"job-over-{id}", utc_now()))
+        self._store.execute("INSERT OR IGNORE INTO meta VALUES(?, ?)", (f"job-over-{id}", utc_now()))
 
     def unit(self, job: str, uuid: bytes) -> UnitRow | None:
         """Return the unit that a board has of a job."""
-        return self._database.read_one(UnitRow, f"SELECT {_UNIT} FROM units WHERE job = ? AND uuid = ?", (job, uuid))
+        return self._store.read_one(UnitRow, f"SELECT {_UNIT} FROM units WHERE job = ? AND uuid = ?", (job, uuid))
 
     def units(self, job: str) -> list[UnitRow]:
         """Return every unit of a job, by number."""
-        return self._database.read(UnitRow, f"SELECT {_UNIT} FROM units WHERE job = ? ORDER BY unit", (job,))
+        return self._store.read(UnitRow, f"SELECT {_UNIT} FROM units WHERE job = ? ORDER BY unit", (job,))
 
     def count_units(self, job: str) -> tuple[int, int, int]:
         """Return how many units were given, how many of them passed, and the greatest number."""
-        row = self._database.execute(
+        row = self._store.execute(
             "SELECT count(*), coalesce(sum(passed > 0), 0), coalesce(max(unit), 0) FROM units WHERE job = ?",
             (job,),
         )[0]
@@ -120,7 +122,7 @@ class LineTables:
 
     def put_unit(self, row: UnitRow) -> None:
         """Keep a unit, or its new attempt."""
-        self._database.execute(
+        self._store.execute(
             f"INSERT INTO units({_UNIT}) VALUES(?, ?, ?, ?, ?, ?)"
             " ON CONFLICT(job, uuid) DO UPDATE SET attempts = excluded.attempts, passed = excluded.passed",
             (row.job, row.uuid, row.unit, row.at, row.attempts, row.passed),
@@ -131,11 +133,11 @@ class LineTables:
     def add_evidence(self, row: EvidenceRow) -> None:
         """Keep a document, whole."""
         values = tuple(getattr(row, column.name) for column in fields(EvidenceRow))
-        self._database.execute(f"INSERT OR IGNORE INTO evidence({_EVIDENCE}) VALUES({places(values)})", values)
+        self._store.execute(f"INSERT OR IGNORE INTO evidence({_EVIDENCE}) VALUES({places(values)})", values)
 
     def last_attempt(self, uuid: bytes) -> int:
         """Return the number of the newest document about a board outside any job, 0 for none."""
-        rows = self._database.execute(
+        rows = self._store.execute(
             "SELECT coalesce(max(attempt), 0) FROM evidence WHERE uuid = ? AND job IS NULL", (uuid,)
         )
         return int(rows[0][0])
@@ -148,7 +150,7 @@ class LineTables:
         values = [value for _, value in chosen]
         after: tuple[Any, ...] = (b"", 0, "")
         while True:
-            rows = self._database.read(
+            rows = self._store.read(
                 EvidenceRow,
                 f"SELECT {_EVIDENCE} FROM evidence WHERE (uuid, attempt, sha256) > (?, ?, ?){where}"
                 f" ORDER BY uuid, attempt, sha256 LIMIT {PAGE}",
@@ -163,13 +165,13 @@ class LineTables:
 
     def sign_request(self, hash: str, direction: Literal["out", "in"]) -> SignRequestRow | None:
         """Return a request by its H, None if it has the other direction or does not exist."""
-        return self._database.read_one(
+        return self._store.read_one(
             SignRequestRow, f"SELECT {_REQUEST} FROM sign_requests WHERE hash = ? AND direction = ?", (hash, direction)
         )
 
     def sign_requests(self, job: str, uuid: bytes, direction: Literal["out", "in"]) -> list[SignRequestRow]:
         """Return the requests for one board of a job."""
-        return self._database.read(
+        return self._store.read(
             SignRequestRow,
             f"SELECT {_REQUEST} FROM sign_requests WHERE job = ? AND uuid = ? AND direction = ?"
             " ORDER BY coalesce(sequence, 0), hash",
@@ -179,4 +181,4 @@ class LineTables:
     def put_sign_request(self, row: SignRequestRow) -> None:
         """Keep a request, or its answer."""
         values = tuple(getattr(row, column.name) for column in fields(SignRequestRow))
-        self._database.execute(f"INSERT OR REPLACE INTO sign_requests({_REQUEST}) VALUES({places(values)})", values)
+        self._store.execute(f"INSERT OR REPLACE INTO sign_requests({_REQUEST}) VALUES({places(values)})", values)

@@ -1,0 +1,1 @@
+"""The rows of a station about its plant and its production line: one class for each topic."""
