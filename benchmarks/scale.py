@@ -25,8 +25,9 @@ from pathlib import Path
 from typing import Any
 
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.station.bulk import BulkRows
 from teds_provision.station.station import Station, initialise
-from teds_provision.station.store import BulkRows, KeyRecord, NodeRecord, WhitelistEntry, utc_now
+from teds_provision.station.store import KeyRecord, NodeRecord, WhitelistEntry, utc_now
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.vault import forget_vaults, node_key_context, passphrase
@@ -70,7 +71,7 @@ def fill(home: Path, count: int) -> None:
         numbers = range(first, min(count, first + _PAGE))
         entries = [WhitelistEntry(_uuid(n), fingerprint(points[n % 97]), name=f"node-{n}") for n in numbers]
         with station.transaction():
-            station.handovers.take_in(
+            station.bulk.put(
                 BulkRows(
                     nodes=[_node(number, points) for number in numbers],
                     whitelist=entries,
@@ -79,7 +80,7 @@ def fill(home: Path, count: int) -> None:
             )
             for number in numbers:
                 signed = {**octets, (0, 128): os.urandom(900)}
-                station._store.put_datasheet(Image(_uuid(number), signed), "temperature-sensor")
+                station.datasheets.put(Image(_uuid(number), signed), "temperature-sensor")
                 station.audit("verify", _uuid(number), "authentic")
     station.close()
     forget_vaults()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -218,18 +219,48 @@ def test_a_command_at_a_node_is_one_call_of_one_step() -> None:
         assert not {module for module, _ in acts if module.split(".")[0] in ("talk", "links")}, path.name
 
 
-def test_nothing_outside_the_station_reaches_past_it_into_the_store() -> None:
-    """Its parts (identity, keys, pins, policy, nodes, groups, handovers) are the doors."""
-    wrong = [
-        f"{name_of(path)}:{node.lineno}"
-        for path in MODULES
-        if room_of(path) != "station"
-        for node in ast.walk(parsed(path))
-        if isinstance(node, ast.Attribute)
-        and (node.attr == "_store" or (node.attr == "store" and getattr(node.value, "id", "") == "station"))
-        and getattr(node.value, "id", "") != "self"
+# Who has one of them can read and write any row; the rest of the folder is records, locks and the audit log.
+_FILE = {"Store", "Database", "Connection", "dump", "load", "statements"}
+_OF_THE_FILE = {"_store", "_database", "tables", *_FILE}
+
+
+def _is_the_file(node: ast.Attribute) -> bool:
+    if node.attr == "_store":
+        return getattr(node.value, "id", "") != "self"
+    return node.attr in _OF_THE_FILE and ast.unparse(node.value).rpartition(".")[2] in ("station", "store", "plant")
+
+
+def test_nothing_above_the_station_gets_its_tables() -> None:
+    """Its topics (identity, keys, pins, policy …) are the doors: each has its rows, and none hands out the file."""
+    above = [path for path in MODULES if room_of(path) != "station"]
+    imported = [
+        f"{name_of(path)}:{line} imports {name}"
+        for path in above
+        for name, line in imports(parsed(path))
+        if name.startswith("teds_provision.station.store.") and name.rpartition(".")[2] in _FILE
     ]
-    assert not wrong
+    reached = [
+        f"{name_of(path)}:{node.lineno} {ast.unparse(node)}"
+        for path in above
+        for node in ast.walk(parsed(path))
+        if isinstance(node, ast.Attribute) and _is_the_file(node)
+    ]
+    assert not imported + reached
+
+
+def test_each_table_is_written_by_one_topic() -> None:
+    """A rule about rows is in the class that writes them; the folder ``store`` makes and copies tables."""
+    written: dict[str, set[str]] = {}
+    for path in MODULES:
+        if room_of(path) != "station" or "/store/" in f"/{name_of(path)}" or path.stem == "snapshot":
+            continue
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                for table in re.findall(r"\b(?:INSERT(?: OR \w+)? INTO|UPDATE(?! SET)|DELETE FROM) (\w+)", node.value):
+                    written.setdefault(table, set()).add(name_of(path))
+    assert len(written) > 40
+    shared = {table: files for table, files in written.items() if len(files) > 1 and table != "meta"}
+    assert not shared
 
 
 _KNOWS_NO_LINK = ("measure", "ncap")

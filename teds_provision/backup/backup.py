@@ -14,9 +14,9 @@ from teds_provision.errors import StoreError, StoreLockedError, TedsProvisionErr
 from teds_provision.files import whole_draft
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.sanitize import counted
+from teds_provision.station.snapshot import totals
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now
-from teds_provision.station.store.snapshot import totals
 from teds_provision.vault import Ask, Vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
 

@@ -13,7 +13,8 @@ from teds_provision import __version__
 from teds_provision.errors import BadDataError, NotAuthenticError, VaultError
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import fingerprint, is_point
-from teds_provision.station.store import KeyRecord, Store
+from teds_provision.station.station import Station
+from teds_provision.station.store.records import KeyRecord
 from teds_provision.vault import Vault, node_key_context
 
 MAX_HEAD_OCTETS: Final = 64 * 1024
@@ -97,11 +98,11 @@ class BackupHead:
 class Content(BackupHead):
     """An opened backup: its head, and its store as a private copy that lives until :meth:`close`."""
 
-    copy: Store = field(repr=False, kw_only=True)
+    copy: Station = field(repr=False, kw_only=True)
 
     def unopened(self, vault: Vault) -> Iterator[KeyRecord]:
         """Yield the keys that ``vault`` cannot open."""
-        for record in self.copy.all_keys():
+        for record in self.copy.keys.all():
             context = node_key_context(self.copy.id, record.uuid, record.epoch, record.slot)
             try:
                 vault.unwrap(record.wrapped, context=context)

@@ -7,35 +7,38 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.station.store import RevocationRecord, Store, Tombstone, WhitelistEntry
-from teds_provision.station.store.snapshot import Relation, extend_audit
+from teds_provision.station.snapshot import Relation, extend_audit
+from teds_provision.station.station import Station
+from teds_provision.station.store.records import RevocationRecord, Tombstone, WhitelistEntry
 
 
 class Merge:
     """Result of one merge: ``back`` counts restored rows, ``kept`` those that stayed although the backup differs."""
 
-    def __init__(self, live: Store, copy: Store, how: Relation) -> None:
+    def __init__(self, live: Station, copy: Station, how: Relation) -> None:
         self.live, self.copy = live, copy
         self.newer = how is Relation.NEWER
         self.older = how in (Relation.OLDER, Relation.SAME)
         self.back: Counter[str] = Counter()
         self.kept: Counter[str] = Counter()
-        epochs = {record.uuid: record.epoch for record in live.nodes()}
-        for key in live.all_keys():
+        epochs = {record.uuid: record.epoch for record in live.nodes.all()}
+        for key in live.keys.all():
             epochs[key.uuid] = max(epochs.get(key.uuid, 0), key.epoch)
         self.epochs = epochs
-        self.held = {key.uuid for key in live.all_keys()}
-        self.barred = {gone.uuid for gone in live.revocations()} | {gone.uuid for gone in live.tombstones()}
+        self.held = {key.uuid for key in live.keys.all()}
+        self.barred = {gone.uuid for gone in live.policy.revocations()} | {
+            gone.uuid for gone in live.policy.tombstones()
+        }
 
     def run(self) -> None:
         """Bring everything in the order in which one part looks at the other."""
         if self.newer:
             self.back["audit entries"] = extend_audit(self.live, self.copy)
-        for revocation in self.copy.revocations():
-            if self.live.revocation(revocation.uuid) is None:
-                self.live.put_revocation(revocation)
+        for revocation in self.copy.policy.revocations():
+            if self.live.policy.revocation(revocation.uuid) is None:
+                self.live.policy.deny(revocation)
                 self.back["revocations"] += 1
-        self.kept["revocations made since"] = _more(self.live.revocations(), self.copy.revocations())
+        self.kept["revocations made since"] = _more(self.live.policy.revocations(), self.copy.policy.revocations())
         self._handovers()
         self._nodes()
         self._whitelist()
@@ -52,28 +55,28 @@ class Merge:
         return [f"{what}: {count}" for what, count in self.kept.items() if count]
 
     def _handovers(self) -> None:
-        for handover in self.copy.handovers():
-            known = self.live.handover(handover.id, handover.direction)
+        for handover in self.copy.handovers.all():
+            known = self.live.handovers.get(handover.id, handover.direction)
             if known is None or (self.newer and known != handover):
-                self.live.put_handover(handover)
+                self.live.handovers.put(handover)
                 self.back["handovers"] += 1
         if not self.older:  # what an older copy has and this store lacks was undone, or rotated away, since
-            for tombstone in self.copy.tombstones():
-                if self.live.tombstone(tombstone.uuid) is None:
-                    self.live.put_tombstone(tombstone)
+            for tombstone in self.copy.policy.tombstones():
+                if self.live.policy.tombstone(tombstone.uuid) is None:
+                    self.live.policy.put_tombstone(tombstone)
                     self.back["tombstones"] += 1
-            present = {(holder.uuid, holder.fingerprint) for holder in self.live.holders()}
-            for holder in self.copy.holders():
+            present = {(holder.uuid, holder.fingerprint) for holder in self.live.keys.holders()}
+            for holder in self.copy.keys.holders():
                 if (holder.uuid, holder.fingerprint) not in present:
-                    self.live.put_holder(holder)
+                    self.live.keys.put_holder(holder)
                     self.back["holders"] += 1
-        self.kept["nodes moved away since"] = _more(self.live.tombstones(), self.copy.tombstones())
+        self.kept["nodes moved away since"] = _more(self.live.policy.tombstones(), self.copy.policy.tombstones())
 
     def _nodes(self) -> None:
-        for record in self.copy.nodes():
-            known = self.live.node(record.uuid)
+        for record in self.copy.nodes.all():
+            known = self.live.nodes.get(record.uuid)
             if known is None:
-                self.live.put_node(record)
+                self.live.nodes.restore(record)
                 self.back["nodes"] += 1
                 continue
             other = known.point is not None and record.point is not None and known.point != record.point
@@ -87,7 +90,7 @@ class Merge:
                 sequence=max(known.sequence, record.sequence),
             )
             if wanted != known:
-                self.live.put_node(wanted)
+                self.live.nodes.restore(wanted)
                 self.back["nodes"] += 1
             self.kept["nodes pinned to another key now"] += other
             self.kept["nodes whose epoch or sequence is higher now"] += (
@@ -99,42 +102,42 @@ class Merge:
 
         What an older copy has and this store lacks was deleted since.
         """
-        present = {group.name: set(group.uuids) for group in self.live.groups()}
-        for group in self.copy.groups():
+        present = {group.name: set(group.uuids) for group in self.live.groups.all()}
+        for group in self.copy.groups.all():
             missing = group.name not in present and not self.older
             if (self.newer or missing) and present.get(group.name) != set(group.uuids):
-                self.live.put_group(group)
+                self.live.groups.put(group)
                 self.back["groups"] += 1
 
     def _whitelist(self) -> None:
-        for entry in self.copy.whitelist():
-            known = self.live.whitelisted(entry.uuid)
+        for entry in self.copy.pins.whitelist():
+            known = self.live.pins.row(entry.uuid)
             pin = self._pin(known, entry.uuid)
-            if self.live.revocation(entry.uuid) is not None:
+            if self.live.policy.revocation(entry.uuid) is not None:
                 self.kept["revoked nodes off the whitelist"] += known is None
             elif entry.fingerprint is not None and pin not in (None, entry.fingerprint):
                 self.kept["whitelist entries pinned to another key now"] += 1
             elif known is None or (self.newer and known != entry):
-                self.live.put_whitelist(entry)
+                self.live.pins.restore([entry])
                 self.back["whitelist"] += 1
 
     def _pin(self, known: WhitelistEntry | None, uuid: bytes) -> str | None:
         """Fingerprint of the key that this store ties a node to: that of its entry, else of what it showed."""
         if known is not None and known.fingerprint is not None:
             return known.fingerprint
-        node = self.live.node(uuid)
+        node = self.live.nodes.get(uuid)
         return fingerprint(node.point) if node is not None and node.point is not None else None
 
     def _keys(self) -> None:
-        for record in self.copy.all_keys():
-            if any(key.key_id == record.key_id for key in self.live.keys(record.uuid)):
+        for record in self.copy.keys.all():
+            if any(key.key_id == record.key_id for key in self.live.keys.keys_of(record.uuid)):
                 continue
             newest = self.epochs.get(record.uuid)
             if record.uuid in self.barred:
                 self.kept["keys of revoked or moved nodes left out"] += 1
             elif newest is None or record.epoch > newest:
                 # Beside a key that is held it comes as pending: an Open under it decides, and drops the other.
-                self.live.add_key(
+                self.live.keys.add(
                     replace(record, state="pending", source="import") if record.uuid in self.held else record
                 )
                 self.back["keys"] += 1
@@ -142,26 +145,29 @@ class Merge:
                 self.kept["older keys left out"] += 1
 
     def _images(self) -> None:
-        for record in self.copy.nodes():
-            draft, known = self.copy.draft(record.uuid), self.live.draft(record.uuid)
+        for record in self.copy.nodes.all():
+            draft, known = self.copy.datasheets.draft(record.uuid), self.live.datasheets.draft(record.uuid)
             if draft is not None and draft != known and (self.newer or (known is None and not self.older)):
-                self.live.put_draft(draft)
+                self.live.datasheets.keep_draft(draft)
                 self.back["drafts"] += 1
-            history, present = self.copy.history(record.uuid), self.live.history(record.uuid)
+            history, present = (
+                self.copy.datasheets.whole_history(record.uuid),
+                self.live.datasheets.whole_history(record.uuid),
+            )
             if history and history != present and (not present or self.newer):
-                self.live.put_history(history[::-1])
+                self.live.datasheets.put_history(history[::-1])
                 self.back["datasheets"] += 1
 
     def _trust(self) -> None:
-        names = {record.name for record in self.live.trusted()}
-        keys = {(record.fingerprint, record.role) for record in self.live.trusted()}
-        for record in self.copy.trusted():
+        names = {record.name for record in self.live.policy.trust_rows()}
+        keys = {(record.fingerprint, record.role) for record in self.live.policy.trust_rows()}
+        for record in self.copy.policy.trust_rows():
             if (record.fingerprint, record.role) in keys:
                 continue
             if record.name in names:
                 self.kept[f"the name {record.name!r} for the key trusted under it now"] += 1
                 continue
-            self.live.put_trust(record)
+            self.live.policy.restore_trust(record)
             self.back[f"trust in {record.role} {record.name}"] += 1
 
     def _decisions(self) -> None:
@@ -169,27 +175,27 @@ class Merge:
 
         What an older copy has and this store lacks may have been taken back since.
         """
-        ended, lifted = self.live.ended_cas(), self.live.lifted()
-        for ca, mac in self.copy.ended_cas().items():
+        ended, lifted = self.live.policy.ended_cas(), self.live.policy.lifted()
+        for ca, mac in self.copy.policy.ended_cas().items():
             if ca not in ended and not self.older:
-                self.live.end_ca(ca, mac)
+                self.live.policy.restore_ended_ca(ca, mac)
                 self.back["CAs whose trust has ended"] += 1
-        for statement, mac in self.copy.lifted().items():
+        for statement, mac in self.copy.policy.lifted().items():
             if statement not in lifted and self.newer:
-                self.live.put_lifted(statement, mac)
+                self.live.policy.restore_lifted(statement, mac)
                 self.back["bans lifted"] += 1
 
     def _facts(self) -> None:
         """Facts of the station that init had not reached here, and certificates; the keystore is this machine's."""
-        here, there = self.live.facts(), self.copy.facts()
+        here, there = self.live.identity.record(), self.copy.identity.record()
         if there is not None and (here is None or here.point is None):
             kept = there if here is None else replace(there, keystore=here.keystore, keystore_why=here.keystore_why)
-            self.live.put_facts(kept)
+            self.live.identity.put(kept)
             self.back["station"] += 1
-        present = self.live.certificates()
-        for (ca, station), signature in self.copy.certificates().items():
+        present = self.live.identity.certificates()
+        for (ca, station), signature in self.copy.identity.certificates().items():
             if (ca, station) not in present:
-                self.live.put_certificate(ca, station, signature)
+                self.live.identity.put_certificate(ca, station, signature)
                 self.back["certificates"] += 1
 
     def _marks(self) -> None:
@@ -197,14 +203,14 @@ class Merge:
 
         What an older copy has and this store lacks may have been settled since.
         """
-        present = self.live.all_key_flags()
+        present = self.live.keys.all_flags()
         wanted = {
             uuid: marks
-            for uuid, marks in self.copy.all_key_flags().items()
+            for uuid, marks in self.copy.keys.all_flags().items()
             if present.get(uuid) != marks
             and (self.newer or (uuid not in present and not (self.older and uuid in self.held)))
         }
-        self.live.put_key_flags(wanted)
+        self.live.keys.put_flags(wanted)
         self.back["marks"] += len(wanted)
 
 

@@ -24,10 +24,10 @@ from teds_provision.errors import (
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.node_keys import RESTORED
 from teds_provision.station.plant.plant import new_home
+from teds_provision.station.snapshot import Relation, is_damage, place, relation, set_aside, totals
 from teds_provision.station.station import Station
-from teds_provision.station.store import Store, StoreLock
+from teds_provision.station.store import StoreLock
 from teds_provision.station.store.database import has_store
-from teds_provision.station.store.snapshot import Relation, is_damage, place, relation, set_aside, totals
 from teds_provision.vault import Ask, Vault, asked_first, create_vault, open_vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
 
@@ -53,32 +53,32 @@ class _DryRunRollbackError(Exception):
     """Rolls a transaction back that was tried out."""
 
 
-def open_present(home: Path, content: Content) -> Store | None:
-    """Open the store of ``home`` if it is usable; return None if it is absent or damaged.
+def open_present(home: Path, content: Content) -> Station | None:
+    """Open the station of ``home`` if it is usable; return None if it is absent or damaged.
 
     Raises PolicyError if it belongs to another station, StoreError if it cannot be used for another reason.
     """
     if not has_store(home):
         return None
     try:
-        store = Store.open(home)
+        station = Station.inspect(home)
     except StoreError as failure:
         if is_damage(failure):
             return None
         raise
-    if store.damage() is not None:
-        store.close()
+    if station.damage() is not None:
+        station.close()
         return None
-    facts = store.facts()
+    facts = station.identity.record()
     point = facts.point if facts is not None else None
-    if store.id != content.store or (point is not None and point != content.point):
-        store.close()
+    if station.id != content.store or (point is not None and point != content.point):
+        station.close()
         here = "of an unfinished init" if point is None else f"of station {fingerprint(point)[:32]}"
         raise PolicyError(
             f"The backup is of station {content.station[:32]}; the store in {home} is {here}.",
             hint="Restore into another --home: backups never mix stations.",
         )
-    return store
+    return station
 
 
 def rebuild(
@@ -111,18 +111,17 @@ def rebuild(
             kind = wanted if wanted is not None and wanted.startswith("pkcs11:") else vault.kind
             with copy.transaction():
                 # note in a restored store of this machine's keystore
-                facts = copy.facts()
+                facts = copy.identity.record()
                 if facts is not None:
-                    copy.put_facts(replace(facts, keystore=kind, keystore_why=why))
-                due = _demand_rotations(copy, content, known)
+                    copy.identity.put(replace(facts, keystore=kind, keystore_why=why))
+                due = _demand_rotations(copy, content)
                 # Have a home that belongs to a plant look for its own pages before it states anything there
-                station = Station(copy, known)
-                in_plant = station.plant.record() is not None
+                in_plant = copy.plant.record() is not None
                 if in_plant:
-                    station.adopt(vault)
-                    station.plant.begin_restored()
+                    copy.adopt(vault)
+                    copy.plant.begin_restored()
                 detail = {"created": content.created, "keystore": vault.kind, "rotations_due": due}
-                copy.audit.append("restore", None, "rebuilt", detail)
+                copy.audit("restore", None, "rebuilt", **detail)
             aside = set_aside(home) if has_store(home) else None
             place(copy, home)
             if in_plant:
@@ -132,10 +131,10 @@ def rebuild(
     return asked_first(ask, make)
 
 
-def _demand_rotations(copy: Store, content: Content, ask: Ask) -> int:
+def _demand_rotations(copy: Station, content: Content) -> int:
     """Have every node for which a key is held rotate it first, and only when a person has the node in hand."""
     why = f"{RESTORED} of {content.created}: it may have been given away or replaced since"
-    keys = Station(copy, ask).keys
+    keys = copy.keys
     nodes = {record.uuid for record in keys.all()}
     keys.set_flags({uuid: {"rotation": why} for uuid in nodes})
     return len(nodes)
@@ -180,78 +179,78 @@ def bring_vault(
     return vault, why
 
 
-def open_vault_of(store: Store, ask: Ask) -> None:
+def open_vault_of(station: Station, ask: Ask) -> None:
     """Open the vault of a living station, before anything is held; one that is lost is no failure yet.
 
     Raises WrongPassphraseError, VaultChangedError.
     """
-    facts = store.facts()
+    facts = station.identity.record()
     try:
-        open_vault(store.home, store.id, facts.keystore if facts is not None else "keyring", ask)
+        open_vault(station.home, station.id, facts.keystore if facts is not None else "keyring", ask)
     except (WrongPassphraseError, VaultChangedError):
         raise
     except VaultError:
         pass
 
 
-def complete_vault(store: Store, content: Content, ask: Ask, *, keystore: str | None = None) -> Vault:
+def complete_vault(station: Station, content: Content, ask: Ask, *, keystore: str | None = None) -> Vault:
     """Open the vault of an existing station; recreate it if it is lost, and add missing master keys from the backup.
 
     A CA key that was removed from the vault since the backup stays removed. Raises VaultError and its leaves.
     """
-    facts = store.facts()
+    facts = station.identity.record()
     wanted = facts.keystore if facts is not None else keystore_for(content, keystore)
     try:
-        vault = open_vault(store.home, store.id, wanted or "keyring", ask)
+        vault = open_vault(station.home, station.id, wanted or "keyring", ask)
     except (WrongPassphraseError, VaultChangedError):
         raise
     except VaultError:  # lost, or locked: then making it fails as well, with the reason
-        return bring_vault(store.home, content, ask, wanted)[0]
+        return bring_vault(station.home, content, ask, wanted)[0]
     if not any(True for _ in content.unopened(vault)):
         return vault
     had_ca = vault.ca() is not None
-    vault, _ = bring_vault(store.home, content, ask, wanted)
+    vault, _ = bring_vault(station.home, content, ask, wanted)
     if not had_ca:
         vault.drop_ca()
     return vault
 
 
-def merge_checked(store: Store, content: Content, vault: Vault, ask: Ask) -> RestoreResult:
-    """Merge into a store whose own key and CA are as this station sealed them.
+def merge_checked(station: Station, content: Content, vault: Vault, ask: Ask) -> RestoreResult:
+    """Merge into a station whose own key and CA are as this station sealed them.
 
     Raises StoreChangedError, and as merge().
     """
-    with store.transaction():
-        Station(store, ask).adopt(vault)
-        return merge(store, content, dry_run=False)
+    with station.transaction():
+        station.adopt(vault)
+        return merge(station, content, dry_run=False)
 
 
-def merge(store: Store, content: Content, *, dry_run: bool) -> RestoreResult:
+def merge(station: Station, content: Content, *, dry_run: bool) -> RestoreResult:
     """Bring back into a living store what it lacks, in one transaction; ``dry_run`` tries it out and changes nothing.
 
     Raises NotAuthenticError, BadDataError, StoreError.
     """
     copy = content.copy
     _check_inside(copy, content)
-    how = relation(copy, store)
-    work = Merge(store, copy, how)
+    how = relation(copy, station)
+    work = Merge(station, copy, how)
     try:
-        with store.transaction():
+        with station.transaction():
             work.run()
             back = {name: count for name, count in work.back.items() if count}
             if back:
                 detail = {"created": content.created, "relation": how.name.lower(), "back": back}
-                store.audit.append("restore", None, "merged", detail)
+                station.audit("restore", None, "merged", **detail)
             if dry_run:
                 raise _DryRunRollbackError
     except _DryRunRollbackError:
         pass
     action = "merged" if back else "nothing"
-    facts = store.facts()
+    facts = station.identity.record()
     return RestoreResult(action, how, back, tuple(work.kept_sentences()), facts.keystore if facts is not None else "")
 
 
-def _check_inside(copy: Store, content: Content) -> None:
-    facts = copy.facts()
+def _check_inside(copy: Station, content: Content) -> None:
+    facts = copy.identity.record()
     if copy.id != content.store or facts is None or facts.point != content.point:
         raise NotAuthenticError("The store in the backup is not that of the station that signed it.")

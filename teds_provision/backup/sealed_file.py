@@ -25,8 +25,8 @@ from teds_provision.files import open_to_read
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey, fingerprint, verify
+from teds_provision.station.station import Station
 from teds_provision.station.store.connection import too_old
-from teds_provision.station.store.dump import load as load_rows
 from teds_provision.vault import passphrase as sealing
 
 FORMAT: Final = "teds-backup/2"
@@ -142,7 +142,7 @@ def _content(chunks: ChunkReader, bound: bytes, clear: dict[str, Any]) -> Conten
     head = BackupHead.read(chunks.read_line(MAX_HEAD_OCTETS), FORMAT)
     if (head.store, head.station, head.created) != (clear["store"], clear["station"], clear["created"]):
         raise NotAuthenticError("The backup's header names a different station than its content.")
-    copy = load_rows(chunks)
+    copy = Station.of_backup(chunks)
     try:
         signed = _LABEL + bound + chunks.digest.digest()
         if not verify(head.point, signed, chunks.read(SIGNATURE_OCTETS)):

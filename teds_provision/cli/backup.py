@@ -20,7 +20,7 @@ from teds_provision.station import store as store_room
 if TYPE_CHECKING:
     from teds_provision.backup.content import Content
     from teds_provision.backup.restore import RestoreResult
-    from teds_provision.station.store import Store
+    from teds_provision.station.station import Station
 
 _KEY_HINT = (
     "A recovery key is an encrypted PEM file: openssl genpkey -algorithm EC -pkeyopt ec_paramgen_curve:P-256 "
@@ -165,10 +165,10 @@ def _require_place(home: Path, file: Path) -> None:
         )
 
 
-def _merge(app: App, store: Store, content: Content, keystore: str | None, *, yes: bool, dry_run: bool) -> None:
-    plan = backup_room.restore.merge(store, content, dry_run=True)
+def _merge(app: App, station: Station, content: Content, keystore: str | None, *, yes: bool, dry_run: bool) -> None:
+    plan = backup_room.restore.merge(station, content, dry_run=True)
     how = plan.relation.value if plan.relation is not None else ""
-    facts = store.facts()
+    facts = station.identity.record()
     head = f"{_summary(content, facts.keystore if facts is not None else keystore)}\nIt is {how} of this station."
     back = [f"  restored: {what}: {count}" for what, count in plan.back.items()]
     app.note("\n".join([head, *back + [f"  unchanged: {kept}" for kept in plan.kept]]))
@@ -180,16 +180,16 @@ def _merge(app: App, store: Store, content: Content, keystore: str | None, *, ye
 
     def work(known: Callable[[str, bool], str]) -> RestoreResult:
         with store_room.StoreLock(app.home, command="restore", notice=app.note):
-            if not yes and backup_room.restore.merge(store, content, dry_run=True).back not in (plan.back, {}):
+            if not yes and backup_room.restore.merge(station, content, dry_run=True).back not in (plan.back, {}):
                 raise VaultChangedError(
                     "Another command changed the station while you were being asked, so the list is out of date. "
                     "Nothing was changed.",
                     hint="Run it again and check the new list.",
                 )
-            vault = backup_room.restore.complete_vault(store, content, known, keystore=keystore)
-            return backup_room.restore.merge_checked(store, content, vault, known)
+            vault = backup_room.restore.complete_vault(station, content, known, keystore=keystore)
+            return backup_room.restore.merge_checked(station, content, vault, known)
 
-    backup_room.restore.open_vault_of(store, app.ask_secret)
+    backup_room.restore.open_vault_of(station, app.ask_secret)
     done = vault_room.asked_first(app.ask_secret, work)
     _emit(app, content, done, "Restored." if done.back else "Nothing to do: the store already has everything in it.")
 

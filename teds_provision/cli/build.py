@@ -408,7 +408,7 @@ def list_(app: App) -> None:
     """List every draft: node, stage and profile."""
     drafts = [
         {"uuid": draft.uuid.hex(), "profile": draft.profile, "stage": draft.stage, "created": draft.created}
-        for draft in app.station().nodes.drafts()
+        for draft in app.station().datasheets.drafts()
     ]
     lines = [
         f"{draft['uuid']}  {draft['stage']:<6}  {local_time(str(draft['created']))}  {draft['profile'] or ''}".rstrip()

@@ -170,7 +170,7 @@ def _numbers(station: Station, uuids: Sequence[bytes], channels: Sequence[int | 
             continue
         found: dict[int, str] = {}
         for uuid in uuids:
-            image = station.nodes.datasheet(uuid)
+            image = station.datasheets.datasheet(uuid)
             if image is None:
                 raise UsageError(
                     f"The channels of node {uuid.hex()} are not known yet, so {chosen!r} cannot be looked up.",

@@ -147,7 +147,7 @@ def _channels(station: Station) -> list[tuple[bytes, int, ChannelFacts]]:
     """Every channel of a datasheet that is kept here, with what makes its name."""
     found = []
     for record in station.nodes.all():
-        image = station.nodes.datasheet(record.uuid)
+        image = station.datasheets.datasheet(record.uuid)
         if image is None:
             continue
         sheet, judged = teds.sheet.Sheet.from_image(image), steps.readings.verdict_of(station, record.uuid)

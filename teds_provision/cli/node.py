@@ -241,7 +241,7 @@ def _known_as(app: App, uuid: bytes) -> str | None:
         return None
     with suppress(StoreError):  # a virtual node can be made beside a store that cannot be read
         station = app.station()
-        if station.nodes.is_known(uuid):
+        if station.overview.is_known(uuid):
             known = station.nodes.get(uuid)
             return f"Node {known.name!r}" if known is not None and known.name else "A node of this station"
     if (app.home / SOCKET).exists():

@@ -117,7 +117,7 @@ def _named_in_plant(station: Station, text: str | None) -> list[bytes]:
     if text is None or station.plant.joined is None:
         return []
     uuid = plant.status.resolve(station, text)
-    if not station.nodes.is_known(uuid):
+    if not station.overview.is_known(uuid):
         raise NotFoundError(f"This station has not met node {uuid.hex()}.", hint=f"See: nodes --plant {uuid.hex()}")
     return [uuid]
 

@@ -74,7 +74,7 @@ def described_node(station: Station, uuid: bytes) -> DescribedNode:
     Raises NotFoundError if no datasheet of it is known, NotAuthenticError or UnprovenError if its verdict is not
     authentic today.
     """
-    image, verdict = station.nodes.datasheet(uuid), verdict_of(station, uuid)
+    image, verdict = station.datasheets.datasheet(uuid), verdict_of(station, uuid)
     if image is None or verdict is None:
         raise NotFoundError(
             f"No datasheet of node {uuid.hex()} is known here.", hint=f"Read it first: verify {uuid.hex()}"

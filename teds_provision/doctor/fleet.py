@@ -14,7 +14,7 @@ from teds_provision.limits import LIMITS, load_toml
 from teds_provision.sanitize import counted
 from teds_provision.station.node_keys import deferred_until
 from teds_provision.station.station import Station
-from teds_provision.station.store import Store, utc_now
+from teds_provision.station.store import utc_now
 from teds_provision.station.store.database import has_store
 
 _SHOWN: Final = 5
@@ -93,10 +93,10 @@ def nodes(system: System) -> Iterator[Finding]:
     """Report what needs an operator: ended calibrations, duplicate names, drafts, unverified nodes, rotations."""
     if not has_store(system.home):
         return
-    with Store.open(system.home) as opened:
-        tally = opened.tally(datetime.now(UTC).strftime("%Y-%m-%d"))
-        marks = opened.all_key_flags()
-    begins = {uuid: deferred_until(mark.rotation or "") or "" for uuid, mark in marks.items()}
+    with Station.inspect(system.home) as station:
+        tally = station.overview.waiting(datetime.now(UTC).strftime("%Y-%m-%d"))
+        due = station.keys.rotations_due()
+    begins = {uuid: deferred_until(why) or "" for uuid, why in due.items()}
     later = tuple(uuid for uuid in tally.rotations if begins.get(uuid, "") > utc_now())
     own = tuple(uuid for uuid in tally.rotations if uuid not in later)
     first = min((begins[uuid] for uuid in later), default="")

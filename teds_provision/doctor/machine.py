@@ -15,7 +15,7 @@ from teds_provision import vault
 from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import StoreError
 from teds_provision.lazy import REQUIRED, install_command
-from teds_provision.station import store as store_room
+from teds_provision.station.station import Station
 from teds_provision.station.store.database import has_store
 
 _MIN_PYTHON: Final = (3, 11)
@@ -120,8 +120,8 @@ def _last_entry(system: System) -> datetime | None:
     if not has_store(system.home):
         return None
     try:
-        with store_room.Store.open(system.home) as store:
-            latest = store.audit.latest()
+        with Station.inspect(system.home) as station:
+            latest = station.audit_log.latest()
         return datetime.strptime(latest, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC) if latest is not None else None
     except (StoreError, ValueError):  # the checks of the store report it
         return None

@@ -19,7 +19,8 @@ from typing import Any, Final
 from teds_provision import __version__
 from teds_provision.doctor.checks import Finding, System
 from teds_provision.errors import TedsProvisionError
-from teds_provision.station.store import AuditFilter, Store
+from teds_provision.station.station import Station
+from teds_provision.station.store import AuditFilter
 from teds_provision.station.store.database import has_store
 
 FORMAT: Final = "teds-report/1"
@@ -120,9 +121,9 @@ def _last_errors(system: System, mask: Mask) -> list[dict[str, str]]:
     if not has_store(system.home):
         return []
     try:
-        with Store.open(system.home) as opened:
-            choice = AuditFilter(failed=True)
-            entries = list(opened.audit.chosen(choice, opened.audit.before(choice, last=_LAST_ERRORS)))
+        with Station.inspect(system.home) as station:
+            choice, log = AuditFilter(failed=True), station.audit_log
+            entries = list(log.chosen(choice, log.before(choice, last=_LAST_ERRORS)))
     except TedsProvisionError:
         return []
     return [

@@ -16,7 +16,9 @@ from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import KeyringUnavailableError, NotFoundError, StoreError, VaultError
 from teds_provision.files import open_to_read
 from teds_provision.sanitize import counted
-from teds_provision.station.store import AuditFilter, Store
+from teds_provision.station.snapshot import totals
+from teds_provision.station.station import Station
+from teds_provision.station.store import AuditFilter, AuditLog
 from teds_provision.station.store.database import has_store
 from teds_provision.station.store.lock import holder_of
 from teds_provision.vault import agent
@@ -72,19 +74,18 @@ def store(system: System) -> Iterator[Finding]:
     if not has_store(system.home):
         yield Finding("store", "skipped", _NO_STATION, _INIT)
         return
-    with Store.open(system.home) as opened:
+    with Station.inspect(system.home) as opened:
         damage = opened.damage()
         if damage is not None:
             yield Finding("store", "failed", f"The store is damaged: {damage}.", "teds-provision restore FILE")
             return
-        facts = opened.facts()
-        if facts is None or facts.point is None:
+        if not opened.identity.is_complete():
             yield Finding("store", "warning", "init was started here but not finished.", _INIT)
             return
-        count = opened.count("nodes")
-        yield Finding("store", "ok", f"Intact; {counted(count, 'node')}, {opened.count('whitelist')} whitelisted.")
-        yield from _audit(opened)
-        yield from _backups(opened, count)
+        count = totals(opened)
+        yield Finding("store", "ok", f"Intact; {counted(count['nodes'], 'node')}, {count['whitelist']} whitelisted.")
+        yield from _audit(opened.audit_log)
+        yield from _backups(opened.audit_log, count["nodes"])
     holder = holder_of(system.home)
     if holder is None:
         yield Finding("lock", "ok", "The store is not locked.")
@@ -92,8 +93,8 @@ def store(system: System) -> Iterator[Finding]:
         yield Finding("lock", "warning", f"The store is locked by {holder}.", "Wait until it has ended.")
 
 
-def _audit(opened: Store) -> Iterator[Finding]:
-    verdict = opened.audit.check()
+def _audit(log: AuditLog) -> Iterator[Finding]:
+    verdict = log.check()
     if verdict.intact:
         yield Finding("audit log", "ok", f"{counted(verdict.count, 'entry', 'entries')}, chain intact.")
     else:
@@ -101,8 +102,8 @@ def _audit(opened: Store) -> Iterator[Finding]:
         yield Finding("audit log", "failed", f"The hash chain is broken: {verdict.why}.", fix)
 
 
-def _backups(opened: Store, nodes: int) -> Iterator[Finding]:
-    taken = [entry.at for entry in opened.audit.chosen(AuditFilter(act="backup"))]
+def _backups(log: AuditLog, nodes: int) -> Iterator[Finding]:
+    taken = [entry.at for entry in log.chosen(AuditFilter(act="backup"))]
     fix = "teds-provision backup FILE"
     if not taken:
         why = "There is no backup: without one, losing this machine means re-keying every node at the bench."
@@ -159,7 +160,7 @@ def vault(system: System) -> Iterator[Finding]:
     elif used == "file":
         yield _file_vault(system)
     elif used == "keyring":
-        with Store.open(system.home) as opened:
+        with Station.inspect(system.home) as opened:
             yield Finding("vault", "ok", f"{vault_room.keyring_vault.KeyringVault.open(opened.id).description}.")
     else:
         token = vault_room.pkcs11_token.find_token(vault_room.pkcs11_uri.Pkcs11Uri.parse(used))
@@ -180,7 +181,7 @@ def unlocked(system: System) -> Iterator[Finding]:
 
 
 def _file_vault(system: System) -> Finding:
-    with Store.open(system.home) as opened:
+    with Station.inspect(system.home) as opened:
         content = vault_room.file_vault.read_sealed(system.home / "vault.json")
         if content.get("store") != opened.id:
             raise VaultError("vault.json belongs to another store.", hint="teds-provision restore FILE")
@@ -194,8 +195,8 @@ def _keystore(system: System) -> str | None:
     if not has_store(system.home):
         return None
     try:
-        with Store.open(system.home) as opened:
-            facts = opened.facts()
+        with Station.inspect(system.home) as opened:
+            facts = opened.identity.record()
             return facts.keystore if facts is not None else None
     except StoreError:  # the check of the store reports it
         return None

@@ -26,19 +26,11 @@ from teds_provision.protocol.handover.revocation import Revocation as Statement
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.bulk import BulkRows
 from teds_provision.station.groups import valid_name
 from teds_provision.station.node_keys import MAX_PENDING
 from teds_provision.station.station import Station
-from teds_provision.station.store import (
-    BulkRows,
-    Handover,
-    Holder,
-    KeyRecord,
-    NodeRecord,
-    WhitelistEntry,
-    chunks,
-    utc_now,
-)
+from teds_provision.station.store import Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, chunks, utc_now
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.identify import identify
 from teds_provision.talk.conversation import Conversation
@@ -82,7 +74,7 @@ class ImportedRows:
             self.station.policy.take_back(back)
             for uuid in back:
                 self.station.audit("handover", uuid, "came back", handover=self.bundle.id)
-            self.station.handovers.take_in(self._rows(taken))
+            self.station.bulk.put(self._rows(taken))
 
     def _rows(self, taken: Sequence[PlannedNode]) -> BulkRows:
         return BulkRows(

@@ -55,7 +55,7 @@ def revoke(station: Station, uuid: bytes, why: str) -> RevokeResult:
             station.plant.record_event("revoked", uuid, statement=statement.statement)
         station.pins.remove(uuid)
         keys = station.keys.remove(uuid)
-        station.nodes.drop_draft(uuid)
+        station.datasheets.drop_draft(uuid)
         station.audit("revoke", uuid, "done", why=why, keys=keys)
     entry = station.policy.revocation(uuid)
     assert entry is not None
@@ -82,7 +82,7 @@ def retire(station: Station, uuid: bytes, receipt: ResetReceipt | None, *, as_: 
     retired = as_ if receipt is not None else as_ + UNCONFIRMED
     with station.transaction():
         station.pins.remove(uuid)
-        station.nodes.drop_draft(uuid)
+        station.datasheets.drop_draft(uuid)
         station.nodes.remember(uuid, name=None, retired=retired)
         left = station.measurements.hand_on(uuid, None)
         detail: dict[str, object] = {"proof": receipt.proof.hex()} if receipt is not None else {}
@@ -164,7 +164,7 @@ def take_over(station: Station, plan: TakeoverPlan, receipt: ResetReceipt | None
             entry, former = station.pins.entry(new), station.pins.entry(old.uuid)
             if entry is not None and former is not None and former.name is not None:
                 station.pins.put(replace(entry, name=former.name))
-            station.nodes.drop_draft(new)
+            station.datasheets.drop_draft(new)
             station.nodes.remember(new, name=old.name, profile=old.profile)
             if plan.calibration:
                 order = BuildOrder(old.profile, name=old.name)

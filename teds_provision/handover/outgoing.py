@@ -25,9 +25,9 @@ from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, s
 from teds_provision.protocol.handover.envelope import EnvelopeWriter
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint
+from teds_provision.station.bulk import BulkRows
 from teds_provision.station.station import Station
 from teds_provision.station.store import (
-    BulkRows,
     ExportEligibility,
     Handover,
     Holder,
@@ -565,9 +565,7 @@ def _record_holders(station: Station, plan: ExportPlan, peers: tuple[str, ...]) 
     """Who holds the keys from now on: each receiver of a copy beside us; of a move, that is, the receiver alone."""
     now, uuids_of_nodes = utc_now(), [node.uuid for node in plan.nodes]
     if plan.mode == "copy":
-        station.handovers.take_in(
-            BulkRows(holders=[Holder(uuid, peer, now) for uuid in uuids_of_nodes for peer in peers])
-        )
+        station.bulk.put(BulkRows(holders=[Holder(uuid, peer, now) for uuid in uuids_of_nodes for peer in peers]))
     elif plan.earlier is None:
         tombstones = [Tombstone(uuid, peers[0], plan.id, now) for uuid in uuids_of_nodes]
-        station.handovers.take_in(BulkRows(tombstones=tombstones))
+        station.bulk.put(BulkRows(tombstones=tombstones))

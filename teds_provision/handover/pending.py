@@ -218,7 +218,7 @@ def _delete_what_left(station: Station, row: Handover, uuids: Iterable[bytes]) -
             in_bundle = left.get(uuid.hex(), "") or (key.key_id if key.created <= row.created else "")
             if key.key_id == in_bundle:
                 station.keys.remove_key(uuid, key.key_id)
-        station.nodes.drop_draft(uuid)
+        station.datasheets.drop_draft(uuid)
 
 
 def signer_of(text: str) -> str:

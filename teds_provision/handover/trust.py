@@ -17,7 +17,7 @@ from teds_provision.protocol.handover.jose import point_of, public_jwk
 from teds_provision.protocol.handover.strict_json import decode_base64url, dump, encode_base64url, load_object
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, from_pem, station_key_message, verify
 from teds_provision.station.station import Station
-from teds_provision.station.store import Store, StoreLock, TrustRecord
+from teds_provision.station.store import StoreLock, TrustRecord
 from teds_provision.station.store.database import has_store
 from teds_provision.station.store.records import TrustRole
 
@@ -120,8 +120,13 @@ def ask_for_certificate(home: Path, *, name: str | None, keystore: str | None, a
 
     A station that is complete asks with the key that it has. Run again it gives a request for the same key.
     """
-    with Store.open(home, create=True) as store:
-        return vaults.asked_first(ask, lambda known: _requested(Station(store, known), name, keystore, known))
+    with Station.make(home, ask=ask) as station:
+
+        def request(known: Ask) -> bytes:
+            station.ask_by(known)
+            return _requested(station, name, keystore, known)
+
+        return vaults.asked_first(ask, request)
 
 
 def _requested(station: Station, name: str | None, keystore: str | None, ask: Ask) -> bytes:
@@ -147,7 +152,7 @@ def adopt_certificate(home: Path, certificate: Certificate, *, ask: Ask) -> Stat
     """
     if not has_store(home):
         raise NotFoundError("This station has not requested a certificate.", hint="First: init --request FILE")
-    station = Station(Store.open(home), ask)
+    station = Station.inspect(home, ask=ask)
 
     def adopt(known: Ask) -> None:
         station.ask_by(known)
@@ -171,8 +176,8 @@ def found_under(home: Path, path: Path, passphrase: str, *, name: str | None, ke
     """
     owner = SoftwareKey.from_secret(vaults.ca_file.read_ca(path, passphrase))
     if has_store(home):
-        with Store.open(home) as store:
-            identity = Station(store, ask).identity
+        with Station.inspect(home, ask=ask) as station:
+            identity = station.identity
             if identity.is_complete() and identity.ca != owner.point:
                 raise PolicyError(
                     f"{home} holds a station of another CA ({fingerprint(identity.ca)[:16]}). Nothing was changed.",

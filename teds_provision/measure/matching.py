@@ -23,8 +23,8 @@ from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.sinks.base import ROWS
 from teds_provision.measure.standing import why_not_measured
 from teds_provision.station.groups import ALL
+from teds_provision.station.overview import Search
 from teds_provision.station.station import Station
-from teds_provision.station.store import Search
 from teds_provision.steps.board_type import misfit
 from teds_provision.steps.readings import verdict_of
 from teds_provision.teds.fits import Requirement, judge, met, parse_fits
@@ -95,7 +95,7 @@ class NodeMatch:
         Not certainly a mistake: a node of that type may be handed over later.
         """
         for kind in self.types:
-            if not _is_profile(kind, station) and not station.nodes.find(Search(profile=kind)):
+            if not _is_profile(kind, station) and not station.overview.find(Search(profile=kind)):
                 return f"no profile and no known node is called {kind!r}"
         return ""
 
@@ -118,7 +118,7 @@ class NodeMatch:
                 return f"it is not in group {group}"
         if self.fits is None:
             return ""
-        image = station.nodes.datasheet(uuid)
+        image = station.datasheets.datasheet(uuid)
         judged = judge(self.fits, Sheet.from_image(image), datetime.now(UTC)) if image is not None else ()
         if met(self.fits, judged):
             return ""
@@ -170,7 +170,7 @@ class UnsignedNodes:
             return "its datasheet was not read in a session"
         if judged.origin == "plain" or judged.verified.verdict != "unsigned":
             return f"its datasheet is {judged.verified.verdict}"
-        image = station.nodes.datasheet(uuid)
+        image = station.datasheets.datasheet(uuid)
         return "" if image is not None and Sheet.from_image(image).channels else "it has no datasheet of its own"
 
 
@@ -205,7 +205,7 @@ class NodeLoad:
 
 def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: BusTime) -> NodeLoad:
     """Return the load of a node; ``NodeLoad()`` if no datasheet of it is stored, or none that can be measured so."""
-    image = station.nodes.datasheet(uuid)
+    image = station.datasheets.datasheet(uuid)
     if image is None:
         return NodeLoad()
     sensors = [channel for channel in Sheet.from_image(image).channels if channel.sample and not channel.actuator]
@@ -231,7 +231,7 @@ def _unlike(station: Station, uuid: bytes, kind: str) -> str:
 
     Such a node was adopted, or came from a station that did not name its profile.
     """
-    image = station.nodes.datasheet(uuid)
+    image = station.datasheets.datasheet(uuid)
     if image is None or not Sheet.from_image(image).channels:
         return "none is known"
     profile = _profile(kind, station.home)

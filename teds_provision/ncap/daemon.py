@@ -354,7 +354,7 @@ class Daemon:
     def known(self, text: str) -> str:
         """Return the UUID that a path names, of a known node; raises NotFoundError, UsageError."""
         uuid = self.resolve(text)
-        if not self.directory.known(uuid) and not self.station.nodes.is_known(bytes.fromhex(uuid)):
+        if not self.directory.known(uuid) and not self.station.overview.is_known(bytes.fromhex(uuid)):
             raise NotFoundError(f"No node matches {uuid!r}.", hint="See /nodes.")
         return uuid
 

@@ -314,7 +314,7 @@ class MeasurementSupervisor:
         And BadDataError if the known datasheet can never be measured so.
         """
         require_measurable(self._station, uuid)
-        image = self._station.nodes.datasheet(uuid)
+        image = self._station.datasheets.datasheet(uuid)
         if image is None:
             return
         kind = None if kept.kind is None else StreamKind[kept.kind.upper()]
@@ -458,7 +458,7 @@ class MeasurementSupervisor:
         with self.session(uuid) as trusted:
             if trusted is None:
                 return None
-        return self._station.nodes.datasheet(bytes.fromhex(uuid))
+        return self._station.datasheets.datasheet(bytes.fromhex(uuid))
 
     def sinks(self) -> list[dict[str, Any]]:
         """Every sink with what became of what it was given."""
@@ -645,7 +645,7 @@ class MeasurementSupervisor:
                 for uuid in found
                 if not why_not_measured(self._station, uuid)
                 and not match.why_not(self._station, uuid)
-                and self._station.nodes.datasheet(uuid) is not None
+                and self._station.datasheets.datasheet(uuid) is not None
                 and not self._is_retired(uuid.hex())
                 and self.measurement_of(uuid.hex()) is None
             ]

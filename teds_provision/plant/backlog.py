@@ -68,8 +68,8 @@ def _handed(station: Station, keys: dict[bytes, KeyRecord]) -> Iterator[Told]:
 
 def signed_here(station: Station, uuid: bytes) -> Iterator[tuple[int, int, str]]:
     """Epoch, sequence and digest of every remembered datasheet of a node that verifies under this station's own key."""
-    draft = station.nodes.draft(uuid)
-    images: list[Image] = [record.image for record in station.nodes.history(uuid)]
+    draft = station.datasheets.draft(uuid)
+    images: list[Image] = [record.image for record in station.datasheets.history(uuid)]
     images += [draft.image] if draft is not None and draft.stage == "signed" else []
     seen: set[str] = set()
     for image in images:

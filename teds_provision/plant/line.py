@@ -441,7 +441,7 @@ class LineUnit:
         station, shown = self.run.station, security.decode(teds)
         job, row = self.run.job, station.nodes.get(uuid)
         credentials = station.credentials(uuid)
-        certificates, origin = _named_in(station.nodes.datasheet(uuid), shown)
+        certificates, origin = _named_in(station.datasheets.datasheet(uuid), shown)
         facts = BoardFacts(
             station=fingerprint(credentials.key.point),
             job=job.id if job is not None else None,

@@ -103,7 +103,7 @@ def vouchable(station: Station, uuids: Sequence[bytes] | None) -> list[tuple[byt
     listed = [shown.uuid for shown in station.nodes.all_shown_keys()] if uuids is None else list(uuids)
     found = []
     for uuid in listed:
-        image = station.nodes.datasheet(uuid)
+        image = station.datasheets.datasheet(uuid)
         octets = image.security if image is not None else None
         if image is None or octets is None:
             continue

@@ -34,7 +34,6 @@ from teds_provision.protocol.plant.roster import (
     read_roster,
     seal_roster,
 )
-from teds_provision.station.plant.plant import PlantRecord
 from teds_provision.station.station import Station
 
 FIRST_ROLES: frozenset[Role] = frozenset({"keeper", "sign", "line", "base"})
@@ -77,13 +76,7 @@ def join(station: Station, roster: Roster, *, url: str | None, told: Sequence[To
         )
     station.unlock()
     with station.transaction():
-        mac = station.row_macs.note("plant", roster.registry)
-        before = station.plant.record()
-        if before is not None and before.registry != roster.registry:
-            station.plant.forget()
-            before = None
-        record = before or PlantRecord(roster.registry)
-        station.plant.put_record(replace(record, left=None, url=url or record.url, mac=mac))
+        station.plant.join(roster.registry, url)
         put_roster(station, roster)
         for act, uuid, members in told:
             station.plant.record_event(act, uuid, **members)

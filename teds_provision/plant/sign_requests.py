@@ -336,7 +336,7 @@ def by_office(
     )
     with station.durable("sign"):
         station.plant.line.put_sign_request(row)
-        station.nodes.keep_draft(Draft(keys.uuid, signed.image, "signed", wanted.profile))
+        station.datasheets.keep_draft(Draft(keys.uuid, signed.image, "signed", wanted.profile))
         station.nodes.remember(keys.uuid, sequence=signed.sequence)
         station.audit("sign", keys.uuid, "by office", sequence=signed.sequence, office=wanted.office)
     return signed
@@ -369,7 +369,7 @@ def sign_by_office(station: Station, links: LinkSettings, order: OfficeOrder, re
     if member is None or member.fingerprint != job.office:
         raise PolicyError(f"The job “{job.title}” names another office than {order.by}.")
     uuid = station.nodes.resolve(order.node)
-    draft = station.nodes.draft(uuid)
+    draft = station.datasheets.draft(uuid)
     if draft is None:
         raise NotFoundError(
             f"Nothing has been built for node {uuid.hex()}.", hint=f"To build it: teds-provision build {uuid.hex()}"
@@ -392,7 +392,7 @@ def sign_by_office(station: Station, links: LinkSettings, order: OfficeOrder, re
             )
             signed = by_office(station, office, visit.node, keys, wanted, None)
     with station.durable("sign"):
-        station.nodes.keep_draft(Draft(uuid, signed.image, "signed", draft.profile))
+        station.datasheets.keep_draft(Draft(uuid, signed.image, "signed", draft.profile))
     return signed
 
 
@@ -446,7 +446,7 @@ def _new_request(station: Station, node: Conversation, keys: SignedNodeKey, want
         station.plant.line.put_sign_request(
             SignRequestRow(request.hash, "out", wanted.job, keys.uuid, wanted.office, octets)
         )
-        station.nodes.keep_draft(Draft(keys.uuid, wanted.image, "built", wanted.profile))
+        station.datasheets.keep_draft(Draft(keys.uuid, wanted.image, "built", wanted.profile))
     return request
 
 

@@ -138,4 +138,4 @@ def firmware_of(station: Station, uuid: bytes, now: FirmwareReading | None = Non
     """Return what is known of one node's firmware, judged by its type; ``now`` is an answer that just came."""
     known = station.nodes.get(uuid)
     profile = known.profile if known is not None else None
-    return known_firmware(station.nodes.firmware(uuid), lambda: FirmwareDemands(station.home).of(profile), now)
+    return known_firmware(station.firmware_reports.get(uuid), lambda: FirmwareDemands(station.home).of(profile), now)

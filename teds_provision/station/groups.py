@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from shlex import quote
@@ -15,8 +15,8 @@ from teds_provision.errors import FrozenError, NotFoundError, UsageError
 from teds_provision.files import open_lock
 from teds_provision.portable import lock
 from teds_provision.station.plant.plant import Plant
-from teds_provision.station.store import Store
-from teds_provision.station.store.records import Group
+from teds_provision.station.store.records import Group, utc_now
+from teds_provision.station.store.store import Store
 
 _LIKE_A_UUID = re.compile(r"(0x)?[0-9a-fA-F]{4,}\Z")
 LONGEST = 64
@@ -49,12 +49,18 @@ class Groups:
         self._store, self._home, self._plant = store, home, plant
 
     def all(self) -> list[Group]:
-        """Every group, by name."""
-        return self._store.groups()
+        """Return every measurement group, by name."""
+        rows = self._store.execute(
+            "SELECT name, created, uuid FROM groups LEFT JOIN group_members USING(name) ORDER BY name, uuid"
+        )
+        found: dict[tuple[str, str], list[bytes]] = {}
+        for name, created, uuid in rows:
+            found.setdefault((name, created), []).extend([] if uuid is None else [uuid])
+        return [Group(name, tuple(uuids), created) for (name, created), uuids in found.items()]
 
     def get(self, name: str) -> Group:
         """One group; raises NotFoundError."""
-        found = self._store.group(name)
+        found = self.find(name)
         if found is None:
             known = [group.name for group in self.all()]
             more = ", …" if len(known) > _SHOWN else ""
@@ -64,7 +70,11 @@ class Groups:
 
     def find(self, name: str) -> Group | None:
         """Return one group, None if there is none of exactly this name."""
-        return self._store.group(name)
+        row = self._store.one("SELECT created FROM groups WHERE name = ?", (name,))
+        if row is None:
+            return None
+        members = self._store.execute("SELECT uuid FROM group_members WHERE name = ? ORDER BY uuid", (name,))
+        return Group(name, tuple(bytes(uuid) for (uuid,) in members), str(row[0]))
 
     def create(self, name: str, uuids: Sequence[bytes]) -> Group:
         """Make a group, or return the existing one if it has the same members; raises UsageError."""
@@ -73,12 +83,12 @@ class Groups:
                 f"{name!r} is not a valid group name.",
                 hint="Use up to 64 characters, not only hex digits or dots, and not 'all', which means every node.",
             )
-        present = self._store.group(name)
+        present = self.find(name)
         if present is not None and set(present.uuids) != set(uuids):
             raise UsageError(f"Group {name!r} already exists.", hint=f"Add nodes to it: group add {quote(name)} UUID …")
         if present is None:
             with self._store.together():
-                self._store.put_group(Group(name, tuple(dict.fromkeys(uuids))))
+                self.put(Group(name, tuple(dict.fromkeys(uuids))))
                 self._report_member(name, uuids, member=True)
         return self.get(name)
 
@@ -87,7 +97,7 @@ class Groups:
         self.get(name)
         with self.frozen(name), self._store.together():
             there, added = self.get(name).uuids, list(dict.fromkeys(uuids))
-            self._store.add_to_group(name, added)
+            self._add(name, added)
             self._report_member(name, [uuid for uuid in added if uuid not in there], member=True)
         return self.get(name)
 
@@ -96,7 +106,7 @@ class Groups:
         self.get(name)
         with self.frozen(name), self._store.together():
             there, gone = self.get(name).uuids, list(dict.fromkeys(uuids))
-            self._store.remove_from_group(name, gone)
+            self._remove(name, gone)
             self._report_member(name, [uuid for uuid in gone if uuid in there], member=False)
         return self.get(name)
 
@@ -106,11 +116,12 @@ class Groups:
             return False
         with self.frozen(name), self._store.together():
             self._report_member(name, self.get(name).uuids, member=False)
-            return self._store.remove_group(name)
+            return self._store.change("DELETE FROM groups WHERE name = ?", (name,)) > 0
 
     def of(self, uuid: bytes) -> list[str]:
         """Return the names of the groups that a node is in."""
-        return self._store.groups_of(uuid)
+        rows = self._store.execute("SELECT name FROM group_members WHERE uuid = ? ORDER BY name", (uuid,))
+        return [str(name) for (name,) in rows]
 
     def hand_on(self, old: bytes, new: bytes | None) -> list[str]:
         """Replace a node in all of its groups (None: remove it), and return their names.
@@ -120,12 +131,35 @@ class Groups:
         names = self.of(old)
         with self._store.together():
             for name in names:
-                self._store.remove_from_group(name, [old])
+                self._remove(name, [old])
                 self._report_member(name, [old], member=False)
                 if new is not None and new not in self.get(name).uuids:
-                    self._store.add_to_group(name, [new])
+                    self._add(name, [new])
                     self._report_member(name, [new], member=True)
         return names
+
+    def put(self, group: Group) -> None:
+        """Add a group, or replace its members, without a report to the plant: it comes from a backup."""
+        with self._store.together():
+            self._store.execute(
+                "INSERT INTO groups VALUES(?, ?) ON CONFLICT(name) DO NOTHING", (group.name, group.created)
+            )
+            self._store.execute("DELETE FROM group_members WHERE name = ?", (group.name,))
+            self._add(group.name, group.uuids)
+
+    def put_members(self, groups: Mapping[str, Sequence[bytes]]) -> None:
+        """Add nodes to groups, by name, without a report to the plant; a group that does not exist is created."""
+        self._store.execute_many("INSERT OR IGNORE INTO groups VALUES(?, ?)", ((name, utc_now()) for name in groups))
+        for name, uuids in groups.items():
+            self._add(name, uuids)
+
+    def _add(self, name: str, uuids: Iterable[bytes]) -> None:
+        self._store.execute_many("INSERT OR IGNORE INTO group_members VALUES(?, ?)", ((name, u) for u in uuids))
+
+    def _remove(self, name: str, uuids: Iterable[bytes]) -> None:
+        """Take nodes out of a group."""
+        statement = "DELETE FROM group_members WHERE name = ? AND uuid = ?"
+        self._store.execute_many(statement, ((name, uuid) for uuid in uuids))
 
     def _report_member(self, name: str, uuids: Iterable[bytes], *, member: bool) -> None:
         """Report to the plant which nodes joined or left a group."""

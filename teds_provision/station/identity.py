@@ -2,59 +2,87 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import NotAuthenticError, NotFoundError, PolicyError
+from teds_provision.errors import NotAuthenticError, NotFoundError, PolicyError, VaultError
 from teds_provision.lazy import late
-from teds_provision.station.row_macs import RowMacs
-from teds_provision.station.store import StationRecord, Store
+from teds_provision.station.row_macs import KEY_OCTETS, MacRow, RowMacs, Values, changed
+from teds_provision.station.store.database import places
+from teds_provision.station.store.records import StationRecord
+from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
     from teds_provision.protocol import keys, wire_agreement
     from teds_provision.vault import Vault
+    from teds_provision.vault.master import MasterKeys
 else:  # cryptography: not for commands that only list
     wire_agreement, keys = late("teds_provision.protocol.wire_agreement"), late("teds_provision.protocol.keys")
 
 DEFAULT_NAME = "station"
+_FACTS = ", ".join(column.name for column in fields(StationRecord))
 
 
 class StationIdentity:
     """The facts of one station, and the certificates (SIG104) that it knows; secrets come from the vault."""
 
-    def __init__(self, store: Store, vault: Callable[[], Vault], seals: RowMacs) -> None:
+    def __init__(self, store: Store, vault: Callable[[], Vault], row_macs: RowMacs) -> None:
         self._store = store
         self._vault = vault
-        self._row_macs = seals
+        self._row_macs = row_macs
+        self._seen: tuple[tuple[int, int], StationRecord | None] | None = None
 
     # -- facts -----------------------------------------------------------------------------------------------------
 
+    def record(self) -> StationRecord | None:
+        """Return what the station knows of itself, None before init made anything.
+
+        Every step asks for it again and again, so it is read once for each state of the file.
+        """
+        state = self._store.state()
+        if self._seen is None or self._seen[0] != state:
+            self._seen = state, self._store.read_one(StationRecord, f"SELECT {_FACTS} FROM station")
+        return self._seen[1]
+
+    def put(self, record: StationRecord) -> None:
+        """Keep the station's facts, all of them, with the MAC that they have."""
+        self._seen = None
+        values = tuple(getattr(record, column.name) for column in fields(StationRecord))
+        self._store.execute(f"INSERT OR REPLACE INTO station(one, {_FACTS}) VALUES(1, {places(values)})", values)
+
+    def _with_mac(self, record: StationRecord) -> StationRecord:
+        """Return the facts with their MAC, and a MAC key if there is none yet."""
+        if record.seal_key is None:
+            key = os.urandom(KEY_OCTETS)
+            record = replace(record, seal_key=self._vault().wrap(key, context=self._context()))
+            self._row_macs.use(key)
+        return replace(record, mac=self._row_macs.mac("station", _bound(record)))
+
     def is_complete(self) -> bool:
         """Return True if init was finished: a key, a CA and its signature are there."""
-        facts = self._store.facts()
+        facts = self.record()
         return facts is not None and facts.point is not None
 
     @property
     def requested(self) -> bytes | None:
         """P(base station) for which a certificate was requested, None if none was."""
-        facts = self._store.facts()
+        facts = self.record()
         return facts.requested if facts is not None else None
 
     def establish(self, name: str | None, keystore: str, keystore_why: str, *, requested: bytes | None = None) -> None:
         """Store where the secrets of a new station are, and the key for which it requests a certificate, if it does."""
-        self._store.put_facts(
-            self._row_macs.facts(StationRecord(name or DEFAULT_NAME, keystore, keystore_why, requested))
-        )
+        self.put(self._with_mac(StationRecord(name or DEFAULT_NAME, keystore, keystore_why, requested)))
 
     def complete(self, point: bytes, ca: bytes, signature: bytes) -> None:
         """Keep the station's key, its owner's CA and SIG104: init is finished."""
         self._row_macs.require()
-        self._store.put_facts(self._row_macs.facts(replace(self._facts, point=point, ca=ca, signature=signature)))
+        self.put(self._with_mac(replace(self._facts, point=point, ca=ca, signature=signature)))
 
     @property
     def _facts(self) -> StationRecord:
-        facts = self._store.facts()
+        facts = self.record()
         if facts is None:
             raise NotFoundError(
                 f"There is no base station in {self._store.home} yet.", hint="To create one: teds-provision init"
@@ -116,12 +144,57 @@ class StationIdentity:
     def begin_rewrapping(self, number: int) -> None:
         """Have every process wrap under this master key from now on."""
         with self._store.transaction():
-            self._store.put_facts(replace(self._facts, master=number, rewrapping=number))
+            self.put(replace(self._facts, master=number, rewrapping=number))
 
     def end_rewrapping(self) -> None:
         """Note that no key is wrapped under an older master key any more."""
         with self._store.transaction():
-            self._store.put_facts(replace(self._facts, rewrapping=None))
+            self.put(replace(self._facts, rewrapping=None))
+
+    # -- the key of row MACs, when the vault opens -------------------------------------------------------------------
+
+    def unlocked(self, vault: Vault) -> None:
+        """Check the station's own facts when the vault has opened; row MACs are checked from now on.
+
+        Raises StoreChangedError if the station's own key or CA differs from what this station wrote, VaultError.
+        """
+        record = self.record()
+        if record is None:
+            return
+        if record.seal_key is not None:
+            self._row_macs.use(vault.unwrap(record.seal_key, context=self._context()))
+        if record.seal_key is None or not self._row_macs.holds(record.mac, "station", _bound(record)):
+            raise changed(
+                ["the station's own key or CA"],
+                "Move store.sqlite3 away, then restore a backup: teds-provision restore FILE",
+            )
+
+    def opened_by(self, masters: MasterKeys) -> bool:
+        """Return True if these master keys open the MAC key, and it is the one that is in use here."""
+        record = self.record()
+        if record is None or record.seal_key is None or not self._row_macs.active:
+            return False
+        try:
+            key = masters.unwrap(record.seal_key, context=self._context())
+        except VaultError:
+            return False
+        return self._row_macs.is_key(key)
+
+    def rewrap(self, vault: Vault) -> None:
+        """Wrap the MAC key under the vault's newest master key; the MACs stay as they are."""
+        record = self.record()
+        if record is not None and record.seal_key is not None:
+            key = vault.unwrap(record.seal_key, context=self._context())
+            self.put(replace(record, seal_key=vault.wrap(key, context=self._context())))
+
+    def _context(self) -> bytes:
+        return b"TEDS1 seal key\0" + self._store.id.encode()
+
+    def mac_rows(self) -> Iterator[MacRow]:
+        """Yield the station's own row, for a check of its MAC."""
+        record = self.record()
+        if record is not None:
+            yield "the station's own key and CA", record.mac, "station", _bound(record)
 
     # -- certificates ----------------------------------------------------------------------------------------------
 
@@ -142,7 +215,20 @@ class StationIdentity:
     def _certificate(self, facts: StationRecord, ca: bytes, point: bytes) -> bytes | None:
         if (ca, point) == (facts.ca, facts.point):
             return self._required(facts.signature)
-        return self._store.certificate(keys.fingerprint(ca), keys.fingerprint(point))
+        row = self._store.one(
+            "SELECT signature FROM certificates WHERE ca = ? AND station = ?",
+            (keys.fingerprint(ca), keys.fingerprint(point)),
+        )
+        return None if row is None else bytes(row[0])
+
+    def certificates(self) -> dict[tuple[str, str], bytes]:
+        """Return every SIG104, by the fingerprints of CA and station."""
+        rows = self._store.execute("SELECT ca, station, signature FROM certificates")
+        return {(str(ca), str(station)): bytes(signature) for ca, station, signature in rows}
+
+    def put_certificate(self, ca: str, station: str, signature: bytes) -> None:
+        """Keep a SIG104, by the fingerprints of CA and station; the caller has verified it."""
+        self._store.execute("INSERT OR REPLACE INTO certificates VALUES(?, ?, ?)", (ca, station, signature))
 
     def keep_certificate(self, ca: bytes, point: bytes, signature: bytes) -> None:
         """Keep a SIG104; raises NotAuthenticError if it does not verify."""
@@ -151,7 +237,7 @@ class StationIdentity:
                 f"The CA {keys.fingerprint(ca)[:16]} did not sign the station {keys.fingerprint(point)[:16]}."
             )
         if self.certificate(ca, point) is None:
-            self._store.put_certificate(keys.fingerprint(ca), keys.fingerprint(point), signature)
+            self.put_certificate(keys.fingerprint(ca), keys.fingerprint(point), signature)
 
     def signature_under(self, ca: bytes) -> bytes:
         """Return SIG104 of ``ca`` over this station's key; raises PolicyError if there is none."""
@@ -168,3 +254,8 @@ class StationIdentity:
         """Return the credentials that the station shows under ``ca``, by default the owner's."""
         under = self.ca if ca is None else ca
         return wire_agreement.Credentials(self._vault().identity(), self.signature_under(under), under)
+
+
+def _bound(record: StationRecord) -> Values:
+    # The last is the column taken_over, which is no longer written: MACs that were made over it go on holding.
+    return (record.requested, record.point, record.ca, record.signature, None)

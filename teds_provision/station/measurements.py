@@ -9,6 +9,7 @@ takes over its settings, as a separate measurement. A topic's name may be change
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import secrets
 import time
@@ -17,12 +18,14 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
+from typing import Any, cast
 
-from teds_provision.errors import FrozenError, NotFoundError, PolicyError, StoreError, UsageError
+from teds_provision.errors import BadDataError, FrozenError, NotFoundError, PolicyError, StoreError, UsageError
 from teds_provision.station.groups import Groups
-from teds_provision.station.store import Store
+from teds_provision.station.store.database import places
 from teds_provision.station.store.lock import OwnerLock, UsageLock, UsageLockTakenError
 from teds_provision.station.store.records import COMMAND, DetectionMode, KeptMeasurement
+from teds_provision.station.store.store import Store
 
 FOLDER = "measuring"  # of the home: who measures what now
 
@@ -57,11 +60,11 @@ class Measurements:
 
     def all(self) -> list[KeptMeasurement]:
         """Return every one that is kept, oldest first; removes those of dead commands."""
-        kept = self._store.measurements()
+        kept = self._rows()
         dead = {measurement.id for measurement in kept if self._is_of_dead_command(measurement)}
         with suppress(StoreError):  # a full disk hides no list; the next reader tries again
             for measurement_id in dead:
-                self._store.remove_measurement(measurement_id)
+                self.forget(measurement_id)
         return [measurement for measurement in kept if measurement.id not in dead]
 
     def due(self) -> list[KeptMeasurement]:
@@ -77,7 +80,8 @@ class Measurements:
 
     def get(self, measurement_id: str) -> KeptMeasurement:
         """One of them; raises NotFoundError."""
-        found = self._store.measurement(measurement_id)
+        statement = "SELECT * FROM measurements WHERE id = ?"
+        found = self._store.read_one(_measurement, statement, (measurement_id,))
         if found is None:
             raise NotFoundError(
                 f"There is no measurement {measurement_id!r}.",
@@ -90,11 +94,7 @@ class Measurements:
 
         None if there is none. The row itself stays its owner's; that of a dead command goes with the next :meth:`all`.
         """
-        kept = [
-            measurement
-            for measurement in self._store.measurements()
-            if measurement.group == group and not _is_past(measurement)
-        ]
+        kept = [measurement for measurement in self._rows() if measurement.group == group and not _is_past(measurement)]
         found = next(
             (
                 measurement
@@ -130,7 +130,7 @@ class Measurements:
                 )
             found = self._groups.delete(group)
             for measurement_id in kept:
-                self._store.remove_measurement(measurement_id)
+                self.forget(measurement_id)
             return found, tuple(kept)
 
     def nodes_of(self, measurement: KeptMeasurement) -> tuple[bytes, ...]:
@@ -145,8 +145,42 @@ class Measurements:
         if measurement.group is not None:
             self._groups.get(measurement.group)
         kept = measurement if measurement.id else replace(measurement, id=secrets.token_hex(4))
-        self._store.put_measurement(kept)
+        self._put(kept)
         return kept
+
+    def _rows(self) -> list[KeptMeasurement]:
+        """Return what the station measures, oldest first."""
+        return self._store.read(_measurement, "SELECT * FROM measurements ORDER BY created, id")
+
+    def _put(self, measurement: KeptMeasurement) -> None:
+        """Keep what the station measures from now on; raises BadDataError if it names none, or two, of what it may."""
+        one = measurement
+        if sum((one.group is not None, bool(one.uuids), one.match is not None)) != 1:
+            raise BadDataError("A measurement names a group, or nodes by UUID, or says which nodes match.")
+        values = (
+            one.id,
+            one.group,
+            json.dumps([uuid.hex() for uuid in one.uuids]),
+            json.dumps(list(one.channels)),
+            one.rate,
+            one.kind,
+            int(one.trigger),
+            int(one.actuators),
+            one.dead_man,
+            float(one.scalar_rate),
+            json.dumps(list(one.sinks)),
+            one.owner,
+            one.ends,
+            one.created,
+            int(one.test_pattern),
+            int(one.unsigned),
+            one.require,
+            one.match,
+            int(one.frozen),
+            one.pid,
+            one.started,
+        )
+        self._store.execute(f"INSERT OR REPLACE INTO measurements VALUES({places(values)})", values)
 
     @contextmanager
     def owned_by_command(self, measurement: KeptMeasurement) -> Iterator[KeptMeasurement]:
@@ -165,7 +199,7 @@ class Measurements:
 
     def forget(self, measurement_id: str) -> bool:
         """Remove a kept measurement, from the next start on; False if there is none. Ends nothing that runs."""
-        return self._store.remove_measurement(measurement_id)
+        return self._store.change("DELETE FROM measurements WHERE id = ?", (measurement_id,)) > 0
 
     def hand_on(self, old: bytes, new: bytes | None) -> HandedOn:
         """Put ``new`` in the place of ``old`` in groups, chosen names, frames and measurements; None removes ``old``.
@@ -177,21 +211,21 @@ class Measurements:
             groups = self._groups.hand_on(old, new)
             topics, refused = self._hand_on_names(old, new)
             changed, ended = [], []
-            for measurement in self._store.measurements():
+            for measurement in self._rows():
                 if measurement.group is None and old in measurement.uuids:
                     rest = dict.fromkeys(uuid if uuid != old else new for uuid in measurement.uuids)
                     uuids = tuple(uuid for uuid in rest if uuid is not None)
                     if uuids:
-                        self._store.put_measurement(replace(measurement, uuids=uuids))
+                        self._put(replace(measurement, uuids=uuids))
                         changed.append(measurement.id)
                     else:
-                        self._store.remove_measurement(measurement.id)
+                        self.forget(measurement.id)
                         ended.append(measurement.id)
                 elif measurement.group is not None and measurement.group in groups:
                     if self._groups.get(measurement.group).uuids:
                         changed.append(measurement.id)
                     else:
-                        self._store.remove_measurement(measurement.id)
+                        self.forget(measurement.id)
                         ended.append(measurement.id)
         return HandedOn(tuple(groups), tuple(topics), tuple(changed), tuple(ended), (*kept, *refused))
 
@@ -219,15 +253,15 @@ class Measurements:
                 what = f"of channel {channel}" if channel else "of the node"
                 refused.append(f"The topic name {name!r} {what}: the new node has the name {names[new, channel]!r}.")
                 continue
-            self._store.remove_topic_name(old, channel)
+            self._remove_name(old, channel)
             if new is not None:
-                self._store.put_topic_name(new, channel, name)
+                self._put_name(new, channel, name)
             moved.append(name)
         for (uuid, channel), frame in frames.items():
             if uuid == old:
-                self._store.remove_frame(old, channel)
+                self._remove_frame(old, channel)
                 if new is not None and (new, channel) not in frames:
-                    self._store.put_frame(new, channel, frame)
+                    self._put_frame(new, channel, frame)
         return moved, refused
 
     @contextmanager
@@ -272,27 +306,31 @@ class Measurements:
     @property
     def detection(self) -> DetectionMode:
         """How nodes are detected; ``whitelist`` by default."""
-        return self._store.detection() or "whitelist"
+        row = self._store.one("SELECT mode FROM detection")
+        return "whitelist" if row is None else cast(DetectionMode, row[0])
 
     @detection.setter
     def detection(self, mode: DetectionMode) -> None:
-        self._store.put_detection(mode)
+        self._store.execute("INSERT OR REPLACE INTO detection VALUES(1, ?)", (mode,))
 
     # -- names of topics ---------------------------------------------------------------------------------------------
 
     @property
     def names(self) -> dict[tuple[bytes, int], str]:
         """Chosen names by UUID and channel: channel 0 is the node's part, :data:`STATION` the station's part."""
-        return self._store.topic_names()
+        rows = self._store.execute("SELECT uuid, channel, name FROM topics ORDER BY uuid, channel")
+        return {(bytes(uuid), int(channel)): str(name) for uuid, channel, name in rows}
 
     def names_of(self, uuid: bytes) -> dict[int, str]:
         """Return the chosen names of one node by channel, 0 for the node's part."""
-        return self._store.topic_names_of(uuid)
+        rows = self._store.execute("SELECT channel, name FROM topics WHERE uuid = ? ORDER BY channel", (uuid,))
+        return {int(channel): str(name) for channel, name in rows}
 
     @property
     def frames(self) -> dict[tuple[bytes, int], str]:
         """Chosen coordinate frames (``frame_id``) by UUID and channel: channel 0 is the whole node."""
-        return self._store.frames()
+        rows = self._store.execute("SELECT uuid, channel, frame FROM frames ORDER BY uuid, channel")
+        return {(bytes(uuid), int(channel)): str(frame) for uuid, channel, frame in rows}
 
     def set_frame(self, uuid: bytes, channel: int, frame: str | None) -> None:
         """Give values of a channel (0: of the whole node) this frame; None: the profile's.
@@ -305,9 +343,9 @@ class Measurements:
                 hint="End that measurement first.",
             )
         if frame is None:
-            self._store.remove_frame(uuid, channel)
+            self._remove_frame(uuid, channel)
         else:
-            self._store.put_frame(uuid, channel, frame)
+            self._put_frame(uuid, channel, frame)
 
     def rename(self, uuid: bytes, channel: int, name: str | None) -> None:
         """Publish a channel (0: the node's part) under this name from the next measurement on; None: the default name.
@@ -321,7 +359,7 @@ class Measurements:
                 hint="End that measurement first.",
             )
         if name is None:
-            self._store.remove_topic_name(uuid, channel)
+            self._remove_name(uuid, channel)
             return
         for (other, number), taken in self.names.items():
             if taken == name and (other, number) != (uuid, channel):
@@ -329,7 +367,24 @@ class Measurements:
                     f"{name!r} is the name of channel {number} of node {other.hex()} already.",
                     hint="Choose another name.",
                 )
-        self._store.put_topic_name(uuid, channel, name)
+        self._put_name(uuid, channel, name)
+
+    def _put_name(self, uuid: bytes, channel: int, name: str) -> None:
+        """Keep a chosen name, in place of the one before."""
+        statement = "INSERT INTO topics VALUES(?, ?, ?) ON CONFLICT(uuid, channel) DO UPDATE SET name = excluded.name"
+        self._store.execute(statement, (uuid, channel, name))
+
+    def _remove_name(self, uuid: bytes, channel: int) -> None:
+        """Forget a chosen name."""
+        self._store.execute("DELETE FROM topics WHERE uuid = ? AND channel = ?", (uuid, channel))
+
+    def _put_frame(self, uuid: bytes, channel: int, frame: str) -> None:
+        """Keep a chosen frame, in place of the one before."""
+        self._store.execute("INSERT OR REPLACE INTO frames VALUES(?, ?, ?)", (uuid, channel, frame))
+
+    def _remove_frame(self, uuid: bytes, channel: int) -> None:
+        """Forget a chosen frame."""
+        self._store.execute("DELETE FROM frames WHERE uuid = ? AND channel = ?", (uuid, channel))
 
 
 def _is_past(measurement: KeptMeasurement) -> bool:
@@ -344,3 +399,18 @@ def _process_start() -> int:
         return int(booted.split()[1]) + ticks // os.sysconf("SC_CLK_TCK")
     except (OSError, ValueError, LookupError, StopIteration):
         return int(time.time())
+
+
+def _measurement(*row: Any) -> KeptMeasurement:
+    one = KeptMeasurement(*row)
+    return replace(
+        one,
+        uuids=tuple(bytes.fromhex(uuid) for uuid in json.loads(row[2])),
+        channels=tuple(json.loads(row[3])),
+        trigger=bool(one.trigger),
+        actuators=bool(one.actuators),
+        sinks=tuple(json.loads(row[10])),
+        test_pattern=bool(one.test_pattern),
+        unsigned=bool(one.unsigned),
+        frozen=bool(one.frozen),
+    )

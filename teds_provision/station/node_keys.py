@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime, timedelta
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import (
     KeyringUnavailableError,
+    NotFoundError,
     UnknownMasterKeyError,
     VaultChangedError,
     VaultError,
@@ -17,9 +19,10 @@ from teds_provision.errors import (
 )
 from teds_provision.station.identity import StationIdentity
 from teds_provision.station.plant.plant import Plant
-from teds_provision.station.row_macs import RowMacs
-from teds_provision.station.store import Holder, KeyFlags, KeyRecord, Store, chunks, utc_now
-from teds_provision.station.store.records import KeySource
+from teds_provision.station.row_macs import MacRow, RowMacs, changed
+from teds_provision.station.store.database import chunks, places
+from teds_provision.station.store.records import Holder, KeyFlags, KeyRecord, KeySource, utc_now
+from teds_provision.station.store.store import Store
 from teds_provision.vault.base import node_key_context
 
 if TYPE_CHECKING:
@@ -28,7 +31,17 @@ if TYPE_CHECKING:
 MAX_PENDING = 8
 """So many keys of one node may wait for their proof at a time (issue 7 L4)."""
 
-_NO_MARKS: Final = KeyFlags()
+_NO_FLAGS: Final = KeyFlags()
+_COLUMNS: Final = "seq, uuid, epoch, key_id, state, slot, wrapped, source, created"
+_FLAGS: Final = ", ".join(column.name for column in fields(KeyFlags))
+_flag_values = attrgetter(*(column.name for column in fields(KeyFlags)))
+_key_values, _holder_values = (attrgetter(*(column.name for column in fields(kind))) for kind in (KeyRecord, Holder))
+_ADD_KEY: Final = (
+    "INSERT INTO keys(uuid, epoch, key_id, state, slot, wrapped, source, created) VALUES(?,?,?,?,?,?,?,?)"
+    " ON CONFLICT(uuid, key_id) DO NOTHING"
+)
+_USE_SLOT: Final = "INSERT INTO key_slots VALUES(?, ?) ON CONFLICT(uuid) DO UPDATE SET last = max(last, excluded.last)"
+_PUT_HOLDER: Final = "INSERT OR REPLACE INTO holders VALUES(?, ?, ?, ?)"
 
 RESTORED = "restored from a backup"
 """Prefix of the reason of a rotation that needs a tap or an operator: other holders of that key are unknown."""
@@ -70,7 +83,7 @@ class NodeKeys:
         store: Store,
         vault: Callable[[], Vault],
         identity: StationIdentity,
-        seals: RowMacs,
+        row_macs: RowMacs,
         reopened: Callable[[], Vault],
         plant: Plant,
     ) -> None:
@@ -78,24 +91,26 @@ class NodeKeys:
         self._store = store
         self._vault = vault
         self._identity = identity
-        self._row_macs = seals
+        self._row_macs = row_macs
         self._reopened = reopened
 
     def keys_of(self, uuid: bytes) -> list[KeyRecord]:
         """Return the keys of a node, wrapped, in the order to try them: newest pending first, the active one last."""
-        return self._store.keys(uuid)
+        statement = f"SELECT {_COLUMNS} FROM keys WHERE uuid = ? ORDER BY state = 'active', seq DESC"
+        return list(self._store.recall(_key, statement, (uuid,)))
 
     def all(self) -> Iterator[KeyRecord]:
-        """Every key of every node, wrapped, in the order they came, a page at a time."""
-        return self._store.all_keys()
+        """Give every key of every node, wrapped, in the order they came, a chunk at a time."""
+        return self._store.stream(_key, f"SELECT {_COLUMNS} FROM keys WHERE seq > ? ORDER BY seq LIMIT ?")
 
     def all_key_names(self) -> Iterator[tuple[bytes, str, int, str]]:
-        """UUID, key id, epoch and state of every key, in the order they came, a page at a time."""
-        return self._store.all_key_names()
+        """Give UUID, key id, epoch and state of every key, in the order they came, a chunk at a time."""
+        statement = "SELECT seq, uuid, key_id, epoch, state FROM keys WHERE seq > ? ORDER BY seq LIMIT ?"
+        return self._store.stream(_key_name, statement)
 
     def held(self, uuid: bytes) -> bool:
         """Return True if any key is held for a node."""
-        return bool(self._store.keys(uuid))
+        return bool(self.keys_of(uuid))
 
     def unwrapped(self, uuid: bytes) -> Iterator[NodeKey]:
         """Every key held for a node, in the order of trying: newest pending first, the active one last.
@@ -103,7 +118,7 @@ class NodeKeys:
         One that cannot be unwrapped does not hide the others; VaultError comes after the last.
         """
         damaged: VaultError | None = None
-        for record in self._store.keys(uuid):
+        for record in self.keys_of(uuid):
             try:
                 key = self.unwrap(record)
             except (WrongPassphraseError, KeyringUnavailableError, VaultLockedError):
@@ -117,15 +132,34 @@ class NodeKeys:
 
     def active_epoch(self, uuid: bytes) -> int:
         """Epoch of the current (active) key of a node, 0 for none."""
-        return next((record.epoch for record in self._store.keys(uuid) if record.state == "active"), 0)
+        return next((record.epoch for record in self.keys_of(uuid) if record.state == "active"), 0)
 
     def get_many(self, uuids: Sequence[bytes]) -> list[KeyRecord]:
-        """Return the keys of a batch of nodes, wrapped, in the order they came."""
-        return self._store.keys_of(uuids)
+        """Return the keys of a chunk of nodes, wrapped, in the order they came."""
+        return self._store.read(
+            _key, f"SELECT {_COLUMNS} FROM keys WHERE uuid IN ({places(uuids)}) ORDER BY seq", uuids
+        )
 
     def slots_of(self, uuids: Sequence[bytes]) -> dict[bytes, int]:
-        """Return the last slot given to the keys of each node of a batch."""
-        return self._store.slots_of(uuids)
+        """Return the last slot given to the keys of each of these nodes (a chunk of them)."""
+        rows = self._store.execute(f"SELECT uuid, last FROM key_slots WHERE uuid IN ({places(uuids)})", uuids)
+        return {bytes(uuid): int(last) for uuid, last in rows}
+
+    def next_slot(self, uuid: bytes) -> int:
+        """Return a slot number that this node never had; to be asked before wrapping a new key."""
+        rows = self._store.execute(
+            "INSERT INTO key_slots VALUES(?, 1) ON CONFLICT(uuid) DO UPDATE SET last = last + 1 RETURNING last", (uuid,)
+        )
+        return int(rows[0][0])
+
+    def add(self, *records: KeyRecord) -> None:
+        """Keep keys, all or none; one that is there already (same node and key id) stays as it is.
+
+        ``seq`` is ignored, the store gives the next. Raises StoreError, also for a second active key.
+        """
+        with self._store.together():
+            self._store.execute_many(_USE_SLOT, ((record.uuid, record.slot) for record in records))
+            self._store.execute_many(_ADD_KEY, (_key_values(record)[:-1] for record in records))
 
     def add_pending(self, uuid: bytes, *, key: bytes, key_id: bytes, epoch: int) -> None:
         """Store a new key durably as pending; of the others only the oldest pending one goes, beyond eight.
@@ -135,11 +169,11 @@ class NodeKeys:
         """
         with self._store.together():
             self.refresh()
-            pending = [record for record in self._store.keys(uuid) if record.state == "pending"]
+            pending = [record for record in self.keys_of(uuid) if record.state == "pending"]
             for record in pending[MAX_PENDING - 1 :]:
-                self._store.remove_key(uuid, record.key_id)
-            slot = self._store.next_slot(uuid)
-            self._store.add_key(
+                self._delete(uuid, record.key_id)
+            slot = self.next_slot(uuid)
+            self.add(
                 self.wrapped(
                     uuid, key=key, key_id=key_id, epoch=epoch, slot=slot, source="agreement", created=utc_now()
                 )
@@ -174,7 +208,7 @@ class NodeKeys:
             return self._unwrapped(record, self._vault())
         except UnknownMasterKeyError:  # of the vault as it was a moment ago, or of a record as old as that
             vault = self._reopened()
-        there = (held for held in self._store.keys(record.uuid) if held.key_id == record.key_id)
+        there = (held for held in self.keys_of(record.uuid) if held.key_id == record.key_id)
         fresh = next(there, record)
         try:
             return self._unwrapped(fresh, vault)
@@ -197,7 +231,7 @@ class NodeKeys:
         late = (datetime.now(UTC) - CONFIRM_MAY_ARRIVE).strftime("%Y-%m-%dT%H:%M:%SZ")
         return [
             other
-            for other in self._store.keys(record.uuid)
+            for other in self.keys_of(record.uuid)
             if other.key_id != record.key_id
             and not (
                 other.state == "pending"
@@ -213,23 +247,23 @@ class NodeKeys:
         Raises NotFoundError for a key that is not held.
         """
         with self._store.together():
-            record = next((held for held in self._store.keys(uuid) if held.key_id == key_id), None)
+            record = next((held for held in self.keys_of(uuid) if held.key_id == key_id), None)
             if record is not None:
                 for other in self.outdated(record):
-                    self._store.remove_key(uuid, other.key_id)
-            self._store.activate_key(uuid, key_id)
-            marks = self._store.key_flags(uuid)
-            if marks.next_ca is None:
+                    self._delete(uuid, other.key_id)
+            self.activate(uuid, key_id)
+            flags = self._flags(uuid)
+            if flags.next_ca is None:
                 return
             self._set_flags(uuid, next_key_id=None, next_ca=None)
-            if marks.next_key_id == key_id:
-                self.set_ca_of(uuid, marks.next_ca)
+            if flags.next_key_id == key_id:
+                self.set_ca_of(uuid, flags.next_ca)
 
     def remove(self, uuid: bytes) -> int:
         """Delete every key of a node; returns how many there were."""
         with self._store.together():
-            self._tell_forgotten(uuid, self._store.keys(uuid))
-            return self._store.remove_keys(uuid)
+            self._tell_forgotten(uuid, self.keys_of(uuid))
+            return self._store.change("DELETE FROM keys WHERE uuid = ?", (uuid,))
 
     def _tell_forgotten(self, uuid: bytes, gone: Sequence[KeyRecord]) -> None:
         """Report to the plant that no key up to these epochs is left here."""
@@ -237,17 +271,38 @@ class NodeKeys:
             self._plant.record_event("forgot", uuid, epoch=max(record.epoch for record in gone))
 
     def wrap_anew(self, rewrap: Callable[[KeyRecord], bytes]) -> int:
-        """Replace the wrapped form of every key by what ``rewrap`` gives, all or none; returns how many."""
-        return self._store.replace_keys(rewrap)
+        """Wrap every key again (a change of the master key), all or none; return how many.
+
+        ``rewrap`` gets each record and returns the new wrapped octets; an error that it raises leaves all as it was.
+        """
+        count = 0
+        with self._store.together():
+            for record in self.all():
+                self._store.execute("UPDATE keys SET wrapped = ? WHERE seq = ?", (rewrap(record), record.seq))
+                count += 1
+        return count
+
+    def activate(self, uuid: bytes, key_id: str) -> None:
+        """Make this key the active one; another active one goes, pending ones stay. Raises NotFoundError."""
+        with self._store.together():
+            if not self._store.one("SELECT 1 FROM keys WHERE uuid = ? AND key_id = ?", (uuid, key_id)):
+                raise NotFoundError(f"The store has no key {key_id} of node {uuid.hex()}.")
+            self._store.execute("DELETE FROM keys WHERE uuid = ? AND key_id <> ? AND state = 'active'", (uuid, key_id))
+            self._store.execute(
+                "UPDATE keys SET state = 'active' WHERE uuid = ? AND key_id = ? AND state <> 'active'", (uuid, key_id)
+            )
 
     def remove_key(self, uuid: bytes, key_id: str) -> bool:
         """Delete one key of a node; False if it is not held."""
         with self._store.together():
-            before = self._store.keys(uuid)
-            removed = self._store.remove_key(uuid, key_id)
+            before = self.keys_of(uuid)
+            removed = self._delete(uuid, key_id)
             if removed and len(before) == 1:
                 self._tell_forgotten(uuid, before)
             return removed
+
+    def _delete(self, uuid: bytes, key_id: str) -> bool:
+        return self._store.change("DELETE FROM keys WHERE uuid = ? AND key_id = ?", (uuid, key_id)) > 0
 
     def correct_epoch(self, record: KeyRecord, epoch: int) -> KeyRecord:
         """Correct the epoch of a key, which was unverified, to the one that a node reported in a session.
@@ -259,77 +314,114 @@ class NodeKeys:
         with self._store.together():
             self.refresh()
             key = self.unwrap(record)
-            slot = self._store.next_slot(record.uuid)
+            slot = self.next_slot(record.uuid)
             context = node_key_context(self._store.id, record.uuid, epoch, slot)
             corrected = replace(record, epoch=epoch, slot=slot, wrapped=self._vault().wrap(key, context=context))
-            self._store.remove_key(record.uuid, record.key_id)
-            self._store.add_key(corrected)
+            self._delete(record.uuid, record.key_id)
+            self.add(corrected)
         return corrected
 
     # -- the CA that a node keeps ----------------------------------------------------------------------------------
 
     def ca_of(self, uuid: bytes) -> bytes:
         """P(CA) that a node keeps: the owner's, or that of the bundle in which the node's key came."""
-        marks = self._store.key_flags(uuid)
-        if marks.ca is None:
+        flags = self._flags(uuid)
+        if flags.ca is None:
             return self._identity.ca
-        self._row_macs.check_ca(uuid, marks.ca, marks.ca_mac)
-        return marks.ca
+        self._check_ca(uuid, flags.ca, flags.ca_mac)
+        return flags.ca
 
     def cas_of_nodes(self) -> dict[bytes, bytes]:
         """P(CA) of every node that keeps another CA than the owner's."""
-        return self._checked_cas(self._store.all_key_flags())
+        return self._checked_cas(self.all_flags())
 
     def cas_among(self, uuids: Sequence[bytes]) -> dict[bytes, bytes]:
-        """P(CA) of those of a page of nodes that keep another CA than the owner's."""
-        return self._checked_cas(self._store.key_flags_of(uuids))
+        """P(CA) of those of a chunk of nodes that keep another CA than the owner's."""
+        return self._checked_cas(self._flags_of(uuids))
 
-    def _checked_cas(self, marked: Mapping[bytes, KeyFlags]) -> dict[bytes, bytes]:
+    def _checked_cas(self, flagged: Mapping[bytes, KeyFlags]) -> dict[bytes, bytes]:
         cas: dict[bytes, bytes] = {}
-        for uuid, marks in marked.items():
-            if marks.ca is not None:
-                self._row_macs.check_ca(uuid, marks.ca, marks.ca_mac)
-                cas[uuid] = marks.ca
+        for uuid, flags in flagged.items():
+            if flags.ca is not None:
+                self._check_ca(uuid, flags.ca, flags.ca_mac)
+                cas[uuid] = flags.ca
         return cas
+
+    def _check_ca(self, uuid: bytes, ca: bytes, mac: bytes | None) -> None:
+        """Raise StoreChangedError if the CA that a node keeps is not the recorded one."""
+        if not self._row_macs.counts(mac, "ca", (uuid, ca)):
+            raise changed(
+                [f"the CA of node {uuid.hex()}"], "Restore a backup, or reset the node and agree on a new key."
+            )
 
     def set_ca_of(self, uuid: bytes, ca: bytes) -> None:
         """Note which CA a node keeps."""
         self._set_flags(uuid, ca=ca)
 
     def set_flags(self, changes: Mapping[bytes, Mapping[str, Any]]) -> None:
-        """Change marks of many nodes at once, by the names of :class:`KeyFlags`; the owner's CA is none."""
-        self._set_all_flags(
-            changes, {uuid: m for page in chunks(changes) for uuid, m in self._store.key_flags_of(page).items()}
-        )
+        """Change flags of many nodes at once, by the names of :class:`KeyFlags`; the owner's CA is none."""
+        self._set_all_flags(changes, {uuid: m for page in chunks(changes) for uuid, m in self._flags_of(page).items()})
 
     def _set_all_flags(self, changes: Mapping[bytes, Mapping[str, Any]], present: Mapping[bytes, KeyFlags]) -> None:
         own = self._identity.ca
         wanted: dict[bytes, KeyFlags] = {}
         for uuid, change in changes.items():
-            before = present.get(uuid, _NO_MARKS)
+            before = present.get(uuid, _NO_FLAGS)
             ca = change.get("ca", before.ca)
             sealed: dict[str, bytes | None] = {}
             if ca == own:
                 sealed = {"ca": None, "ca_mac": None}
             elif ca is not None and ca != before.ca:
-                sealed = {"ca_mac": self._row_macs.ca(uuid, ca)}
+                sealed = {"ca_mac": self._row_macs.mac("ca", (uuid, ca))}
             values = {**change, **sealed}
             after = (
-                KeyFlags(**values) if before is _NO_MARKS else replace(before, **values)
+                KeyFlags(**values) if before is _NO_FLAGS else replace(before, **values)
             )  # replace() costs four times
             if after != before:
                 wanted[uuid] = after
         if wanted:
-            self._store.put_key_flags(wanted)
+            self.put_flags(wanted)
 
     def _set_flags(self, uuid: bytes, **change: Any) -> None:
-        self._set_all_flags({uuid: change}, {uuid: self._store.key_flags(uuid)})
+        self._set_all_flags({uuid: change}, {uuid: self._flags(uuid)})
+
+    def _flags(self, uuid: bytes) -> KeyFlags:
+        row = self._store.read_one(KeyFlags, f"SELECT {_FLAGS} FROM marks WHERE uuid = ?", (uuid,))
+        return row or _NO_FLAGS
+
+    def _flags_of(self, uuids: Sequence[bytes]) -> dict[bytes, KeyFlags]:
+        """Return the flags of those of these nodes (a chunk of them) that have one."""
+        statement = f"SELECT uuid, {_FLAGS} FROM marks WHERE uuid IN ({places(uuids)})"
+        return dict(self._store.read(_flagged, statement, uuids))
+
+    def all_flags(self) -> dict[bytes, KeyFlags]:
+        """Return the flags of every node that has one."""
+        return dict(self._store.read(_flagged, f"SELECT uuid, {_FLAGS} FROM marks"))
+
+    def put_flags(self, flags: Mapping[bytes, KeyFlags]) -> None:
+        """Keep the flags of nodes, with the MACs that they have, in place of those that are there.
+
+        A node without any flag has no row.
+        """
+        columns = ("uuid", *fields(KeyFlags))
+        rows = ((uuid, *_flag_values(kept)) for uuid, kept in flags.items() if kept != _NO_FLAGS)
+        without = [(uuid,) for uuid, kept in flags.items() if kept == _NO_FLAGS]
+        with self._store.together():
+            self._store.execute_many("DELETE FROM marks WHERE uuid = ?", without)
+            statement = f"INSERT OR REPLACE INTO marks(uuid, {_FLAGS}) VALUES({places(columns)})"
+            self._store.execute_many(statement, rows)
+
+    def mac_rows(self) -> Iterator[MacRow]:
+        """Yield the CA of every node that keeps another one than the owner's, for a check of its MAC."""
+        for uuid, flags in self.all_flags().items():
+            if flags.ca is not None:
+                yield f"the CA of node {uuid.hex()}", flags.ca_mac, "ca", (uuid, flags.ca)
 
     # -- rotations and other holders -------------------------------------------------------------------------------
 
     def rotation_due(self, uuid: bytes) -> str | None:
         """Return why a node's key is to be rotated, None if it is not; :meth:`rotates_now`: by this station, today."""
-        return self._store.key_flags(uuid).rotation
+        return self._flags(uuid).rotation
 
     def rotates_now(self, uuid: bytes) -> bool:
         """Return True if the next session with a node has to rotate its key first.
@@ -342,13 +434,13 @@ class NodeKeys:
 
     def rotations_due(self) -> dict[bytes, str]:
         """Why a rotation is due, for every node that has one."""
-        marks = self._store.all_key_flags()
-        return {uuid: mark.rotation for uuid, mark in marks.items() if mark.rotation is not None}
+        flags = self.all_flags()
+        return {uuid: kept.rotation for uuid, kept in flags.items() if kept.rotation is not None}
 
     def due_among(self, uuids: Sequence[bytes]) -> set[bytes]:
-        """Those of a page of nodes whose key must be rotated."""
-        marks = self._store.key_flags_of(uuids)
-        return {uuid for uuid, mark in marks.items() if mark.rotation is not None}
+        """Those of a chunk of nodes whose key must be rotated."""
+        flags = self._flags_of(uuids)
+        return {uuid for uuid, kept in flags.items() if kept.rotation is not None}
 
     def restored(self, uuid: bytes) -> bool:
         """Return True if the keys of a node came back from a backup and none was agreed since."""
@@ -365,13 +457,17 @@ class NodeKeys:
         Only a key that is agreed on from now on ends that: one that is pending already may be known to others.
         """
         self._set_flags(uuid, rotation=why)
-        self._store.count_as_imported(uuid)
+        self._count_as_imported(uuid)
+
+    def _count_as_imported(self, uuid: bytes) -> None:
+        """Have no pending key of a node count as agreed on here: a rotation became due after it was made."""
+        self._store.execute("UPDATE keys SET source = 'import' WHERE uuid = ? AND state = 'pending'", (uuid,))
 
     def rotated(self, uuid: bytes) -> None:
         """Note that a node has a key that no other station holds."""
         self._set_flags(uuid, rotation=None)
-        for holder in self._store.holders(uuid):
-            self._store.remove_holder(uuid, holder.fingerprint)
+        for holder in self.holders(uuid):
+            self.remove_holder(uuid, holder.fingerprint)
 
     def end_removal_mark(self, record: KeyRecord) -> None:
         """End a rotation that a removal demanded: a session was opened under a key that no removed station has had.
@@ -386,24 +482,40 @@ class NodeKeys:
 
     def former(self, uuid: bytes) -> str | None:
         """Fingerprint of the board that the link keys were agreed with, once its pin was let go."""
-        return self._store.key_flags(uuid).former
+        return self._flags(uuid).former
 
     def set_former(self, uuid: bytes, fingerprint: str | None) -> None:
         """Note which board the link keys were agreed with; None once a session has shown it."""
         self._set_flags(uuid, former=fingerprint)
 
     def holders(self, uuid: bytes | None = None) -> list[Holder]:
-        """Who else holds keys: of this node, or of all."""
-        return self._store.holders(uuid)
+        """Return who else holds keys: of this node, or of all."""
+        which, values = ("", ()) if uuid is None else ("WHERE uuid = ?", (uuid,))  # by the index: there may be 100,000
+        return self._store.read(Holder, f"SELECT * FROM holders {which} ORDER BY uuid, since, fingerprint", values)
 
     def holders_of_key(self, record: KeyRecord) -> set[str]:
         """Return the stations that were noted as holders since this key came; earlier ones had the key before it."""
-        return {holder.fingerprint for holder in self._store.holders(record.uuid) if holder.since >= record.created}
+        return {holder.fingerprint for holder in self.holders(record.uuid) if holder.since >= record.created}
 
-    def put_holder(self, holder: Holder) -> None:
-        """Note that another station holds a key of this node."""
-        self._store.put_holder(holder)
+    def put_holder(self, *holders: Holder) -> None:
+        """Note that other stations hold a key of these nodes."""
+        self._store.execute_many(_PUT_HOLDER, map(_holder_values, holders))
 
     def remove_holder(self, uuid: bytes, fingerprint: str) -> bool:
-        """Note that a station holds it no more; False if it was not noted."""
-        return self._store.remove_holder(uuid, fingerprint)
+        """Note that a station holds it no more (a rotation); False if it was not noted."""
+        statement = "DELETE FROM holders WHERE uuid = ? AND fingerprint = ?"
+        return self._store.change(statement, (uuid, fingerprint)) > 0
+
+
+def _key_name(seq: int, *row: Any) -> tuple[bytes, str, int, str]:
+    uuid, key_id, epoch, state = row
+    return uuid, key_id, epoch, state
+
+
+def _key(seq: int, *row: Any) -> KeyRecord:
+    values = (*row, seq)
+    return KeyRecord(*values)
+
+
+def _flagged(uuid: bytes, *row: Any) -> tuple[bytes, KeyFlags]:
+    return uuid, KeyFlags(*row)

@@ -1,267 +1,262 @@
-"""Nodes: names and states, the last datasheet of each, and the draft that it is being given."""
+"""Nodes: names, states and identity keys, and what leads from a text to a node."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import json
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import fields, replace
+from functools import lru_cache
+from operator import attrgetter
+from typing import Any, Final
 
-from teds_provision.errors import BadDataError, StoreError
-from teds_provision.lazy import late
+from teds_provision.errors import KeyMismatchError, NotFoundError, StoreError, UsageError
 from teds_provision.station.plant.plant import Plant
-from teds_provision.station.row_macs import RowMacs
-from teds_provision.station.store import (
-    DatasheetRecord,
-    Draft,
-    ExportedNode,
-    ExportEligibility,
-    FirmwareRecord,
-    NodeOverview,
-    NodeReading,
-    NodeRecord,
-    Search,
-    Store,
-    chunks,
-    utc_now,
-)
-from teds_provision.teds.codec.model import AccessCode
-from teds_provision.teds.image import Image
+from teds_provision.station.row_macs import MacRow, RowMacs, changed
+from teds_provision.station.store.database import PAGE, chunks, places
+from teds_provision.station.store.records import UUID_OCTETS, ExportedNode, ExportEligibility, NodeRecord
+from teds_provision.station.store.store import Store
 
-if TYPE_CHECKING:
-    from teds_provision.teds import sheet
-    from teds_provision.teds.codec import security
-else:  # TEDS: a list decodes none
-    sheet, security = late("teds_provision.teds.sheet"), late("teds_provision.teds.codec.security")
+_UUID_DIGITS = 2 * UUID_OCTETS
+_MIN_PREFIX = 4
+_SHOWN_CANDIDATES = 5
+NODE_FIELDS = tuple(column.name for column in fields(NodeRecord))
+_NODE_COLUMNS = ", ".join(NODE_FIELDS)
+_EXPORTED_COLUMNS = ", ".join(
+    "(SELECT json_group_array(name) FROM (SELECT name FROM group_members m WHERE m.uuid = nodes.uuid ORDER BY name))"
+    if name == "groups"
+    else name
+    for name in ExportedNode._fields
+)
+_REPLACE = f"INSERT OR REPLACE INTO nodes({_NODE_COLUMNS}) VALUES({places(NODE_FIELDS)})"
+_node_values = attrgetter(*NODE_FIELDS)
+_MAC = NODE_FIELDS.index("point_mac")
+_LISTED_NAMES: Final = (
+    "(SELECT w.uuid, w.name FROM whitelist w LEFT JOIN nodes n USING (uuid)"
+    " WHERE w.name IS NOT NULL AND n.name IS NULL)"
+)
+"""The names of the whitelist that count: a node that was named since has that name alone."""
 
 
 class Nodes:
     """The nodes of one station, by UUID."""
 
-    def __init__(self, store: Store, seals: RowMacs, plant: Plant) -> None:
-        self._plant = plant
-        self._store = store
-        self._row_macs = seals
+    def __init__(self, store: Store, row_macs: RowMacs, plant: Plant) -> None:
+        self._store, self._row_macs, self._plant = store, row_macs, plant
 
     def all(self) -> list[NodeRecord]:
-        """All nodes, by UUID."""
-        return self._store.nodes()
-
-    def all_shown_keys(self) -> Iterator[ExportEligibility]:
-        """Identity key of all nodes, and whether each was retired, by UUID, a page at a time."""
-        return self._store.all_shown_keys()
-
-    def get_many(self, uuids: Sequence[bytes]) -> dict[bytes, NodeRecord]:
-        """Return the records of a batch of nodes, by UUID."""
-        return self._store.nodes_of(uuids)
-
-    def exported_many(self, uuids: Sequence[bytes]) -> dict[bytes, ExportedNode]:
-        """Return a bundle's facts about a batch of nodes, by UUID."""
-        return self._store.exported_nodes_of(uuids)
-
-    def bearers_of(self, names: Sequence[str]) -> dict[str, bytes]:
-        """Who has each of a page of names."""
-        return self._store.bearers_of(names)
+        """Return all nodes, by UUID."""
+        return self._store.read(NodeRecord, f"SELECT {_NODE_COLUMNS} FROM nodes ORDER BY uuid")
 
     def get(self, uuid: bytes) -> NodeRecord | None:
         """Return the record of a node, None if there is none."""
-        return self._store.node(uuid)
+        return self._store.read_one(NodeRecord, f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid = ?", (uuid,))
+
+    def get_many(self, uuids: Sequence[bytes]) -> dict[bytes, NodeRecord]:
+        """Return the records of a chunk of nodes, by UUID."""
+        statement = f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid IN ({places(uuids)})"
+        return {record.uuid: record for record in self._store.read(NodeRecord, statement, uuids)}
+
+    def all_shown_keys(self) -> Iterator[ExportEligibility]:
+        """Give identity key and retirement of all nodes, by UUID, a chunk at a time."""
+        after = b""
+        statement = "SELECT uuid, point, point_mac, retired FROM nodes WHERE uuid > ? ORDER BY uuid LIMIT ?"
+        while page := self._store.read(ExportEligibility, statement, (after, PAGE)):
+            yield from page
+            after = page[-1].uuid
+
+    def exported_many(self, uuids: Sequence[bytes]) -> dict[bytes, ExportedNode]:
+        """Return a bundle's facts about a chunk of nodes, by UUID."""
+        statement = f"SELECT {_EXPORTED_COLUMNS} FROM nodes WHERE uuid IN ({places(uuids)})"
+        return {exported.uuid: exported for exported in self._store.read(_exported, statement, uuids)}
 
     def put(self, record: NodeRecord) -> None:
         """Add or replace a node. Epoch and sequence never go back; raises KeyMismatchError for another identity key."""
-        present = self._store.node(record.uuid)
-        self._store.put_node(replace(record, point_mac=self._seal(record.uuid, record.point, present)))
+        with self._store.together():
+            present = self.get(record.uuid)
+            self._replace(replace(record, point_mac=self._mac_of(record.uuid, record.point, present)), present)
+
+    def restore(self, record: NodeRecord) -> None:
+        """As :meth:`put`, with the MAC that the record has: it comes from a backup."""
+        with self._store.together():
+            self._replace(record, self.get(record.uuid))
+
+    def put_many(self, records: Iterable[NodeRecord]) -> None:
+        """Add or replace nodes, each with a MAC of its identity key; the caller has held them against those here."""
+        rows = ((record, self._mac(record.uuid, record.point) if record.point else None) for record in records)
+        self._store.execute_many(_REPLACE, (_row(record, mac) for record, mac in rows))
 
     def remember(self, uuid: bytes, **facts: object) -> NodeRecord:
         """Bring what is known of a node up to date and return it."""
         with self._store.together():  # no other process changes what was read before it is written
-            present = self._store.node(uuid)
+            present = self.get(uuid)
             before = present or NodeRecord(uuid)
-            mac = self._seal(uuid, facts.get("point", before.point), present)
+            mac = self._mac_of(uuid, facts.get("point", before.point), present)
             changed = replace(before, **facts, point_mac=mac)  # type: ignore[arg-type]
             if present is None or changed != present or mac != present.point_mac:
-                self._store.replace_node(changed, present)
+                self._replace(changed, present)
             if changed.name != before.name:
                 self._plant.record_name(uuid, changed.name)
         return changed
 
-    def _seal(self, uuid: bytes, point: object, present: NodeRecord | None) -> bytes | None:
-        """Return the row MAC of an identity key, new if the vault is open; without one it is a hint."""
-        if not isinstance(point, bytes):
-            return None
-        if present is not None and present.point == point and present.point_mac is not None:
-            return present.point_mac
-        return self._row_macs.point(uuid, point)
+    def _replace(self, record: NodeRecord, known: NodeRecord | None) -> None:
+        """Keep a record, inside a transaction in which ``known`` was read (None: there is no such node)."""
+        if known and known.point and record.point and known.point != record.point:
+            raise KeyMismatchError(
+                f"Node {record.uuid.hex()} is known with another identity key than the one it shows now.",
+                hint="Do not trust this node. If its chip was really replaced, it needs a new UUID.",
+            )
+        values: dict[str, Any] = {name: getattr(record, name) for name in NODE_FIELDS}
+        if known:
+            if record.point is None:
+                values["point"], values["point_mac"] = known.point, known.point_mac
+            values["epoch"] = max(record.epoch, known.epoch)
+            values["sequence"] = max(record.sequence, known.sequence)
+        self._store.execute(_REPLACE, tuple(values.values()))
 
     def met_at(self, uuid: bytes, place: str) -> None:
         """Record that a session with this node was opened at ``place`` (``LINK:PORT``), for the next search.
 
         A hint: it neither waits for the disk nor fails because of it; a lost one comes back in the next session.
         """
-        if place and self._store.last_places([uuid]).get(uuid) != place:
+        if place and self.last_places([uuid]).get(uuid) != place:
             with suppress(StoreError), self._store.transaction(later=True):
-                self._store.put_last_place(uuid, place)
+                self._store.execute("INSERT OR REPLACE INTO last_places VALUES(?, ?)", (uuid, place))
 
     def last_places(self, uuids: Sequence[bytes]) -> dict[bytes, str]:
         """Return the last place of each of these nodes, as ``LINK:PORT``; without those never met."""
-        return {uuid: place for page in chunks(uuids) for uuid, place in self._store.last_places(page).items()}
+        return {
+            bytes(uuid): str(place)
+            for batch in chunks(uuids)
+            for uuid, place in self._store.execute(
+                f"SELECT uuid, place FROM last_places WHERE uuid IN ({places(batch)})", batch
+            )
+        }
+
+    def unpin(self, uuid: bytes) -> None:
+        """Forget the identity key of a node on its owner's explicit order; epoch and sequence stay."""
+        self._store.execute("UPDATE nodes SET point = NULL, point_mac = NULL WHERE uuid = ?", (uuid,))
+
+    def set_due(self, uuid: bytes, due: str | None) -> None:
+        """Record the day (ISO 8601) on which the first calibration of a node ends, None if none does."""
+        self._store.execute("UPDATE nodes SET due = ? WHERE uuid = ? AND due IS NOT ?", (due, uuid, due))
+
+    # -- the MAC of an identity key ----------------------------------------------------------------------------------
+
+    def _mac_of(self, uuid: bytes, point: object, present: NodeRecord | None) -> bytes | None:
+        """Return the row MAC of an identity key, new if the vault is open; without one it is a hint."""
+        if not isinstance(point, bytes):
+            return None
+        if present is not None and present.point == point and present.point_mac is not None:
+            return present.point_mac
+        return self._mac(uuid, point)
+
+    def _mac(self, uuid: bytes, point: bytes) -> bytes | None:
+        """Return the MAC of an identity key; None, and so only a hint, as long as the vault is closed."""
+        return self._row_macs.mac("node", (uuid, point)) if self._row_macs.active else None
+
+    def check_point(self, node: NodeRecord | ExportEligibility) -> None:
+        """Raise StoreChangedError if a node's identity key with a MAC was changed."""
+        has_mac = node.point is not None and node.point_mac is not None
+        if has_mac and not self._row_macs.counts(node.point_mac, "node", (node.uuid, node.point)):
+            remove = f"teds-provision whitelist remove {node.uuid.hex()}, then tap the node."
+            raise changed([f"the key of node {node.uuid.hex()}"], remove)
+
+    def mac_rows(self) -> Iterator[MacRow]:
+        """Yield every identity key with a MAC, for a check of them."""
+        for node in self.all():
+            if node.point is not None and node.point_mac is not None:
+                yield f"the key of node {node.uuid.hex()}", node.point_mac, "node", (node.uuid, node.point)
+
+    # -- names, and prefixes of UUIDs --------------------------------------------------------------------------------
 
     def resolve(self, text: str) -> bytes:
-        """Return the UUID for ``text`` (a UUID, a prefix of it, or a name); raises NotFoundError, UsageError."""
-        return self._store.resolve(text)
+        """Return the UUID that ``text`` means, looking at nodes and whitelist.
+
+        ``text`` is a UUID of 20 hex digits (returned even if unknown), a prefix of four or more, either with or
+        without ``0x`` and in any case, or a name. Raises NotFoundError, or UsageError when several nodes fit.
+        """
+        asked = text.strip()
+        digits = asked.removeprefix("0x").removeprefix("0X").lower()
+        is_hex = re.fullmatch("[0-9a-f]+", digits) is not None
+        if is_hex and len(digits) == _UUID_DIGITS:
+            return bytes.fromhex(digits)
+        found = set(self._store.execute(*_by_name(asked)))
+        if is_hex and _MIN_PREFIX <= len(digits) < _UUID_DIGITS:
+            found.update(self._store.execute(*_by_prefix(digits)))
+        candidates = sorted(uuid for (uuid,) in found)
+        if not candidates:
+            raise NotFoundError(
+                f"No node is known as {asked!r}.",
+                hint="Give a UUID (20 hex digits, or its first four or more) or a name; see teds-provision nodes.",
+            )
+        if len(candidates) > 1:
+            shown = ", ".join(uuid.hex() for uuid in candidates[:_SHOWN_CANDIDATES])
+            more = f" and {len(candidates) - _SHOWN_CANDIDATES} more" if len(candidates) > _SHOWN_CANDIDATES else ""
+            raise UsageError(f"{asked!r} fits several nodes: {shown}{more}.", hint="Give more digits of the UUID.")
+        return bytes(candidates[0])
 
     def beginning_with(self, text: str, most: int) -> list[tuple[str, str]]:
-        """Names and UUIDs that begin with ``text``, each with what it is; for completing a command line."""
-        return self._store.beginning_with(text, most)
+        """Return at most so many words that begin with ``text``, each with what it is: names, and UUIDs (20 digits)."""
+        found: dict[str, str] = {}
+        upper = text + "\U0010ffff"
+        digits = text.removeprefix("0x").lower()
+        for table, names in (("nodes", "nodes"), ("whitelist", _LISTED_NAMES)):
+            named = f"SELECT name, lower(hex(uuid)) FROM {names} WHERE name >= ? AND name < ? ORDER BY name LIMIT ?"
+            found.update((name, uuid) for name, uuid in self._store.execute(named, (text, upper, most)))
+            if re.fullmatch("[0-9a-f]{0,20}", digits):
+                within = f"SELECT lower(hex(uuid)), name FROM {table} WHERE uuid BETWEEN ? AND ? LIMIT ?"
+                rows = self._store.execute(within, (*_bounds(digits), most))
+                found.update((uuid, found.get(uuid) or name or "") for uuid, name in rows)
+        return sorted(found.items())[:most]
 
-    def find(self, search: Search) -> list[bytes]:
-        """UUIDs of the nodes that are meant, ascending; of all that is known, imported and merely listed ones too."""
-        return self._store.find(search)
-
-    def overview(self, uuids: Sequence[bytes]) -> Iterator[NodeOverview]:
-        """All that is known of these nodes, in their order, a page at a time."""
-        return self._store.overview(uuids)
-
-    def is_known(self, uuid: bytes) -> bool:
-        """Return True if anything is known of a node."""
-        return self._store.is_known(uuid)
+    def all_named(self, name: str) -> list[bytes]:
+        """Return the UUIDs of the nodes and whitelist entries that have exactly this name."""
+        return sorted(bytes(uuid) for (uuid,) in self._store.execute(*_by_name(name)))
 
     def named(self, name: str) -> bytes | None:
         """Return the UUID of the only node of exactly this name, None if none or several have it."""
-        return self._store.named(name)
+        statement = "SELECT uuid FROM nodes WHERE name = ? UNION SELECT uuid FROM whitelist WHERE name = ? LIMIT 2"
+        rows = self._store.execute(statement, (name, name))
+        return bytes(rows[0][0]) if len(rows) == 1 else None
 
-    def all_named(self, name: str) -> list[bytes]:
-        """Return the UUIDs that have exactly this name, as a node or on the whitelist."""
-        return self._store.all_named(name)
-
-    # -- datasheets ------------------------------------------------------------------------------------------------
-
-    def datasheet(self, uuid: bytes) -> Image | None:
-        """Return the image of a node when it was last read or written whole, None if it never was."""
-        record = self._store.datasheet(uuid)
-        return record.image if record is not None and is_whole(record.image) else None
-
-    def keep_datasheet(self, image: Image, profile: str | None = None) -> None:
-        """Keep the present datasheet of a node, as it was read or written; the one before goes into its history.
-
-        A draft of the same content is removed. ``profile`` names the type, if it is known. An incomplete datasheet (a
-        Security TEDS alone, or a TEDS of its field 108 missing) is not kept: it would replace octets that were not
-        read.
-        """
-        if not is_whole(image):
-            return
-        with self._store.together():
-            draft = self._store.draft(image.uuid)
-            if draft is not None and draft.image == image:
-                profile = profile or draft.profile
-                self._store.drop_draft(image.uuid)
-            if self._store.put_datasheet(image, profile):
-                self._store.set_due(image.uuid, _first_due(image))
-
-    def history(self, uuid: bytes) -> list[DatasheetRecord]:
-        """Return the datasheets that a node had, newest first: the present one and at most ten older ones.
-
-        Readings of the Security TEDS alone are not among them.
-        """
-        return [record for record in self._store.history(uuid) if record.image.unsigned_blocks()]
-
-    # -- readings --------------------------------------------------------------------------------------------------
-
-    def reading(self, uuid: bytes) -> NodeReading | None:
-        """Return the last reading of a node, from which its verdict is derived; None if there is none."""
-        return self._store.reading_of(uuid)
-
-    def reads_well(self, uuid: bytes) -> bool:
-        """Return True if a node's datasheet was read in a session and was free of faults: a hint, without trust."""
-        row = self.reading(uuid)
-        return row is not None and row.in_session and not row.failed
-
-    def readings_of(self, uuids: Sequence[bytes]) -> dict[bytes, NodeReading]:
-        """Return the last readings of a batch of nodes, by UUID."""
-        return self._store.readings_of(uuids)
-
-    def keep_reading(self, reading: NodeReading, image: Image | None = None, profile: str | None = None) -> bool:
-        """Keep a reading of a node, with the datasheet if that is worth keeping, at one moment.
-
-        Only a reading in a session replaces one made in a session: False if it did not.
-        """
-        with self._store.together():
-            kept = self._store.put_reading(reading)
-            if image is not None:
-                self.keep_datasheet(image, profile)
-        return kept
-
-    def started_anew(self, uuid: bytes, c: bytes) -> None:
-        """Record a restart of the node since its reading, as a session with this ``c`` (8 octets) shows.
-
-        Does not wait for the disk: a record lost in a crash comes back in the next session.
-        """
-        with self._store.transaction(later=True):
-            self._store.put_start(uuid, c)
-
-    def forget_reading(self, uuid: bytes) -> None:
-        """Forget the reading of a node that was reset."""
-        self._store.drop_reading(uuid)
-
-    # -- firmware --------------------------------------------------------------------------------------------------
-
-    def firmware(self, uuid: bytes) -> FirmwareRecord | None:
-        """Return what a node last reported of its firmware, None if nothing is known."""
-        return self.firmware_of([uuid]).get(uuid)
-
-    def firmware_of(self, uuids: Sequence[bytes]) -> dict[bytes, FirmwareRecord]:
-        """Return what a batch of nodes last reported, by UUID; what another program wrote does not count."""
-        found = self._store.firmware_of(uuids)
-        return {uuid: record for uuid, record in found.items() if self._row_macs.reported(record)}
-
-    def keep_firmware(self, uuid: bytes, report: bytes, *, in_session: bool, signed: bool = False) -> None:
-        """Keep a node's answer to About (empty: it reports none); only one in a session replaces one of a session.
-
-        ``signed``: its datasheet was signed under this firmware. An answer that is known is not written again.
-        """
-        with self._store.together():
-            before = self.firmware(uuid)
-            if before is not None and before.in_session and not in_session:
-                return
-            known = before is not None and (before.report, before.in_session) == (report, in_session)
-            at = before.at if before is not None and known else utc_now()
-            kept = before.signed if before is not None else None
-            record = FirmwareRecord(uuid, report, in_session, at, report if signed else kept)
-            if record != before:
-                self._store.put_firmware(self._row_macs.firmware(record))
-
-    def drafts(self) -> list[Draft]:
-        """Every image that was built and not written, by UUID."""
-        return self._store.drafts()
-
-    def draft(self, uuid: bytes) -> Draft | None:
-        """Return the image that a node is being given, and how far the write has come."""
-        return self._store.draft(uuid)
-
-    def keep_draft(self, draft: Draft) -> None:
-        """Keep an image for a node, in place of the one before."""
-        self._store.put_draft(draft)
-
-    def drop_draft(self, uuid: bytes) -> bool:
-        """Forget the image that a node was to be given; False if there was none."""
-        return self._store.drop_draft(uuid)
+    def bearers_of(self, names: Sequence[str]) -> dict[str, bytes]:
+        """Return who has each of these names (a chunk of them), in the nodes or in the whitelist."""
+        found = (
+            f"SELECT name, uuid FROM {table} WHERE name IN ({places(names)})" for table in (_LISTED_NAMES, "nodes")
+        )
+        return {name: bytes(uuid) for statement in found for name, uuid in self._store.execute(statement, names)}
 
 
-def is_whole(image: Image) -> bool:
-    """Return True if an image is a whole datasheet: more than a Security TEDS, with every TEDS of field 108."""
-    if not image.unsigned_blocks():
-        return False
-    if image.security is None:
-        return True
-    try:
-        return security.decode(image.security).signed_blocks.keys() <= image.blocks.keys()
-    except BadDataError:
-        return True  # not of this profile: it lists nothing
+def _row(record: NodeRecord, mac: bytes | None) -> list[Any]:
+    row = list(_node_values(record))
+    row[_MAC] = mac
+    return row
 
 
-def _first_due(image: Image) -> str | None:
-    """Return the day (ISO 8601) on which the first calibration of a datasheet ends, None if none does."""
-    if not any(code == AccessCode.CALIBRATION for _, code in image):
-        return None
-    ends = [channel.due for channel in sheet.Sheet.from_image(image).channels if channel.due is not None]
-    return min(ends).strftime("%Y-%m-%d") if ends else None
+def _exported(*row: Any) -> ExportedNode:
+    values: tuple[Any, ...] = (*row[:-1], _groups(row[-1]))
+    return ExportedNode(*values)
+
+
+@lru_cache(maxsize=256)  # nodes may be 100,000, and groups are few
+def _groups(listed: str) -> tuple[str, ...]:
+    return tuple(json.loads(listed))
+
+
+def _by_name(name: str) -> tuple[str, tuple[str, str]]:
+    return f"SELECT uuid FROM nodes WHERE name = ? UNION SELECT uuid FROM {_LISTED_NAMES} WHERE name = ?", (name, name)
+
+
+def _by_prefix(digits: str) -> tuple[str, tuple[bytes, bytes, bytes, bytes]]:
+    statement = (
+        "SELECT uuid FROM nodes WHERE uuid BETWEEN ? AND ? UNION SELECT uuid FROM whitelist WHERE uuid BETWEEN ? AND ?"
+    )
+    low, high = _bounds(digits)
+    return statement, (low, high, low, high)
+
+
+def _bounds(digits: str) -> tuple[bytes, bytes]:
+    """Return the lowest and the highest UUID that begins with these digits."""
+    return bytes.fromhex(digits.ljust(_UUID_DIGITS, "0")), bytes.fromhex(digits.ljust(_UUID_DIGITS, "f"))

@@ -4,19 +4,27 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields, replace
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 from teds_provision.lazy import late
 from teds_provision.protocol.fingerprints import is_whole, same_key
+from teds_provision.station.datasheets import Datasheets
 from teds_provision.station.node_keys import NodeKeys
+from teds_provision.station.nodes import Nodes
 from teds_provision.station.plant.plant import Plant
-from teds_provision.station.row_macs import RowMacs
-from teds_provision.station.store import ExportEligibility, NodeRecord, Store, WhitelistEntry
+from teds_provision.station.row_macs import MacRow, RowMacs, Values, changed
+from teds_provision.station.store.database import PAGE, places
+from teds_provision.station.store.records import ExportEligibility, NodeRecord, WhitelistEntry
+from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
     from teds_provision.protocol import keys, wire_agreement
 else:  # cryptography: not for commands that only list
     wire_agreement, keys = late("teds_provision.protocol.wire_agreement"), late("teds_provision.protocol.keys")
+
+_values = attrgetter(*(column.name for column in fields(WhitelistEntry)))
 
 RECORD_AGAIN: Final = 600.0
 """Seconds in which a process records one wrong key of a UUID.
@@ -29,13 +37,17 @@ its audit log.
 class Pins:
     """The whitelist, and the key of each UUID: by the whitelist, else from the first proven contact.
 
-    With an open vault every row that is used has to carry this station's seal: StoreChangedError otherwise.
+    With an open vault every row that is used has to carry its row MAC: StoreChangedError otherwise.
     """
 
-    def __init__(self, store: Store, keys: NodeKeys, seals: RowMacs, plant: Plant) -> None:
+    def __init__(
+        self, store: Store, nodes: Nodes, datasheets: Datasheets, keys: NodeKeys, row_macs: RowMacs, plant: Plant
+    ) -> None:
         self._store = store
+        self._nodes = nodes
+        self._datasheets = datasheets
         self._keys = keys
-        self._row_macs = seals
+        self._row_macs = row_macs
         self._plant = plant
         self._recorded: dict[bytes, tuple[float, int]] = {}
 
@@ -48,10 +60,10 @@ class Pins:
         pin = entry.fingerprint if entry is not None else None
         if is_whole(pin):
             return pin
-        node = self._store.node(uuid)
+        node = self._nodes.get(uuid)
         if node is None or node.point is None:
             return pin
-        self._row_macs.check_point(node)
+        self._nodes.check_point(node)
         return _wholer(pin, keys.fingerprint(node.point))
 
     def all(self, nodes: Iterable[NodeRecord] | None = None) -> dict[bytes, str]:
@@ -59,7 +71,7 @@ class Pins:
 
         ``nodes`` are all of the store if they have been read already.
         """
-        return self.pinned_among(self._store.nodes() if nodes is None else nodes, self.whitelist())
+        return self.pinned_among(self._nodes.all() if nodes is None else nodes, self.whitelist())
 
     def pinned_among(
         self, nodes: Iterable[NodeRecord | ExportEligibility], entries: Iterable[WhitelistEntry]
@@ -68,7 +80,7 @@ class Pins:
         pins: dict[bytes, str] = {}
         for node in nodes:
             if node.point is not None:
-                self._row_macs.check_point(node)
+                self._nodes.check_point(node)
                 pins[node.uuid] = keys.fingerprint(node.point)
         for entry in entries:
             if entry.fingerprint is not None:
@@ -96,27 +108,42 @@ class Pins:
     # -- the whitelist ---------------------------------------------------------------------------------------------
 
     def whitelist(self) -> list[WhitelistEntry]:
-        """All entries, by UUID."""
-        entries = self._store.whitelist()
+        """Return all entries, by UUID."""
+        entries = self._store.read(WhitelistEntry, "SELECT * FROM whitelist ORDER BY uuid")
         for entry in entries:
-            self._row_macs.check_entry(entry)
+            self._checked(entry)
         return entries
 
     def all_entries(self) -> Iterator[WhitelistEntry]:
-        """All entries, by UUID, a page at a time, for lists."""
-        return map(self._checked, self._store.all_whitelisted())
+        """Give all entries, by UUID, a chunk at a time, for lists; holds no lock between chunks."""
+        after = b""
+        while page := self._store.read(
+            WhitelistEntry, "SELECT * FROM whitelist WHERE uuid > ? ORDER BY uuid LIMIT ?", (after, PAGE)
+        ):
+            yield from map(self._checked, page)
+            after = page[-1].uuid
 
     def _checked(self, entry: WhitelistEntry) -> WhitelistEntry:
-        self._row_macs.check_entry(entry)
+        """Return an entry; raise StoreChangedError if its MAC does not hold. Unchecked with a closed vault."""
+        if not self._row_macs.counts(entry.mac, "whitelist", _bound(entry)):
+            raise changed(
+                [f"the whitelist entry of {entry.uuid.hex()}"], "Remove it from the whitelist and add it again."
+            )
         return entry
 
     def entry(self, uuid: bytes) -> WhitelistEntry | None:
         """Return the whitelist entry of a node, None if it is not on it."""
-        return self._row_macs.check_entry(self._store.whitelisted(uuid))
+        entry = self.row(uuid)
+        return None if entry is None else self._checked(entry)
+
+    def row(self, uuid: bytes) -> WhitelistEntry | None:
+        """As :meth:`entry`, whatever its MAC: for what replaces or removes it."""
+        return self._store.read_one(WhitelistEntry, "SELECT * FROM whitelist WHERE uuid = ?", (uuid,))
 
     def get_many(self, uuids: Sequence[bytes]) -> dict[bytes, WhitelistEntry]:
-        """Return the entries of a batch of nodes, by UUID."""
-        return {uuid: self._checked(entry) for uuid, entry in self._store.whitelist_of(uuids).items()}
+        """Return the entries of a chunk of nodes, by UUID."""
+        statement = f"SELECT * FROM whitelist WHERE uuid IN ({places(uuids)})"
+        return {entry.uuid: self._checked(entry) for entry in self._store.read(WhitelistEntry, statement, uuids)}
 
     def put(self, *entries: WhitelistEntry) -> None:
         """Add or replace entries of the whitelist (the vault opens); the caller has held keys against pinned ones."""
@@ -124,11 +151,19 @@ class Pins:
         with self._store.together():
             for entry in entries if self._plant.joined is not None else ():
                 self._report_pin(entry)
-            self._store.put_whitelist_entries(self._row_macs.entry(entry) for entry in entries)
+            self.put_many(entries)
+
+    def put_many(self, entries: Iterable[WhitelistEntry]) -> None:
+        """Add or replace entries, each with its MAC, without a report to the plant; inside a transaction."""
+        self.restore(replace(entry, mac=self._row_macs.mac("whitelist", _bound(entry))) for entry in entries)
+
+    def restore(self, entries: Iterable[WhitelistEntry]) -> None:
+        """Add or replace entries with the MACs that they have: they come from a backup."""
+        self._store.execute_many("INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)", map(_values, entries))
 
     def _report_pin(self, entry: WhitelistEntry) -> None:
         """Report a new pin of this station to the plant."""
-        before = self._store.whitelisted(entry.uuid)
+        before = self.row(entry.uuid)
         if entry.name != (before.name if before is not None else None):
             self._plant.record_name(entry.uuid, entry.name)
         if entry.fingerprint is None or not is_whole(entry.fingerprint) or entry.assurance == "registry":
@@ -140,24 +175,31 @@ class Pins:
         """Take a node off the whitelist (the vault opens); False if it was not on it. A contact's key stays pinned."""
         self._row_macs.require()
         with self._store.together():
-            entry = self._store.whitelisted(uuid) if self._plant.joined is not None else None
+            entry = self.row(uuid) if self._plant.joined is not None else None
             if entry is not None and is_whole(entry.fingerprint) and entry.assurance != "registry":
                 self._plant.record_event("unpinned", uuid)
-            return self._store.remove_whitelist(uuid)
+            return self._store.change("DELETE FROM whitelist WHERE uuid = ?", (uuid,)) > 0
+
+    def mac_rows(self) -> Iterator[MacRow]:
+        """Yield every entry, for a check of its MAC."""
+        for entry in self._store.read(WhitelistEntry, "SELECT * FROM whitelist ORDER BY uuid"):
+            yield f"the whitelist entry of {entry.uuid.hex()}", entry.mac, "whitelist", _bound(entry)
 
     # -- a board that was replaced under its UUID ------------------------------------------------------------------
 
     def unpin(self, uuid: bytes) -> None:
         """Forget the pinned key; the link keys that are held still belong to the board that had it."""
         self._row_macs.require()
-        entry, node = self._store.whitelisted(uuid), self._store.node(uuid)  # whatever it is: it is forgotten
+        entry, node = self.row(uuid), self._nodes.get(uuid)  # whatever it is: it is forgotten
         pinned = entry.fingerprint if entry is not None else None
         if not is_whole(pinned) and node is not None and node.point is not None:
             pinned = _wholer(pinned, keys.fingerprint(node.point))
         if pinned is not None and is_whole(pinned):  # with a board that was never met no key was agreed
             self._keys.set_former(uuid, pinned)
-            self._store.drop_draft(uuid)  # it may hold the old board's calibration
-        self._store.unpin_node(uuid)
+            self._datasheets.drop_draft(uuid)  # it may hold the old board's calibration
+        with self._store.together():
+            self._nodes.unpin(uuid)
+            self._datasheets.forget_reading(uuid)  # of the board that it was
 
     def epoch_to_exceed(self, uuid: bytes, pinned: str | None) -> int:
         """Epoch that an agreement must exceed: the active key's, but 0 for a board that it was not agreed with."""
@@ -178,3 +220,7 @@ def _wholer(pin: str | None, seen: str | None) -> str:
     if pin is None or (seen is not None and same_key(pin, seen)):
         return seen or ""
     return pin
+
+
+def _bound(entry: WhitelistEntry) -> Values:
+    return (entry.uuid, entry.fingerprint, entry.assurance, entry.name)

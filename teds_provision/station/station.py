@@ -7,12 +7,16 @@ part          content
 ``keys``      link keys, the CA of each node, other holders, rotations due
 ``pins``      the whitelist, and the pinned key of each UUID
 ``policy``    trusted stations and CAs, the deny list, nodes given away
-``nodes``     each node's record, datasheets and drafts
+``nodes``     each node's record and names
+``datasheets`` what each node had, was read of it last, and is being given
+``firmware_reports`` what each node last reported of its firmware
+``overview``  all that is known of nodes, across the topics
 ``groups``    nodes that are measured together
 ``measurements`` measurements, also after a restart; detection; names
 ``handovers`` bundles that left and came
 ``plant``     the joined registry, and events for its other stations
-``seals``     MACs over the rows that decide whom the station trusts
+``bulk``      many rows of several topics as one change
+``row_macs``  MACs over the rows that decide whom the station trusts
 ============  ======================================================================
 
 Opening a station reads the store only; the vault opens at the first secret.
@@ -38,20 +42,24 @@ from teds_provision.errors import (
     VaultLockedError,
 )
 from teds_provision.lazy import late
+from teds_provision.station.bulk import Bulk
+from teds_provision.station.datasheets import Datasheets
+from teds_provision.station.firmware_reports import FirmwareReports
 from teds_provision.station.groups import Groups
+from teds_provision.station.handovers import Handovers
 from teds_provision.station.identity import DEFAULT_NAME, StationIdentity
 from teds_provision.station.measurements import Measurements
 from teds_provision.station.node_keys import NodeKey, NodeKeys
 from teds_provision.station.nodes import Nodes
+from teds_provision.station.overview import Overview
 from teds_provision.station.pins import Pins
 from teds_provision.station.plant.plant import Plant
 from teds_provision.station.policy import Policy
 from teds_provision.station.row_macs import RowMacs
-from teds_provision.station.store import AuditLog, BulkRows, Handover, KeyRecord, NodeLock, Store, StoreLock
+from teds_provision.station.store import AuditLog, KeyRecord, NodeLock, Store, StoreLock
 from teds_provision.station.store.background_writer import BackgroundWriter
 from teds_provision.station.store.database import has_store
-from teds_provision.station.store.dump import dump
-from teds_provision.station.store.records import Direction
+from teds_provision.station.store.dump import RowSource, dump, load
 from teds_provision.vault.base import node_key_context
 
 if TYPE_CHECKING:
@@ -60,42 +68,6 @@ if TYPE_CHECKING:
     from teds_provision.vault.master import MasterKeys
 else:  # cryptography: not for commands that only list
     keys = late("teds_provision.protocol.keys")
-
-
-class Handovers:
-    """Bundles that left and came, and the many rows that one of them brings at once."""
-
-    def __init__(self, store: Store, keys: NodeKeys, seals: RowMacs) -> None:
-        self._store = store
-        self._keys = keys
-        self._row_macs = seals
-
-    def all(self) -> list[Handover]:
-        """Every bundle that left or came, oldest first."""
-        return self._store.handovers()
-
-    def get(self, handover_id: str, direction: Direction) -> Handover | None:
-        """One bundle, None if it is not known."""
-        return self._store.handover(handover_id, direction)
-
-    def put(self, handover: Handover) -> None:
-        """Add or replace a bundle."""
-        self._store.put_handover(handover)
-
-    def remove(self, handover_id: str, direction: Direction) -> bool:
-        """Forget a bundle; False if there is none."""
-        return self._store.remove_handover(handover_id, direction)
-
-    def take_in(self, batch: BulkRows) -> None:
-        """Add or replace many rows, all or none; the caller has held them against what is there."""
-        with self._store.transaction():
-            seals = self._row_macs
-            self._store.put_bulk(
-                batch,
-                seal_node=lambda node: seals.point(node.uuid, node.point) if node.point else None,
-                seal_entry=seals.of_entry,
-            )
-            self._keys.set_flags(batch.key_flags)
 
 
 __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", "not_initialised"]
@@ -130,17 +102,32 @@ class Station:
         self.use_agent = True
         """True if an agent's secret (``unlock``) opens the vault; False if the passphrase itself is asked for."""
         store.notice = lambda text: self.notice(text)  # noqa: PLW0108 - it is replaced later
-        self.row_macs = RowMacs(store, self._opened, tell)
+        self.row_macs = RowMacs(self._opened)
         self.identity = StationIdentity(store, self._opened, self.row_macs)
         self.plant = Plant(store, self.current_vault, self.identity, self.row_macs)
-        self.row_macs.sources.append(self.plant.mac_rows)
-        self.keys = NodeKeys(store, self._opened, self.identity, self.row_macs, self._reopened, self.plant)
-        self.pins = Pins(store, self.keys, self.row_macs, self.plant)
-        self.policy = Policy(store, self.identity, self.keys, self.pins, self.row_macs, self.plant)
         self.nodes = Nodes(store, self.row_macs, self.plant)
+        self.firmware_reports = FirmwareReports(store, self.row_macs)
+        self.datasheets = Datasheets(store, self.nodes, self.firmware_reports)
+        self.keys = NodeKeys(store, self._opened, self.identity, self.row_macs, self._reopened, self.plant)
+        self.pins = Pins(store, self.nodes, self.datasheets, self.keys, self.row_macs, self.plant)
+        self.handovers = Handovers(store)
+        self.policy = Policy(
+            store, self.identity, self.keys, self.pins, self.handovers, self.row_macs, self.plant, tell
+        )
         self.groups = Groups(store, store.home, self.plant)
         self.measurements = Measurements(store, self.groups, store.home)
-        self.handovers = Handovers(store, self.keys, self.row_macs)
+        self.overview = Overview(store)
+        self.bulk = Bulk(store, self.nodes, self.pins, self.keys, self.policy, self.groups)
+        self.row_macs.sources = (
+            self.identity.mac_rows,
+            self.policy.mac_rows,
+            self.pins.mac_rows,
+            self.nodes.mac_rows,
+            self.keys.mac_rows,
+            self.firmware_reports.mac_rows,
+            self.policy.decision_rows,
+            self.plant.mac_rows,
+        )
 
     @classmethod
     def open(cls, home: Path, *, ask: Ask, tell: Callable[[str], object] = lambda text: None) -> Station:
@@ -156,6 +143,19 @@ class Station:
             station.close()
             raise not_certified() if asked else not_initialised(home)
         return station
+
+    @classmethod
+    def make(cls, home: Path, *, ask: Ask | None = None) -> Station:
+        """Open the station of ``home``, as far as init has come; its store is made if it is missing."""
+        return cls(Store.open(home, create=True), ask or _ask_no_one)
+
+    @classmethod
+    def of_backup(cls, rows: RowSource) -> Station:
+        """Return the station in a backup, as a private copy without a vault.
+
+        Raises BadDataError (form, unknown tables, rows that break a rule), StoreError.
+        """
+        return cls(load(rows), _ask_no_one)
 
     @classmethod
     def inspect(cls, home: Path, *, ask: Ask | None = None) -> Station:
@@ -228,22 +228,23 @@ class Station:
 
     def adopt(self, vault: Vault) -> None:
         """Use a vault that is open; raises StoreChangedError if the store no longer matches it."""
-        self._vault = vault  # the seals below are made and checked with it
+        self._vault = vault  # row MACs are made and checked with it
         try:
-            self._look_at_seals(vault)
+            self._check_row_macs(vault)
         except BaseException:
             self._vault = None
             raise
 
-    def _look_at_seals(self, vault: Vault) -> None:
+    def _check_row_macs(self, vault: Vault) -> None:
         try:
-            self.row_macs.unlocked(vault)
+            self.identity.unlocked(vault)
         except (
             UnknownMasterKeyError
         ):  # between the opening of the vault and this look another command changed the master key
             if not vault.refresh():
                 raise
-            self.row_macs.unlocked(vault)
+            self.identity.unlocked(vault)
+        self.policy.unlocked()
 
     def ask_by(self, ask: Ask) -> None:
         """Ask for the passphrase by another function from now on."""
@@ -280,7 +281,7 @@ class Station:
     def accept_masters(self, masters: MasterKeys) -> bool:
         """Use master keys that a command of this user hands over; False if they are not those of this store.
 
-        They are if the sender knows one that is in use here, or if they open the key that seals this store's rows.
+        They are if the sender knows one that is in use here, or if they open the key of this store's row MACs.
         """
         with self._opening:
             vault = self._vault
@@ -290,7 +291,7 @@ class Station:
             common = here.keys() & masters.keys.keys()
             if any(here[number] != masters.keys[number] for number in common):
                 return False
-            if not common and not self.row_macs.opened_by(masters):
+            if not common and not self.identity.opened_by(masters):
                 return False
             vault.accept(masters)
             return True
@@ -306,6 +307,10 @@ class Station:
     def credentials(self, uuid: bytes | None = None) -> wire_agreement.Credentials:
         """Return the credentials for node ``uuid`` under the CA that this node keeps, else the station's own."""
         return self.identity.credentials(None if uuid is None else self.keys.ca_of(uuid))
+
+    def damage(self) -> str | None:
+        """Return what is wrong with the store's file, None if nothing (for doctor)."""
+        return self._store.damage()
 
     def version(self) -> int:
         """Return a number that changes exactly when another process has changed the store: earlier plans are stale."""
@@ -449,7 +454,7 @@ def initialise(
 
     Each part is durable before the next begins, so that an interrupted init is carried on by the same command.
     """
-    station = Station(Store.open(home, create=True), ask)
+    station = Station.make(home, ask=ask)
     if station.identity.is_complete():
         return station, station.identity.keystore_why
     told: set[str] = set()
@@ -524,7 +529,7 @@ def rewrap(station: Station) -> RewrapResult:
         return vault.wrap(key, context=context)
 
     count = station.keys.wrap_anew(anew)
-    station.row_macs.rewrap(vault)
+    identity.rewrap(vault)
     station.plant.rewrap(vault)
     vault.retire_masters()
     vaults.master_socket.hand_over(station.home, vault.master_keys())

@@ -357,7 +357,7 @@ def _new_key(
     """Agree on a key; if none is ``demanded``, one that a new node has stored after all is as good."""
     new = who.state == NodeState.FACTORY
     if new:
-        station.plant.require_undisputed(node.uuid)
+        station.policy.require_undisputed(node.uuid)
         station.plant.require_role(
             "line", "cannot key new nodes", "Key it on a station that has this role, then have it handed over"
         )
@@ -531,7 +531,7 @@ def reset_node(station: Station, node: Conversation, who: IdentifiedNode) -> Res
     with station.durable("reset"):
         station.keys.remove(who.uuid)
         station.nodes.remember(who.uuid, state=int(NodeState.FACTORY), retired=None)
-        station.nodes.forget_reading(who.uuid)
+        station.datasheets.forget_reading(who.uuid)
         told = {"challenge": receipt.challenge.hex(), "proof": receipt.proof.hex()}
         station.plant.record_event("reset", who.uuid, epoch=receipt.epoch, point=who.point.hex(), **told)
         station.audit("reset", who.uuid, "done", epoch=receipt.epoch, **told)

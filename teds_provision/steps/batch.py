@@ -426,7 +426,7 @@ class BatchRun:
         verified = judged is not None and judged.verified.verdict == "authentic"
         if not verified or contact.identity.state != NodeState.PROVISIONED:
             return True
-        image = self._station.nodes.datasheet(uuid)
+        image = self._station.datasheets.datasheet(uuid)
         return image is not None and self._lacks_calibration(uuid, image) is not None
 
     def _board(self, contact: Contact, place: str, questions: Questions) -> BoardResult | None:
@@ -456,7 +456,7 @@ class BatchRun:
 
         It is read in a session, and its datasheet is not signed again by this station.
         """
-        uuid, unread = node.uuid, self._station.nodes.reading(node.uuid) is None
+        uuid, unread = node.uuid, self._station.datasheets.reading(node.uuid) is None
         if not unread or node.identity.state != NodeState.PROVISIONED or not self.prepared.order.names_nothing:
             return False
         if self.progress is not None or self.line is not None or not self._station.keys.held(uuid):
@@ -573,7 +573,7 @@ def _progress(station: Station, request: ProvisionRequest, order: BuildOrder) ->
 
 def _has_it_already(station: Station, row: SheetRow, uuid: bytes) -> bool:
     """Return True if the board's last known datasheet is what its row of the sheet gives."""
-    image = station.nodes.datasheet(uuid)
+    image = station.datasheets.datasheet(uuid)
     if image is None:
         return False
     try:

@@ -150,7 +150,7 @@ def topic_warnings(station: Station, has: Image | None, wanted: Image) -> tuple[
     names = station.measurements.names_of(wanted.uuid)
     if not any(names):
         return ()
-    before = has if has is not None and _describes(has.blocks) else station.nodes.datasheet(wanted.uuid)
+    before = has if has is not None and _describes(has.blocks) else station.datasheets.datasheet(wanted.uuid)
     if before is None:
         return ()
     old, new = ({channel.number: channel for channel in Sheet.from_image(image).channels} for image in (before, wanted))
@@ -227,14 +227,14 @@ def is_remembered(station: Station, uuid: bytes, wanted: str | None, *, factory:
 
     What was merely built for it does not count; what was written, or came in a bundle, does.
     """
-    history = station.nodes.history(uuid)
+    history = station.datasheets.history(uuid)
     if factory and history:
         return True
     written = next((record.profile for record in history if record.profile is not None), None)
     record = station.nodes.get(uuid)
     known = record.profile if record is not None else None
     wanted = wanted or known
-    brought = written is None and known == wanted and station.nodes.draft(uuid) is None
+    brought = written is None and known == wanted and station.datasheets.draft(uuid) is None
     return wanted is not None and (written == wanted or brought)
 
 

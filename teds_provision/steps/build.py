@@ -591,7 +591,7 @@ def build(
         told = differences(has.blocks, prepared.profile, prepared.calibrations or ())
         if told and not is_remembered(station, uuid, order.profile, factory=False):
             (retype or require_board_type)(uuid, told)
-    pending, draft = pending_image(station, uuid, has), station.nodes.draft(uuid)
+    pending, draft = pending_image(station, uuid, has), station.datasheets.draft(uuid)
     name = own_name(station, pending, draft.profile) if pending is not None and draft is not None else None
     plan = compose(station, uuid, prepared, pending or has, name=name, edition=edition)
     image = Image(uuid, dict(plan.blocks))
@@ -610,7 +610,7 @@ def build(
         if has is None or not has.unsigned_blocks():  # of a node with a datasheet the store keeps what is on it
             facts = {"profile": plan.wanted, "profile_digest": plan.digest, "name": plan.name}
             station.nodes.remember(uuid, **{fact: value for fact, value in facts.items() if value is not None})
-        station.nodes.keep_draft(Draft(uuid, image, "built", plan.wanted))
+        station.datasheets.keep_draft(Draft(uuid, image, "built", plan.wanted))
         station.audit("build", uuid, "done", profile=built.profile, teds=image.digest())
     return built
 
@@ -706,7 +706,7 @@ def _mended(station: Station, prepared: PreparedOrder, present: NodeSnapshot) ->
         shown = None
     if octets is None or shown is None or not shown.signed or not prepared.order.names_nothing:
         return None
-    for record in station.nodes.history(uuid):
+    for record in station.datasheets.history(uuid):
         blocks = record.image.unsigned_blocks()
         if datasheet.digests(blocks) != shown.signed_blocks:
             continue
@@ -730,7 +730,7 @@ def _composed(
     """Everything by profile; ``resume``: with the calibration of a run that never came to write."""
     uuid, has = present.image.uuid, present.image
     pending = pending_image(station, uuid, has) if resume else None
-    source = station.nodes.draft(uuid) if pending is not None else station.nodes.get(uuid)
+    source = station.datasheets.draft(uuid) if pending is not None else station.nodes.get(uuid)
     name = own_name(station, pending or has, source.profile if source is not None else None)
     plan = compose(station, uuid, prepared, pending or has, name=name, as_known=resume)
     image = Image(uuid, {**keep, **plan.blocks})
@@ -744,7 +744,7 @@ def _as_it_is(station: Station, present: NodeSnapshot, keep: Mapping[BlockId, by
     pending = pending_image(station, uuid, has)
     if pending is None or pending.unsigned_blocks() == has.unsigned_blocks():
         return Proposal(Image(uuid, has.unsigned_blocks()), (), named=True)
-    draft = station.nodes.draft(uuid)
+    draft = station.datasheets.draft(uuid)
     image = Image(uuid, {**keep, **pending.unsigned_blocks()})
     profile = draft.profile if draft is not None else None
     return Proposal(image, (), named=False, profile=profile, name=own_name(station, image, profile))
@@ -776,7 +776,7 @@ def _only_what_is_named(
 
 def pending_image(station: Station, uuid: bytes, has: Image | None) -> Image | None:
     """Return an unwritten image of an earlier run: it determines the intended calibration, not the node."""
-    draft = station.nodes.draft(uuid)
+    draft = station.datasheets.draft(uuid)
     if draft is None:
         return None
     image = draft.image

@@ -235,7 +235,7 @@ def _identified(station: Station, node: Conversation, add: bool) -> ProvenNode:
     known = station.nodes.get(who.uuid)
     name = (known.name if known else None) or described.name
     facts: dict[str, object] = {}
-    read = station.nodes.reading(who.uuid)
+    read = station.datasheets.reading(who.uuid)
     if read is None or not read.is_datasheet:  # nothing is verified here: it fills in what is not known better
         facts["channels"] = described.channels
         if name is not None and station.nodes.all_named(name) in ([], [who.uuid]):
@@ -523,7 +523,7 @@ class WriteReport:
 
 def _wanted(station: Station, uuid: bytes, file: Path | None) -> tuple[Image, dict[str, object]]:
     """Return the signed image to write to a node, and the facts to record once it is written."""
-    draft = station.nodes.draft(uuid)
+    draft = station.datasheets.draft(uuid)
     profile = draft.profile if draft is not None else None
     facts: dict[str, object] = {}
     if file is not None:
@@ -654,7 +654,7 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
     """
     uuid = order.uuid
     station.policy.require_whitelisted(uuid)
-    draft = station.nodes.draft(uuid)
+    draft = station.datasheets.draft(uuid)
     known = known_image(station, uuid)
     image = order.image or (draft.image if draft is not None else known)
     if image is None or not image.unsigned_blocks():
@@ -752,7 +752,7 @@ def _keep(station: Station, order: SignOrder, signed: SignResult, draft: Draft |
     record = station.nodes.get(uuid)
     profile = draft.profile if draft is not None else record.profile if record is not None else None
     with station.durable("sign"):
-        station.nodes.keep_draft(Draft(uuid, signed.image, "signed", profile))
+        station.datasheets.keep_draft(Draft(uuid, signed.image, "signed", profile))
 
 
 def _sequence_of(has: Image | None) -> int:
@@ -781,10 +781,10 @@ class DroppedDraft:
 def drop_draft(station: Station, node: str, *, dry_run: bool = False) -> DroppedDraft:
     """Drop what was built for the node that ``node`` names and never written."""
     uuid = station.nodes.resolve(node)
-    draft = station.nodes.draft(uuid)
+    draft = station.datasheets.draft(uuid)
     if draft is not None and not dry_run:
         with station.durable("draft"):
-            station.nodes.drop_draft(uuid)
+            station.datasheets.drop_draft(uuid)
             station.audit("draft", uuid, "dropped", stage=draft.stage, profile=draft.profile)
     return DroppedDraft(uuid, draft)
 
@@ -792,7 +792,7 @@ def drop_draft(station: Station, node: str, *, dry_run: bool = False) -> Dropped
 def history_of(station: Station, node: str) -> tuple[bytes, list[DatasheetRecord]]:
     """Return the datasheets of the node that ``node`` names, newest first."""
     uuid = station.nodes.resolve(node)
-    return uuid, station.nodes.history(uuid)
+    return uuid, station.datasheets.history(uuid)
 
 
 @dataclass(frozen=True)
@@ -806,7 +806,7 @@ class RestoredDatasheet:
 
 
 def _record_of(station: Station, uuid: bytes, sequence: int) -> DatasheetRecord:
-    known = station.nodes.history(uuid)
+    known = station.datasheets.history(uuid)
     for record in known:
         if record.sequence == sequence:
             return record
@@ -827,7 +827,7 @@ def restore_datasheet(
     station.policy.require_whitelisted(uuid)
     record = _record_of(station, uuid, sequence)
     if dry_run:
-        now = station.nodes.datasheet(uuid)
+        now = station.datasheets.datasheet(uuid)
         before = now.unsigned_blocks() if now is not None else {}
         return RestoredDatasheet(uuid, sequence, tuple(diff_blocks(before, record.image.unsigned_blocks())), None)
     with at_node(station, links.after_agreeing(), uuid, reporter, unlock="always", writes="write") as visit:

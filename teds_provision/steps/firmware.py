@@ -99,4 +99,4 @@ def require_firmware(uuid: bytes, demand: FirmwareDemand | None, reading: Firmwa
 def keep_firmware(station: Station, uuid: bytes, reading: FirmwareReading | None, *, signed: bool = False) -> None:
     """Keep a node's answer. ``signed``: its datasheet was signed now, under this firmware."""
     if reading is not None:
-        station.nodes.keep_firmware(uuid, reading.payload, in_session=reading.sealed, signed=signed)
+        station.firmware_reports.keep(uuid, reading.payload, in_session=reading.sealed, signed=signed)

@@ -149,7 +149,7 @@ def examine(station: Station, node: Conversation) -> IdentifiedNode:
 
 def known_key(station: Station, uuid: bytes) -> bytes | None:
     """Return P(node) of the Security TEDS last read from this UUID, None if there is none of this profile."""
-    row = station.nodes.reading(uuid)
+    row = station.datasheets.reading(uuid)
     return row.node_key if row is not None else None
 
 

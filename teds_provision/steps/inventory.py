@@ -15,8 +15,8 @@ from teds_provision import teds
 from teds_provision.errors import NotFoundError, PolicyError
 from teds_provision.lazy import late
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.overview import NodeOverview, Search
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeOverview, Search
 
 if TYPE_CHECKING:
     from teds_provision.station import firmware
@@ -42,9 +42,9 @@ def search(station: Station, text: str | None = None, *, state: str | None = Non
     """
     number: str | int | None = NodeState[state.upper()].value if state in STATES[:3] else state
     if text is None:
-        return station.nodes.find(Search(state=number, **more))
+        return station.overview.find(Search(state=number, **more))
     exact = _exact(station, text) if number is None and not any(more.values()) else None
-    found = [exact] if exact is not None else station.nodes.find(Search(text, number, **more))
+    found = [exact] if exact is not None else station.overview.find(Search(text, number, **more))
     if not found:
         raise NotFoundError(f"No node matches {text!r}.", hint="See: teds-provision nodes.")
     return found
@@ -53,7 +53,7 @@ def search(station: Station, text: str | None = None, *, state: str | None = Non
 def _exact(station: Station, text: str) -> bytes | None:
     digits = text.strip().lower().removeprefix("0x")
     if len(digits) == _UUID_DIGITS and not set(digits) - set("0123456789abcdef"):
-        return bytes.fromhex(digits) if station.nodes.is_known(bytes.fromhex(digits)) else None
+        return bytes.fromhex(digits) if station.overview.is_known(bytes.fromhex(digits)) else None
     return station.nodes.named(text)
 
 
@@ -64,14 +64,14 @@ def inventory(station: Station, uuids: Sequence[bytes]) -> Iterator[dict[str, An
 
 def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[dict[str, Any], NodeVerdict | None]]:
     """Yield the rows of :func:`inventory`, each with the whole verdict; None if no datasheet of the node was read."""
-    known = station.nodes.overview(uuids)
+    known = station.overview.nodes(uuids)
     demands = firmware.FirmwareDemands(station.home)
     while page := list(islice(known, PAGE)):
         listed = [overview.uuid for overview in page]
         judged = readings.verdicts_of(
             station, listed, [overview.uuid for overview in page if overview.keys and overview.moved is None]
         )
-        reported = station.nodes.firmware_of(listed)
+        reported = station.firmware_reports.get_many(listed)
         for overview in page:
             found, record = judged.get(overview.uuid), reported.get(overview.uuid)
             node = _described(overview, found)
@@ -149,7 +149,7 @@ def fits_of(
     """Judge the last known datasheet of each node; ``skipped`` if there is none."""
     asked = tuple(requirements)
     for uuid in uuids:
-        image = station.nodes.datasheet(uuid)
+        image = station.datasheets.datasheet(uuid)
         sheet = teds.sheet.Sheet.from_image(image) if image is not None else None
         for requirement in asked:
             if sheet is None or not sheet.channels:

@@ -424,7 +424,7 @@ class _Run:
                 step.result = NOTHING if elsewhere.reused else DONE
                 step.detail = f"sequence {elsewhere.sequence}, by the office"
                 return elsewhere
-            draft = self.station.nodes.draft(who.uuid)
+            draft = self.station.datasheets.draft(who.uuid)
             earlier = draft.image.blocks.get(SECURITY) if draft is not None and draft.stage == "signed" else None
             # a node whose TEDS are not what it was signed for takes them only under a newer sequence
             intact = present.image.unsigned_blocks() == proposal.image.unsigned_blocks()

@@ -116,19 +116,19 @@ def keep_judged(
 ) -> None:
     """Keep what :func:`judge_reading` gave of ``image``."""
     worth = row.in_session and judged.verified.verdict != "not authentic"  # else what it had stays known
-    station.nodes.keep_reading(row, image if worth else None, profile)
+    station.datasheets.keep_reading(row, image if worth else None, profile)
 
 
 def keep_shown(station: Station, uuid: bytes, security_teds: bytes, *, by: str) -> None:
     """Keep the Security TEDS that a node showed in no session: its key, for who builds; it is no datasheet."""
     image = Image(uuid, {SECURITY: security_teds})
     signers = static_checks(image, None)[1]
-    station.nodes.keep_reading(NodeReading(uuid, utc_now(), by, None, False, _packed(image), *signers))
+    station.datasheets.keep_reading(NodeReading(uuid, utc_now(), by, None, False, _packed(image), *signers))
 
 
 def is_known(station: Station, node: Conversation, image: Image) -> bool:
     """Return True if the row has this already: the same TEDS, all of them read since the node last started."""
-    row = station.nodes.reading(image.uuid)
+    row = station.datasheets.reading(image.uuid)
     return (
         row is not None
         and row.whole
@@ -146,7 +146,7 @@ def cached_image_if_current(
     Every TEDS of field 108 is in it, with the digest that was read last. If the session's c shows a restart since, that
     is recorded: the verdict is ``kept`` then. None: all of it has to be read.
     """
-    row, image = station.nodes.reading(node.uuid), station.nodes.datasheet(node.uuid)
+    row, image = station.datasheets.reading(node.uuid), station.datasheets.datasheet(node.uuid)
     if row is None or image is None or not row.in_session or node.open_counter is None:
         return None
     if image.security != security_teds or _packed(image) != row.digests or row.failed - MERELY_UNSIGNED:
@@ -155,13 +155,13 @@ def cached_image_if_current(
     if {check.name for check in said if check.result == "failed"} - MERELY_UNSIGNED:
         return None
     if not row.is_of_this_start(node.open_counter):
-        station.nodes.started_anew(node.uuid, node.open_counter)
+        station.datasheets.started_anew(node.uuid, node.open_counter)
     return image
 
 
 def verdict_of(station: Station, uuid: bytes) -> NodeVerdict | None:
     """Return today's verdict on a node from its reading; None if no datasheet of it was read."""
-    row = station.nodes.reading(uuid)
+    row = station.datasheets.reading(uuid)
     if row is None or not row.is_datasheet:
         return None
     return _judged(station, row, keyed=is_keyed(station, uuid))
@@ -174,7 +174,7 @@ def is_keyed(station: Station, uuid: bytes) -> bool:
 
 def verdicts_of(station: Station, uuids: Sequence[bytes], keyed: Iterable[bytes]) -> dict[bytes, NodeVerdict]:
     """As :func:`verdict_of`, of a page of nodes; ``keyed`` are those of which a key is held."""
-    rows = [row for row in station.nodes.readings_of(uuids).values() if row.is_datasheet]
+    rows = [row for row in station.datasheets.readings_of(uuids).values() if row.is_datasheet]
     if not rows:
         return {}
     held = set(keyed)

@@ -58,7 +58,7 @@ def known_node_keys(station: Station, uuid: bytes, image: Image | None = None) -
             keys = node_keys_of(uuid, source.security)
             station.pins.check(uuid, keys.key)
             return keys
-    row = station.nodes.reading(uuid)
+    row = station.datasheets.reading(uuid)
     if row is not None and row.node_key is not None and row.node_key_signature is not None:
         if not node_key_good(uuid, row.node_key, row.node_key_signature):
             raise BadDataError(f"The Security TEDS of {uuid.hex()} belongs to another node (field 102).")
@@ -72,7 +72,7 @@ def known_node_keys(station: Station, uuid: bytes, image: Image | None = None) -
 
 def known_image(station: Station, uuid: bytes) -> Image | None:
     """Return the image of a node when it was last read, None if it never was."""
-    return station.nodes.datasheet(uuid)
+    return station.datasheets.datasheet(uuid)
 
 
 def unsigned_security(station: Station, keys: SignedNodeKey, image: Image) -> bytes:
@@ -150,7 +150,7 @@ def sign(
         made = image.with_block(SECURITY, sign_datasheet(unsigned, keys.uuid, credentials))
         station.nodes.remember(keys.uuid, sequence=number)
         if keep_draft:
-            station.nodes.keep_draft(Draft(keys.uuid, made, "signed", profile))
+            station.datasheets.keep_draft(Draft(keys.uuid, made, "signed", profile))
         digest = hashlib.sha256(made.blocks[SECURITY]).hexdigest()
         of_unit = {} if unit is None else dict(zip(("job", "unit"), unit, strict=True))
         station.plant.record_event("signed", keys.uuid, epoch=epoch, sequence=number, teds_sha256=digest, **of_unit)

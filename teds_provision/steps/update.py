@@ -336,7 +336,7 @@ class _Update:
     def _note(self, node: Conversation, *, as_kept: bool) -> _BeforeRestart:
         """Return what the board is before its restart; ``as_kept``: it has restarted, and the store knows it."""
         identity, security = read_identity(node), read_block(node, SECURITY)
-        datasheet = self._station.nodes.datasheet(self._uuid) if identity.state == NodeState.PROVISIONED else None
+        datasheet = self._station.datasheets.datasheet(self._uuid) if identity.state == NodeState.PROVISIONED else None
         if as_kept and datasheet is not None and datasheet.security is not None:
             security = datasheet.security
         elif identity.state == NodeState.PROVISIONED and (datasheet is None or datasheet.security != security):

@@ -137,7 +137,7 @@ def verify_node(
         with station.durable("verify"):
             readings.keep_judged(station, row, judged, image)
             keep_firmware(station, image.uuid, firmware)
-            kept = station.nodes.reading(image.uuid)
+            kept = station.datasheets.reading(image.uuid)
             if identity is not None or (kept is not None and not kept.in_session):
                 station.nodes.remember(image.uuid, **_facts(image, identity))
             station.audit("verify", image.uuid, judged.verified.verdict)

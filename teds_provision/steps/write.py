@@ -165,9 +165,9 @@ def _conclude(
                 keep_firmware(station, image.uuid, firmware, signed=True)
                 _tell_written(station, image, known, sequence)
                 # A draft that is on the node now is none any more; a newer trial stays
-                draft = station.nodes.draft(image.uuid)
+                draft = station.datasheets.draft(image.uuid)
                 if draft is not None and draft.image.unsigned_blocks() == image.unsigned_blocks():
-                    station.nodes.drop_draft(image.uuid)
+                    station.datasheets.drop_draft(image.uuid)
                 station.audit("write", image.uuid, "done", octets=octets, sequence=sequence)
 
     station.run_in_background(record)  # the next verification has the node prove its key meanwhile

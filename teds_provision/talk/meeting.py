@@ -255,7 +255,7 @@ def pick_single_node(station: Station, contacts: list[Contact]) -> Contact:
 
 
 def _finished(station: Station, identity: Identity) -> bool:
-    return identity.state == NodeState.PROVISIONED and station.nodes.reads_well(identity.uuid)
+    return identity.state == NodeState.PROVISIONED and station.datasheets.reads_well(identity.uuid)
 
 
 # -- tap first, then over BLE (profile.md, "BLE") ------------------------------------------------------------------

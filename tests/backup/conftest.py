@@ -25,10 +25,10 @@ def station(tmp_path: Path) -> Iterator[Station]:
         made.pins.put(WhitelistEntry(uuid, assurance="tap"))
         made.nodes.put(NodeRecord(uuid, POINT, state=2, epoch=1, sequence=5))
         add_key(made, uuid, 1)
-        made.nodes.keep_datasheet(Image(uuid))
+        made.datasheets.keep_datasheet(Image(uuid))
     add_key(made, TWO, 2, active=False)
     made.policy.trust(TrustRecord("owner", "ca", POINT, "ab" * 32))
-    made.nodes.keep_draft(Draft(ONE, Image(ONE)))
+    made.datasheets.keep_draft(Draft(ONE, Image(ONE)))
     made.audit("test", ONE, "ready")
     yield made
     made.close()

@@ -17,8 +17,7 @@ from teds_provision.backup.sealed_file import SealedFile, Sealer
 from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError, WrongPassphraseError
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeRecord, Store
-from teds_provision.station.store import dump as rows
+from teds_provision.station.store import NodeRecord
 from tests.backup.backups import ONE, POINT, TWO, back_up, copy_of, opened, opened_octets, restored_into
 
 
@@ -95,11 +94,11 @@ def test_a_backup_that_another_key_has_signed_is_not_the_stations(station: Stati
     back_up(station, path, recovery.point)
     sealer = Sealer(recovery=recovery.point)
     with SealedFile(path).open_with_key(recovery) as real, path.open("wb") as file:
-        backup_file.write(file, real, rows.dump(real.copy), forger, sealer)
+        backup_file.write(file, real, real.copy.rows(), forger, sealer)
     with pytest.raises(NotAuthenticError, match="not signed"):
         SealedFile(path).open_with_key(recovery)
     with copy_of(station, tmp_path) as real, path.open("wb") as file:
-        backup_file.write(file, replace(real, point=forger.point), rows.dump(real.copy), forger, sealer)
+        backup_file.write(file, replace(real, point=forger.point), real.copy.rows(), forger, sealer)
     forged = SealedFile(path).open_with_key(recovery)
     with pytest.raises(PolicyError, match=r"the store in .* is of station"):
         open_present(station.home, forged)
@@ -131,13 +130,13 @@ def test_a_backup_taken_while_the_store_is_written_is_one_moment(station: Statio
     stop, home = threading.Event(), station.home
 
     def write() -> None:
-        with Store.open(home) as store:
+        with Station.inspect(home) as store:
             number = 10
             while not stop.is_set():
                 number += 1
                 with store.transaction():
                     for uuid in (ONE, TWO):
-                        store.put_node(NodeRecord(uuid, POINT, sequence=number))
+                        store.nodes.restore(NodeRecord(uuid, POINT, sequence=number))
                 stop.wait(0.002)  # SQLite's writers wait their turn without a queue
 
     writer = threading.Thread(target=write)
@@ -145,9 +144,9 @@ def test_a_backup_taken_while_the_store_is_written_is_one_moment(station: Statio
     try:
         for _ in range(20):
             with copy_of(station, tmp_path) as content:
-                sequences = {record.sequence for record in content.copy.nodes()}
+                sequences = {record.sequence for record in content.copy.nodes.all()}
                 assert len(sequences) == 1
-                assert content.copy.audit.check().intact
+                assert content.copy.audit_log.check().intact
     finally:
         stop.set()
         writer.join()

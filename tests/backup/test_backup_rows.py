@@ -27,13 +27,13 @@ def test_a_store_of_several_chunks_goes_out_and_comes_back(station: Station, tmp
     filler = {(0, 1): os.urandom(100_000)}
     with station.transaction():
         for number in range(40):
-            station._store.put_draft(Draft(uuid := number.to_bytes(10, "big"), Image(uuid, filler)))
+            station.datasheets.keep_draft(Draft(uuid := number.to_bytes(10, "big"), Image(uuid, filler)))
     done = back_up(station, tmp_path / "b")
     assert done.octets > 3 * CHUNK_OCTETS
     octets = (tmp_path / "b").read_bytes()
     with opened(tmp_path / "b") as content:
-        assert list(rows.dump(content.copy))[1:] != []
-        draft = content.copy.draft((39).to_bytes(10, "big"))
+        assert list(content.copy.rows())[1:] != []
+        draft = content.copy.datasheets.draft((39).to_bytes(10, "big"))
         assert draft is not None
         assert draft.image.blocks == filler
     head = octets.index(b"\n") + 1
@@ -122,8 +122,8 @@ class Octets:
 
 def test_a_dump_comes_back_row_for_row(station: Station) -> None:
     first = b"".join(station.rows())
-    with rows.load(Octets(first)) as copy:
-        assert b"".join(rows.dump(copy)) == first
+    with Station.of_backup(Octets(first)) as copy:
+        assert b"".join(copy.rows()) == first
 
 
 def head(tables: dict[str, list[str]], schema: object = SCHEMA_VERSION) -> bytes:

@@ -9,9 +9,9 @@ import pytest
 
 from teds_provision.backup.restore import open_present
 from teds_provision.errors import NotFoundError, StoreError
+from teds_provision.station.snapshot import place
 from teds_provision.station.station import Station
 from teds_provision.station.store import Store
-from teds_provision.station.store.snapshot import place
 from teds_provision.vault import forget_vaults
 from tests.backup.backups import ONE, POINT, TWO, ask, back_up, copy_of, keys_of, opened, restored_into
 

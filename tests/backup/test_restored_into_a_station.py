@@ -13,9 +13,9 @@ from teds_provision.backup.backup import backup
 from teds_provision.backup.restore import complete_vault, merge, open_present, rebuild
 from teds_provision.errors import PolicyError, UsageError, VaultError
 from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.station.snapshot import Relation, place
 from teds_provision.station.station import Station, initialise
-from teds_provision.station.store import Holder, NodeRecord, RevocationRecord, Store, Tombstone, WhitelistEntry
-from teds_provision.station.store.snapshot import Relation, place
+from teds_provision.station.store import Holder, NodeRecord, RevocationRecord, Tombstone, WhitelistEntry
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
 from teds_provision.vault.software import SoftwareVault
@@ -28,25 +28,25 @@ from ..vault.softhsm import PIN, loaded, unload
 def test_restoring_the_present_state_is_nothing_to_do(station: Station, tmp_path: Path) -> None:
     back_up(station, tmp_path / "b")
     count = station.audit_log.check().count
-    done = merge(station._store, opened(tmp_path / "b"), dry_run=False)
+    done = merge(station, opened(tmp_path / "b"), dry_run=False)
     assert (done.action, done.relation, done.back) == ("nothing", Relation.OLDER, {})
     assert station.audit_log.check().count == count
 
 
 def test_an_older_state_brings_back_what_is_missing_and_nothing_goes_back(station: Station, tmp_path: Path) -> None:
     back_up(station, tmp_path / "b")
-    store = station._store
-    store.remove_whitelist(ONE)
-    store.remove_trust("owner")
+    store = station
+    store.pins.remove(ONE)
+    store.policy.distrust("owner")
     add_key(station, ONE, 2)  # rotated since: the key of epoch 1 is gone
-    store.put_node(NodeRecord(ONE, POINT, epoch=2, sequence=9))
+    store.nodes.restore(NodeRecord(ONE, POINT, epoch=2, sequence=9))
     add_key(station, NEW, 1)
-    store.put_whitelist(WhitelistEntry(NEW, assurance="tap"))
-    store.put_tombstone(Tombstone(TWO, "cd" * 32, "id"))
+    store.pins.restore([WhitelistEntry(NEW, assurance="tap")])
+    store.policy.put_tombstone(Tombstone(TWO, "cd" * 32, "id"))
     station.audit("sign", ONE, "done")
     before = {uuid: keys_of(station, uuid) for uuid in (ONE, TWO, NEW)}
     plan = merge(store, opened(tmp_path / "b"), dry_run=True)
-    assert store.whitelisted(ONE) is None
+    assert store.pins.row(ONE) is None
     done = merge(store, opened(tmp_path / "b"), dry_run=False)
     assert done == plan
     assert done.relation is Relation.OLDER
@@ -54,13 +54,13 @@ def test_an_older_state_brings_back_what_is_missing_and_nothing_goes_back(statio
     assert "older keys left out: 1" in done.kept
     assert "nodes whose epoch or sequence is higher now: 1" in done.kept
     assert "nodes moved away since: 1" in done.kept
-    known = store.node(ONE)
+    known = store.nodes.get(ONE)
     assert known is not None
     assert (known.epoch, known.sequence) == (2, 9)
     assert {uuid: keys_of(station, uuid) for uuid in (ONE, TWO, NEW)} == before
-    assert store.tombstone(TWO) is not None
-    assert store.whitelisted(NEW) is not None
-    assert store.audit.check().intact
+    assert store.policy.tombstone(TWO) is not None
+    assert store.pins.row(NEW) is not None
+    assert store.audit_log.check().intact
 
 
 def test_a_revoked_node_stays_revoked_and_off_the_whitelist(station: Station, tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_a_revoked_node_stays_revoked_and_off_the_whitelist(station: Station, tm
     station.pins.remove(ONE)
     station.keys.remove(ONE)
     station.audit("revoke", ONE, "done")
-    done = merge(station._store, opened(tmp_path / "b"), dry_run=False)
+    done = merge(station, opened(tmp_path / "b"), dry_run=False)
     assert done.action == "nothing"
     assert station.pins.entry(ONE) is None
     assert station.keys.keys_of(ONE) == []
@@ -80,7 +80,7 @@ def test_keys_given_up_since_are_not_brought_back(station: Station, tmp_path: Pa
     back_up(station, tmp_path / "b")
     station.keys.remove(ONE)
     station.audit("decommission", ONE, "done")
-    merge(station._store, opened(tmp_path / "b"), dry_run=False)
+    merge(station, opened(tmp_path / "b"), dry_run=False)
     assert station.keys.keys_of(ONE) == []
 
 
@@ -92,7 +92,7 @@ def test_a_node_that_was_pinned_anew_keeps_its_new_key(station: Station, tmp_pat
     other = SoftwareKey.generate().point
     station.nodes.remember(ONE, point=other)
     station.audit("identify", ONE, "proven")
-    done = merge(station._store, opened(tmp_path / "b"), dry_run=False)
+    done = merge(station, opened(tmp_path / "b"), dry_run=False)
     known = station.nodes.get(ONE)
     assert known is not None
     assert known.point == other
@@ -108,12 +108,12 @@ def test_a_newer_state_brings_a_rolled_back_store_forward(station: Station, tmp_
     shutil.copy(home / "vault.json", stale / "vault.json")
     new_key = add_key(station, ONE, 2)
     station.nodes.put(NodeRecord(ONE, POINT, epoch=2, sequence=9))
-    station._store.put_tombstone(Tombstone(TWO, "cd" * 32, "id"))
+    station.policy.put_tombstone(Tombstone(TWO, "cd" * 32, "id"))
     station.keys.put_holder(Holder(ONE, "cd" * 32))
     station.audit("sign", ONE, "done")
     back_up(station, tmp_path / "b")
     old = Station.open(stale, ask=ask)
-    done = merge(old._store, opened(tmp_path / "b"), dry_run=False)
+    done = merge(old, opened(tmp_path / "b"), dry_run=False)
     assert done.relation is Relation.NEWER
     known = old.nodes.get(ONE)
     assert known is not None
@@ -124,7 +124,7 @@ def test_a_newer_state_brings_a_rolled_back_store_forward(station: Station, tmp_
     assert old.keys.holders(ONE)[0].fingerprint == "cd" * 32
     assert old.audit_log.check().intact
     assert [entry.act for entry in old.audit_log.entries()][-2:] == ["sign", "restore"]
-    assert merge(old._store, opened(tmp_path / "b"), dry_run=False).action == "nothing"
+    assert merge(old, opened(tmp_path / "b"), dry_run=False).action == "nothing"
     old.close()
 
 
@@ -140,7 +140,7 @@ def test_states_that_went_different_ways_keep_both_sides_newest(station: Station
     other = Station.open(stale, ask=ask)
     add_key(other, TWO, 7)
     other.audit("agree", TWO, "done")
-    done = merge(other._store, opened(tmp_path / "b"), dry_run=False)
+    done = merge(other, opened(tmp_path / "b"), dry_run=False)
     assert done.relation is Relation.DIVERGED
     assert {epoch for epoch, _, _ in keys_of(other, ONE)} == {1, 4}
     assert {epoch for epoch, _, _ in keys_of(other, TWO)} == {7}
@@ -169,7 +169,7 @@ def test_master_keys_of_the_backup_join_those_of_the_vault(station: Station, tmp
     software(station).retire_masters()
     software(station).drop_ca()
     forget_vaults()
-    vault = complete_vault(station._store, opened(tmp_path / "b"), ask)
+    vault = complete_vault(station, opened(tmp_path / "b"), ask)
     assert isinstance(vault, SoftwareVault)
     assert len(vault._material.masters.keys) == 2
     assert vault.ca() is None  # it was taken out since, and stays out
@@ -180,7 +180,7 @@ def test_a_vault_that_lacks_nothing_is_left_as_it_is(station: Station, tmp_path:
     software(station).drop_ca()
     before = (station.home / "vault.json").read_bytes()
     forget_vaults()
-    assert complete_vault(station._store, opened(tmp_path / "b"), ask).ca() is None
+    assert complete_vault(station, opened(tmp_path / "b"), ask).ca() is None
     assert (station.home / "vault.json").read_bytes() == before
 
 
@@ -188,7 +188,7 @@ def test_a_lost_vault_comes_back_beside_its_store(station: Station, tmp_path: Pa
     back_up(station, tmp_path / "b")
     (station.home / "vault.json").unlink()
     forget_vaults()
-    assert complete_vault(station._store, opened(tmp_path / "b"), ask).identity().point == station.point
+    assert complete_vault(station, opened(tmp_path / "b"), ask).identity().point == station.point
     again = Station.open(station.home, ask=ask)
     assert keys_of(again, ONE)[0][0] == 1
     again.close()
@@ -201,17 +201,17 @@ def test_marks_on_nodes_do_not_go_back_and_come_forward(station: Station, tmp_pa
     station.keys.demand_rotation(ONE, "due")
     station.keys.demand_rotation(TWO, "due")
     station.audit("test", ONE, "marked")
-    merge(station._store, opened(tmp_path / "old"), dry_run=False)
+    merge(station, opened(tmp_path / "old"), dry_run=False)
     assert station.keys.rotation_due(ONE) == "due"
     back_up(station, tmp_path / "new")
     stale = tmp_path / "stale"
     with opened(tmp_path / "old") as content:
         stale.mkdir(mode=0o700)
         place(content.copy, stale)
-    with Store.open(stale) as store:
+    with Station.inspect(stale) as store:
         done = merge(store, opened(tmp_path / "new"), dry_run=False)
         assert done.relation is Relation.NEWER
-        assert (store.key_flags(ONE).rotation, store.key_flags(TWO).rotation) == ("due", "due")
+        assert (store.keys.rotation_due(ONE), store.keys.rotation_due(TWO)) == ("due", "due")
 
 
 def test_a_key_that_the_vault_does_not_open_is_told_when_backing_up(station: Station, tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.station.store import Draft, KeyRecord, NodeRecord, Store
+from teds_provision.station.station import Station
+from teds_provision.station.store import Draft, KeyRecord, NodeRecord
 from teds_provision.teds.image import Image
 from tests.bench import PASSPHRASE, make_station
 
@@ -174,11 +175,11 @@ def test_killed_at_any_moment_the_home_is_empty_or_the_station(
 
 
 def test_killed_in_the_middle_of_a_merge_the_store_is_old_or_new(home: Path, sealed: Path) -> None:
-    with Store.open(home) as store, store.transaction():
-        store.remove_whitelist(ONE)
+    with Station.inspect(home, ask=lambda prompt, confirm: PASSPHRASE) as store, store.transaction():
+        store.pins.remove(ONE)
         for number in range(3000):
-            store.put_node(NodeRecord(number.to_bytes(10, "big"), sequence=1))
-            store.add_key(KeyRecord(number.to_bytes(10, "big"), 1, f"{number:016x}", "active", 1, b"x" * 40))
+            store.nodes.restore(NodeRecord(number.to_bytes(10, "big"), sequence=1))
+            store.keys.add(KeyRecord(number.to_bytes(10, "big"), 1, f"{number:016x}", "active", 1, b"x" * 40))
     for delay in (0.0, 0.01, 0.03):
         read, write = os.pipe()
         os.write(write, PASSPHRASE.encode() + b"\n")
@@ -206,8 +207,8 @@ def test_killed_in_the_middle_of_a_merge_the_store_is_old_or_new(home: Path, sea
 
 
 def test_a_full_disk_leaves_the_old_backup_and_no_rest(home: Path, sealed: Path, tmp_path: Path) -> None:
-    with Store.open(home) as store:
-        store.put_draft(Draft(ONE, Image(ONE, {(0, 1): os.urandom(300_000)})))
+    with Station.inspect(home) as store:
+        store.datasheets.keep_draft(Draft(ONE, Image(ONE, {(0, 1): os.urandom(300_000)})))
     before, words = sealed.read_bytes(), tmp_path / "words"
     words.write_text(PASSPHRASE + "\n")
     run = f"{sys.executable} -m teds_provision --home {home} --passphrase-fd 3 backup {sealed} --yes 3<{words}"

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import PolicyError
-from teds_provision.station.store import NodeRecord, Store
+from teds_provision.station.station import Station
+from teds_provision.station.store import NodeRecord
 from teds_provision.steps.inventory import NodeFit, require
 from teds_provision.teds.calibration import fit
 from teds_provision.teds.fits import Fit, parse_fits, parse_require
@@ -30,11 +31,11 @@ def image(uuid: bytes, uncertainty: float) -> Image:
 
 @pytest.fixture
 def known(home: Path) -> Path:
-    with Store.open(home) as store:
+    with Station.inspect(home) as store:
         for uuid in (GOOD, COARSE, UNSEEN):
-            store.put_node(NodeRecord(uuid))
+            store.nodes.restore(NodeRecord(uuid))
         for uuid, uncertainty in ((GOOD, 0.5), (COARSE, 5.0)):
-            store.put_datasheet(image(uuid, uncertainty))
+            store.datasheets.put(image(uuid, uncertainty))
     return home
 
 

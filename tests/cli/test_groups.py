@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.station.store import Group, KeptMeasurement, Store
+from teds_provision.station.station import Station
+from teds_provision.station.store import Group, KeptMeasurement
 from tests.terminal import on_terminal
 
 from .shell import call
@@ -17,16 +18,16 @@ ONE = bytes.fromhex("8d4d9da65281f7000000")
 @pytest.fixture
 def measured(home: Path) -> Path:
     """A group with a measurement that the page began, and another one without."""
-    with Store.open(home) as store:
-        store.put_group(Group("crane", (ONE,)))
-        store.put_group(Group("spare", (ONE,)))
-        store.put_measurement(KeptMeasurement("1a2b3c4d", "crane", owner="page"))
+    with Station.inspect(home) as store:
+        store.groups.put(Group("crane", (ONE,)))
+        store.groups.put(Group("spare", (ONE,)))
+        store.measurements.keep(KeptMeasurement("1a2b3c4d", "crane", owner="page"))
     return home
 
 
 def kept(home: Path) -> list[str]:
-    with Store.open(home) as store:
-        return [measurement.id for measurement in store.measurements()]
+    with Station.inspect(home) as store:
+        return [measurement.id for measurement in store.measurements.all()]
 
 
 def test_a_kept_measurement_is_named_and_goes_only_with_a_word(measured: Path) -> None:

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.station.station import Station
 from teds_provision.station.store import (
     Group,
     Holder,
     KeyRecord,
     NodeRecord,
     RevocationRecord,
-    Store,
     Tombstone,
     WhitelistEntry,
 )
@@ -31,8 +31,8 @@ STATION = "cd" * 32
 @pytest.fixture
 def known(home: Path) -> Path:
     """Two nodes: one in daily use, one that was moved away and revoked."""
-    with Store.open(home) as store:
-        store.put_node(
+    with Station.inspect(home) as store:
+        store.nodes.restore(
             NodeRecord(
                 ONE,
                 POINT,
@@ -46,14 +46,14 @@ def known(home: Path) -> Path:
                 channels=4,
             )
         )
-        store.put_group(Group("hand", (ONE,)))
-        store.put_whitelist(WhitelistEntry(ONE, assurance="tap"))
-        store.add_key(KeyRecord(ONE, 3, "ab" * 8, "active", 1, b"wrapped-secret"))
-        store.add_key(KeyRecord(ONE, 4, "cd" * 8, "pending", 2, b"wrapped-secret"))
-        store.put_holder(Holder(ONE, STATION))
-        store.put_node(NodeRecord(TWO, POINT))
-        store.put_tombstone(Tombstone(TWO, STATION, "an-id"))
-        store.put_revocation(RevocationRecord(TWO, None, "lost", "{}"))
+        store.groups.put(Group("hand", (ONE,)))
+        store.pins.restore([WhitelistEntry(ONE, assurance="tap")])
+        store.keys.add(KeyRecord(ONE, 3, "ab" * 8, "active", 1, b"wrapped-secret"))
+        store.keys.add(KeyRecord(ONE, 4, "cd" * 8, "pending", 2, b"wrapped-secret"))
+        store.keys.put_holder(Holder(ONE, STATION))
+        store.nodes.restore(NodeRecord(TWO, POINT))
+        store.policy.put_tombstone(Tombstone(TWO, STATION, "an-id"))
+        store.policy.deny(RevocationRecord(TWO, None, "lost", "{}"))
     return home
 
 
@@ -127,10 +127,10 @@ def test_a_node_that_is_only_whitelisted_can_be_asked_for(home: Path) -> None:
 @pytest.fixture
 def fleet(home: Path) -> Path:
     """Five nodes in five ways known: met, listed, brought by a bundle, moved away, out of service."""
-    with Store.open(home) as store:
+    with Station.inspect(home) as store:
         for number in range(5):
             uuid = bytes([number]) * 10
-            store.put_node(
+            store.nodes.restore(
                 NodeRecord(
                     uuid,
                     POINT,
@@ -141,9 +141,9 @@ def fleet(home: Path) -> Path:
                     due=f"2026-0{number + 1}-15",
                 )
             )
-        store.put_node(NodeRecord(b"\xaa" * 10, POINT, state=2, name="imported"))  # never seen here
-        store.put_group(Group("left hand", (bytes(10), b"\1" * 10)))
-        store.put_tombstone(Tombstone(b"\2" * 10, STATION, "an-id"))
+        store.nodes.restore(NodeRecord(b"\xaa" * 10, POINT, state=2, name="imported"))  # never seen here
+        store.groups.put(Group("left hand", (bytes(10), b"\1" * 10)))
+        store.policy.put_tombstone(Tombstone(b"\2" * 10, STATION, "an-id"))
     return home
 
 
@@ -192,9 +192,9 @@ def test_a_narrow_terminal_drops_columns_and_never_a_digit(fleet: Path) -> None:
 
 
 def test_people_find_nodes_in_the_order_of_their_names(fleet: Path) -> None:
-    with Store.open(fleet) as store:
-        store.put_node(NodeRecord(b"\x01" + b"\xbb" * 9, POINT, name="Finger-10"))
-        store.put_node(NodeRecord(b"\x00" + b"\xbb" * 9, POINT))
+    with Station.inspect(fleet) as store:
+        store.nodes.restore(NodeRecord(b"\x01" + b"\xbb" * 9, POINT, name="Finger-10"))
+        store.nodes.restore(NodeRecord(b"\x00" + b"\xbb" * 9, POINT))
     listed = call(fleet, "nodes").out.splitlines()[1:]
     names = [line.split()[1] for line in listed[:-1]]
     assert names == [*(f"finger-{number}" for number in range(5)), "Finger-10", "imported"]

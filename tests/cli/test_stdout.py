@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.sanitize import printable, sanitize, sanitize_json
+from teds_provision.station.station import Station
 from teds_provision.station.store import NodeRecord, Store
 from tests.bench import PASSPHRASE
 from tests.cli.shell import call, clean_environment
@@ -66,9 +67,9 @@ def test_a_broken_pipe_ends_quietly_with_141_after_the_work(home: Path, run: str
 
 
 def test_a_long_list_into_head(home: Path, run: str) -> None:
-    with Store.open(home) as store, store.transaction():
+    with Station.inspect(home) as store, store.transaction():
         for number in range(2000):
-            store.put_node(NodeRecord(number.to_bytes(10, "big"), name=f"node {number} " + "x" * 80))
+            store.nodes.restore(NodeRecord(number.to_bytes(10, "big"), name=f"node {number} " + "x" * 80))
     for option in ("", "--json"):
         done = shell(f"set -o pipefail; ({run} {option} nodes; echo $? >&2) | head -c 100 >/dev/null")
         assert done.stderr == "141\n"
@@ -93,8 +94,8 @@ def test_cleaned_text_steers_nothing_and_json_still_says_the_same() -> None:
     "words", [("nodes",), ("--json", "nodes"), ("nodes", UUID.hex()), ("--json", "nodes", UUID.hex())]
 )
 def test_a_name_that_steers_terminals_is_cleaned_on_one(home: Path, words: tuple[str, ...]) -> None:
-    with Store.open(home) as store:
-        store.put_node(NodeRecord(UUID, name=STEERING, profile=STEERING, retired=STEERING))
+    with Station.inspect(home) as store:
+        store.nodes.restore(NodeRecord(UUID, name=STEERING, profile=STEERING, retired=STEERING))
     environment = clean_environment(TERM="xterm", NO_COLOR="1", COLUMNS="200")
     told = on_terminal(home, *words, environment=environment)
     assert told.code == 0

@@ -25,6 +25,7 @@ from teds_provision.doctor.station import holds_private_key
 from teds_provision.lazy import REQUIRED, install_command
 from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.station.node_keys import deferred
+from teds_provision.station.station import Station
 from teds_provision.station.store import (
     Draft,
     KeyFlags,
@@ -362,19 +363,19 @@ def test_a_lost_passphrase_file_is_told_without_asking_for_anything(stationed: S
 
 
 def test_nodes_without_a_backup_are_a_warning(stationed: System) -> None:
-    with Store.open(stationed.home) as store:
-        store.put_node(NodeRecord(bytes(10)))
+    with Station.inspect(stationed.home) as store:
+        store.nodes.restore(NodeRecord(bytes(10)))
     backup = next(finding for finding in look(stationed, "store") if finding.name == "backup")
     assert (backup.result, backup.fix) == ("warning", "teds-provision backup FILE")
-    with Store.open(stationed.home) as store:
-        store.audit.append("backup", None, "done")
+    with Station.inspect(stationed.home) as store:
+        store.audit("backup", None, "done")
     assert next(finding for finding in look(stationed, "store") if finding.name == "backup").result == "ok"
 
 
 def test_a_station_whose_keyring_is_gone_is_a_failure(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DBUS_SESSION_BUS_ADDRESS", f"unix:path={stationed.home}/no-bus")
-    with Store.open(stationed.home) as store:
-        store.put_facts(StationRecord("bench", "keyring"))
+    with Station.inspect(stationed.home) as store:
+        store.identity.put(StationRecord("bench", "keyring"))
     found = by_name(stationed)
     assert (found["keyring"].result, found["vault"].result) == ("failed", "failed")
     monkeypatch.setenv("PYTHON_KEYRING_BACKEND", "keyring.backends.null.Keyring")
@@ -382,8 +383,8 @@ def test_a_station_whose_keyring_is_gone_is_a_failure(stationed: System, monkeyp
 
 
 def test_a_token_whose_module_is_missing_is_a_failure(stationed: System) -> None:
-    with Store.open(stationed.home) as store:
-        store.put_facts(StationRecord("bench", "pkcs11:token=bench?module-path=/nowhere/module.so"))
+    with Station.inspect(stationed.home) as store:
+        store.identity.put(StationRecord("bench", "pkcs11:token=bench?module-path=/nowhere/module.so"))
     vault = by_name(stationed)["vault"]
     assert (vault.result, "module" in vault.why) == ("failed", True)
 
@@ -456,13 +457,13 @@ def test_a_store_that_is_gone_beside_its_vault_is_a_failure(stationed: System) -
 
 def test_what_waits_for_somebody_is_told(stationed: System) -> None:
     assert look(stationed, "nodes")[0].result == "ok"
-    with Store.open(stationed.home) as store:
+    with Station.inspect(stationed.home) as store:
         for number in range(3):
-            store.put_node(NodeRecord(bytes([number]) * 10, name="same" if number else "other", due="2020-01-01"))
-        store.put_draft(Draft(bytes(10), Image(bytes(10), {(0, 1): b"x"})))
-        store.add_key(KeyRecord(bytes(10), 1, "ab" * 8, "active", 1, b"wrapped"))
+            store.nodes.restore(NodeRecord(bytes([number]) * 10, name="same" if number else "other", due="2020-01-01"))
+        store.datasheets.keep_draft(Draft(bytes(10), Image(bytes(10), {(0, 1): b"x"})))
+        store.keys.add(KeyRecord(bytes(10), 1, "ab" * 8, "active", 1, b"wrapped"))
         later = deferred(datetime(2099, 1, 1, tzinfo=UTC), "station lost was removed")
-        store.put_key_flags({b"\1" * 10: KeyFlags(rotation="restored"), b"\2" * 10: KeyFlags(rotation=later)})
+        store.keys.put_flags({b"\1" * 10: KeyFlags(rotation="restored"), b"\2" * 10: KeyFlags(rotation=later)})
     found = look(stationed, "nodes")
     said = [finding.why for finding in found]
     counts = [why.split()[0] for why in said]
@@ -479,7 +480,7 @@ def test_seals_are_checked_where_the_passphrase_is_given(stationed: System) -> N
     forget_vaults()
     system = replace(stationed, ask=lambda prompt, confirm: PASSPHRASE)
     assert look(system, "seals")[0].result == "ok"
-    with Store.open(stationed.home) as store:
-        store.put_whitelist(WhitelistEntry(bytes(10), "ab" * 32))
+    with Station.inspect(stationed.home) as store:
+        store.pins.restore([WhitelistEntry(bytes(10), "ab" * 32)])
     found = look(system, "seals")[0]
     assert (found.result, bytes(10).hex() in found.why) == ("failed", True)

@@ -22,7 +22,7 @@ import pytest
 
 from teds_provision.node.firmware.boot_loader import ImageSlots
 from teds_provision.node.node_template import create
-from teds_provision.station.store import Store
+from teds_provision.station import station as base_station
 from tests.bench import PASSPHRASE
 from tests.cli.shell import PROGRAM, ROOT, Outcome, begin
 from tests.firmware.c_node import CNode
@@ -304,13 +304,13 @@ class Station:
 
     def keys(self, uuid: str) -> list[tuple[str, int]]:
         """State and epoch of every key that is held for a node."""
-        with Store.open(self.home) as store:
-            return [(record.state, record.epoch) for record in store.keys(bytes.fromhex(uuid))]
+        with base_station.Station.inspect(self.home) as store:
+            return [(record.state, record.epoch) for record in store.keys.keys_of(bytes.fromhex(uuid))]
 
     def log_is_whole(self) -> bool:
         """Whether the hash chain of the audit log holds."""
-        with Store.open(self.home) as store:
-            return store.audit.check().intact
+        with base_station.Station.inspect(self.home) as store:
+            return store.audit_log.check().intact
 
 
 def _blank(row: tuple[Any, ...]) -> tuple[Any, ...]:

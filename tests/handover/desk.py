@@ -106,15 +106,15 @@ def node_key_id(board: Board) -> str:
 
 def everything(station: Station) -> tuple[object, ...]:
     """What the store holds but for the audit log and times: to see that nothing changed."""
-    store = station._store
+    store = station
     return (
-        [replace(entry, added="") for entry in store.whitelist()],
-        store.nodes(),
-        sorted((key.uuid, key.key_id, key.state, key.epoch) for key in store.all_keys()),
-        [replace(row, created="") for row in store.handovers()],
-        [replace(tombstone, created="") for tombstone in store.tombstones()],
-        [replace(holder, since="") for holder in store.holders()],
-        store.revocations(),
+        [replace(entry, added="") for entry in store.pins.whitelist()],
+        store.nodes.all(),
+        sorted((key.uuid, key.key_id, key.state, key.epoch) for key in store.keys.all()),
+        [replace(row, created="") for row in store.handovers.all()],
+        [replace(tombstone, created="") for tombstone in store.policy.tombstones()],
+        [replace(holder, since="") for holder in store.keys.holders()],
+        store.policy.revocations(),
     )
 
 

@@ -114,7 +114,7 @@ def test_a_lie_about_the_epoch_is_corrected_in_the_first_session(pair: Pair) -> 
 
 def test_a_far_jump_of_the_sequence_needs_a_persons_word(pair: Pair) -> None:
     provisioned(pair.north, pair.board)
-    image = pair.north.nodes.datasheet(pair.board.uuid)
+    image = pair.north.datasheets.datasheet(pair.board.uuid)
     assert image is not None
     far = pair.board.state.sequence + SEQUENCE_WINDOW + 1
     keys = known_node_keys(pair.north, pair.board.uuid, image)

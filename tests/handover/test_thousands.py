@@ -12,8 +12,9 @@ import pytest
 from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import, proven_of
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.station.bulk import BulkRows
 from teds_provision.station.station import Station
-from teds_provision.station.store import BulkRows, NodeRecord
+from teds_provision.station.store import NodeRecord
 from tests.bench import make_station
 from tests.handover.desk import trust
 
@@ -46,7 +47,7 @@ def fill(station: Station, count: int) -> None:
         keys.append(station.keys.wrapped(uuid, key=digest.digest()[:16], key_id=digest.digest()[:8], epoch=1, slot=1,
                                          source="agreement", created="2026-01-01T00:00:00Z"))  # fmt: skip
     with station.transaction():
-        station.handovers.take_in(BulkRows(nodes=nodes, keys=keys))
+        station.bulk.put(BulkRows(nodes=nodes, keys=keys))
         for key in keys:
             station.keys.promote(key.uuid, key.key_id)
 

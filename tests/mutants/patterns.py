@@ -62,7 +62,7 @@ PATTERNS = (
     Pattern(
         "a due rotation makes pending keys imported",
         "NodeKeys.demand_rotation",
-        "self._store.count_as_imported(uuid)",
+        "self._count_as_imported(uuid)",
         "None",
     ),
     Pattern(

@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 
 from teds_provision.client import ApiError
-from teds_provision.station.store import KeptMeasurement, Store
+from teds_provision.station.station import Station
+from teds_provision.station.store import KeptMeasurement
 from tests.e2e.desk import Running
 from tests.measure.hall import Hall, killed
 from tests.ncap.service import Service
@@ -39,15 +40,15 @@ def tidy(hall: Hall) -> Iterator[None]:
     """Each test ends all that it began, and leaves no measurement in the store."""
     yield
     hall.desk.clear(but=[node.process for node in hall.nodes.values()])
-    with closing(Store.open(hall.station.home)) as store:
-        for kept in store.measurements():
-            store.remove_measurement(kept.id)
+    with closing(Station.inspect(hall.station.home)) as store:
+        for kept in store.measurements._rows():
+            store.measurements.forget(kept.id)
 
 
 def rows(hall: Hall) -> list[KeptMeasurement]:
     """The rows as they are stored: this reader removes none."""
-    with closing(Store.open(hall.station.home)) as store:
-        return store.measurements()
+    with closing(Station.inspect(hall.station.home)) as store:
+        return store.measurements._rows()
 
 
 def began(hall: Hall, *words: object) -> Running:
@@ -105,8 +106,8 @@ def test_the_next_reader_removes_the_row_of_a_killed_command(hall: Hall, reader:
 
 
 def test_a_process_that_got_the_process_id_of_a_killed_command_does_not_own_its_row(hall: Hall) -> None:
-    with closing(Store.open(hall.station.home)) as store:
-        store.put_measurement(KeptMeasurement("dead", "arm", owner="command", pid=os.getpid(), started=1))
+    with closing(Station.inspect(hall.station.home)) as store:
+        store.measurements.keep(KeptMeasurement("dead", "arm", owner="command", pid=os.getpid(), started=1))
     assert listed(ncap(hall)) == []
     assert rows(hall) == []
 
@@ -166,8 +167,8 @@ def test_the_log_has_what_is_measured_and_who_requested_it(hall: Hall) -> None:
 
 def test_a_measurement_whose_time_is_over_holds_its_nodes_no_longer(hall: Hall) -> None:
     """It was listed as ended, and its nodes as measured, until somebody deleted it."""
-    with closing(Store.open(hall.station.home)) as store:
-        store.put_measurement(KeptMeasurement("brief", "arm", rate=20.0, ends=time.time() + 6))
+    with closing(Station.inspect(hall.station.home)) as store:
+        store.measurements.keep(KeptMeasurement("brief", "arm", rate=20.0, ends=time.time() + 6))
     service = ncap(hall)
     [shown] = listed(service)
     assert (shown["id"], shown["group"]) == ("brief", "arm")

@@ -21,6 +21,7 @@ import pytest
 from teds_provision import client
 from teds_provision.client import ApiError
 from teds_provision.ncap.settings import own_source
+from teds_provision.station import station as base_station
 from teds_provision.station.store import Store
 from teds_provision.station.store.schema import SCHEMA_VERSION
 from tests.bench import make_station
@@ -79,9 +80,9 @@ class Lab:
         if running is not None and running.process.poll() is None:
             self.service.kill()
         self.service.process = None
-        with Store.open(self.service.station.home) as store:
-            for kept in store.measurements():
-                store.remove_measurement(kept.id)
+        with base_station.Station.inspect(self.service.station.home) as store:
+            for kept in store.measurements.all():
+                store.measurements.forget(kept.id)
         if self.node.process is None or self.node.process.process.poll() is not None:
             self.power()
 

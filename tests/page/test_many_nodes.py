@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from teds_provision import client
-from teds_provision.station.store import Store
+from teds_provision.station.station import Station
 from tests.pace import until
 
 from .lab import Lab, opened
@@ -30,9 +30,9 @@ def crowd(lab: Lab) -> Iterator[Lab]:
     file.write_text(json.dumps({"whitelist": listed}))
     lab.ask("whitelist", "import", file)
     yield lab
-    with Store.open(lab.station.home) as store, store.together():
+    with Station.inspect(lab.station.home) as store, store._store.together():
         for entry in listed:
-            store.remove_whitelist(bytes.fromhex(entry["uuid"]))
+            store._store.execute("DELETE FROM whitelist WHERE uuid = ?", (bytes.fromhex(entry["uuid"]),))
 
 
 def called(lab: Lab, *nodes: str) -> list[str]:

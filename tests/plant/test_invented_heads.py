@@ -26,7 +26,7 @@ def test_an_auditors_word_counts_for_nothing_and_a_keeper_knows_its_own_chain(
         station.plant.pages.put_heads(
             station.plant.pages.chain(witness.fingerprint).chain, {made.north.fingerprint: (10_000, "ab" * 32)}
         )
-        rules = station.plant.signer_rules()
+        rules = station.policy.signer_rules()
         assert rules is not None
         said = rules.signing(station.ca, thief.point, os.urandom(32))
         assert said is not None

@@ -363,12 +363,12 @@ def test_the_line_takes_no_word_but_the_offices(desk: Desk) -> None:
 def test_a_board_that_waits_for_the_office_has_a_draft_until_its_datasheet_is_written(desk: Desk) -> None:
     run, one = desk.run(), board(1)
     request = desk.request(run, one)
-    waiting = desk.line.nodes.draft(one.uuid)
+    waiting = desk.line.datasheets.draft(one.uuid)
     assert waiting is not None
     assert (waiting.stage, waiting.profile) == ("built", ANGLE)
     assert waiting.image.unsigned_blocks() == request.image.unsigned_blocks()
     assert build(run, one).verified.verdict == "authentic"
-    assert desk.line.nodes.draft(one.uuid) is None
+    assert desk.line.datasheets.draft(one.uuid) is None
 
 
 def test_another_members_answer_neither_ends_the_waiting_nor_hides_the_offices(desk: Desk) -> None:

@@ -347,7 +347,7 @@ def test_another_holder_shares_for_a_maker_that_was_removed(plant: Plant) -> Non
     sync(plant, "west", "north", "west")
     north = plant["north"]
     [key] = north.keys.keys_of(board.uuid)
-    north._store.activate_key(board.uuid, key.key_id)  # proven in a session
+    north.keys.activate(board.uuid, key.key_id)  # proven in a session
     plant.roster({"north": "base", "south": "base"}, everything(plant, "south"), removed={"west": (1, "ab" * 32)})
     sync(plant, "north")
     sync(plant, "south")

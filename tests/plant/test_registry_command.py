@@ -16,7 +16,7 @@ import pytest
 from teds_provision import plant
 from teds_provision.station.plant.pages import PageRow
 from teds_provision.station.station import Station
-from teds_provision.station.store import Holder, Store
+from teds_provision.station.store import Holder
 from tests.bench import PASSPHRASE
 from tests.cli.shell import Outcome, call, spawn
 from tests.plant.stations import ask, certified, owner
@@ -195,10 +195,11 @@ def test_the_doctor_says_whose_clock_is_wrong_until_that_station_dates_a_page_we
 
     def found(created: str) -> list[str]:
         """What is said once west has made one page more, and dated it so."""
-        with Store.open(desk.folder / "south") as store, store.transaction():
-            chain = store.chain(west)
-            n = 1 + max((number for number, *_ in store.page_times(chain.chain, 1)), default=0)
-            store.add_page(chain.chain, PageRow(n, f"{n:064x}", "", created, "", b"", b"{}", bytes(64)))
+        with Station.inspect(desk.folder / "south") as south, south.transaction():
+            pages = south.plant.pages
+            chain = pages.chain(west)
+            n = 1 + max((number for number, *_ in pages.times(chain.chain, 1)), default=0)
+            pages.add(chain.chain, PageRow(n, f"{n:064x}", "", created, "", b"", b"{}", bytes(64)))
         checks = json.loads(desk.run("south", "--json", "doctor").out)["checks"]
         said = [check for check in checks if check["name"] == "registry" and "page" in check["why"]]
         return [f"{item['why']} {item['fix']}" for item in said]
@@ -435,8 +436,8 @@ def test_what_waits_in_pages_counts_as_unsent(desk: Desk) -> None:
     pages.parent.rename(desk.folder / "away")
     pages.parent.write_text("no folder: the page is made, and cannot leave")
     assert desk.run("north", "registry", "sync").code not in (0, 2)
-    with Store.open(desk.folder / "north") as store:
-        assert store.outbox(1) == []
+    with Station.inspect(desk.folder / "north") as north:
+        assert north.plant.outbox(1) == []
     assert desk.ask("north", "registry", "status")["unsent"] == 1
     checks = json.loads(desk.run("north", "--json", "doctor").out)["checks"]
     assert any(check["why"].startswith("1 events unsent") for check in checks if check["name"] == "registry")

@@ -116,7 +116,7 @@ def test_a_datasheet_of_a_removed_signer_is_judged_by_a_station_that_joins_after
 
 
 def verdict(station: Station, signer: Station, digest: bytes) -> str:
-    rules = station.plant.signer_rules()
+    rules = station.policy.signer_rules()
     assert rules is not None
     said = rules.signing(station.ca, signer.point, digest)
     assert said is not None
@@ -301,7 +301,7 @@ def test_a_home_from_a_backup_finds_its_own_pages_among_those_handed_in(loss: Lo
     newest = chain.counted[0]
     hash = chain.counted[1]
     with west.transaction():  # as a backup from before its last page has it
-        west.plant._database.execute("DELETE FROM pages WHERE chain = ? AND hash = ?", (chain.chain, hash))
+        west._store.execute("DELETE FROM pages WHERE chain = ? AND hash = ?", (chain.chain, hash))
         roster = west.plant.roster
         assert roster is not None
         plant_room.apply_pages.recount(west, chain, roster)

@@ -31,7 +31,7 @@ def made_by(station: Station, board: Board) -> Image:
     """The datasheet that a station provisions a board with."""
     with talk(board) as node:
         provision(station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=SilentReporter())
-    image = station.nodes.datasheet(board.uuid)
+    image = station.datasheets.datasheet(board.uuid)
     assert image is not None
     return image
 
@@ -108,7 +108,7 @@ def test_a_keeper_vouches_for_what_a_station_signed_that_never_joined(plants: Pl
     image = made_by(old, board)
     old.close()
     assert verdict(plants.north, image) == "not authentic", "it is in no roster"
-    plants.north.nodes.keep_datasheet(image)
+    plants.north.datasheets.keep_datasheet(image)
     found = plant.membership.vouchable(plants.north, [board.uuid])
     assert [uuid for uuid, _, _ in found] == [board.uuid]
     assert plant.membership.vouch(plants.north, found) == 1

@@ -75,7 +75,7 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
         assert (entry.fingerprint if entry is not None else None) == (None if due.bans else due.pin)
         assert (station.policy.revocation(uuid) is not None) == bool(due.bans)
         assert {name for _, name, _ in station.plant.claims.conflicts(uuid)} == set(due.conflicts)
-    rules = station.plant.signer_rules()
+    rules = station.policy.signer_rules()
     assert rules is not None
     for speaker in speakers:
         for digest in (DIGEST, DIGEST2):

@@ -5,7 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.station.station import Station
 from teds_provision.station.store import Store
+
+from ..bench import make_station
 
 
 @pytest.fixture
@@ -17,3 +20,9 @@ def home(tmp_path: Path) -> Path:
 def store(home: Path) -> Iterator[Store]:
     with Store.open(home, create=True) as opened:
         yield opened
+
+
+@pytest.fixture
+def station(home: Path) -> Iterator[Station]:
+    with make_station(home) as made:
+        yield made

@@ -137,15 +137,16 @@ def test_a_run_that_ends_early_is_on_the_disk_all_the_same(watched: Watched, syn
 def test_what_comes_later_is_on_the_disk_with_the_next_entry_or_when_it_is_asked_for(
     watched: Watched, synced: list[str]
 ) -> None:
-    store, node = watched.station._store, NodeRecord(bytes(10))
+    station, node = watched.station, NodeRecord(bytes(10))
+    store = station._store
     with store.transaction(later=True):
-        store.put_node(node)
+        station.nodes.restore(node)
     with store.transaction():
-        store.put_node(node)  # the same again: SQLite may find nothing to write
+        station.nodes.restore(node)  # the same again: SQLite may find nothing to write
     store.flush()
     assert synced == ["store.sqlite3-wal"]
     with store.transaction(later=True):
-        store.put_node(node)
+        station.nodes.restore(node)
     store.audit.append("identify", node.uuid, "done")
     store.flush()
     assert synced == ["store.sqlite3-wal"]
@@ -225,14 +226,14 @@ def test_what_is_not_waited_for_does_not_bring_what_came_before_onto_the_disk(
 
 def test_nothing_that_a_provisioning_or_a_look_up_asks_reads_a_whole_table(watched: Watched) -> None:
     """They cost the same with a hundred thousand nodes; the list of trusted stations is short, and read whole."""
-    store, board = watched.station._store, Board()
+    station, board = watched.station, Board()
     watched.run(board)
-    store.is_known(board.uuid)
-    store.resolve(board.uuid.hex()[:8])
-    store.named("finger-1")
+    station.overview.is_known(board.uuid)
+    station.nodes.resolve(board.uuid.hex()[:8])
+    station.nodes.named("finger-1")
     asked = {statement for statement in watched.statements if statement.startswith(("SELECT", "UPDATE", "DELETE"))}
     assert len(asked) > 20
-    plans = {name: [row[3] for row in store.execute(f"EXPLAIN QUERY PLAN {name}")] for name in asked}
+    plans = {name: [row[3] for row in station._store.execute(f"EXPLAIN QUERY PLAN {name}")] for name in asked}
     one_row = {"SCAN trust", "SCAN station", "SCAN plant", "SCAN CONSTANT ROW"}  # or as many as there are stations
     whole = {
         asked_for

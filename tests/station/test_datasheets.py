@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.station.store import Draft, NodeRecord, Store
-from teds_provision.station.store.tables.datasheets import packed, unpacked
+from teds_provision.station.datasheets import packed, unpacked
+from teds_provision.station.station import Station
+from teds_provision.station.store import Draft, NodeRecord
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 
@@ -32,59 +33,59 @@ def test_what_was_not_packed_is_refused_with_value_error(octets: bytes) -> None:
     assert unpacked(NODE, packed(image)) == image
 
 
-def test_a_truncated_image_is_damage(store: Store) -> None:
+def test_a_truncated_image_is_damage() -> None:
     with pytest.raises(ValueError):
         unpacked(NODE, packed(Image(NODE, {(0, 1): b"meta"}))[:-2])
 
 
-def test_the_same_datasheet_is_kept_once(store: Store) -> None:
+def test_the_same_datasheet_is_kept_once(station: Station) -> None:
     image = Image(NODE, {(0, 1): b"meta"})
-    assert store.put_datasheet(image, "finger")
-    assert not store.put_datasheet(image)
-    (only,) = store.history(NODE)
+    assert station.datasheets.put(image, "finger")
+    assert not station.datasheets.put(image)
+    (only,) = station.datasheets.whole_history(NODE)
     assert (only.image, only.profile, only.digest) == (image, "finger", image.digest())
 
 
-def test_the_present_one_and_ten_older_ones_are_kept(store: Store) -> None:
+def test_the_present_one_and_ten_older_ones_are_kept(station: Station) -> None:
     images = [Image(NODE, {(0, 1): bytes([number])}) for number in range(15)]
     for image in images:
-        store.put_datasheet(image)
-    assert [record.image for record in store.history(NODE)] == images[:3:-1]
-    assert store.datasheet(NODE) == store.history(NODE)[0]
+        station.datasheets.put(image)
+    assert [record.image for record in station.datasheets.whole_history(NODE)] == images[:3:-1]
+    assert station.datasheets.datasheet(NODE) == images[-1]
 
 
-def test_a_datasheet_that_comes_back_is_the_present_one_again(store: Store) -> None:
+def test_a_datasheet_that_comes_back_is_the_present_one_again(station: Station) -> None:
     first, second = Image(NODE, {(0, 1): b"1"}), Image(NODE, {(0, 1): b"2"})
     for image in (first, second, first):
-        store.put_datasheet(image)
-    assert [record.image for record in store.history(NODE)] == [first, second, first]
+        station.datasheets.put(image)
+    assert [record.image for record in station.datasheets.whole_history(NODE)] == [first, second, first]
 
 
-def test_drafts_of_all_nodes_are_listed_and_dropped_one_by_one(store: Store) -> None:
+def test_drafts_of_all_nodes_are_listed_and_dropped_one_by_one(station: Station) -> None:
     other = os.urandom(10)
     for uuid in (NODE, other):
-        store.put_draft(Draft(uuid, Image(uuid, {(0, 1): b"x"}), profile="finger"))
-    assert {draft.uuid for draft in store.drafts()} == {NODE, other}
-    assert store.drop_draft(NODE)
-    assert not store.drop_draft(NODE)
-    assert [draft.uuid for draft in store.drafts()] == [other]
+        station.datasheets.keep_draft(Draft(uuid, Image(uuid, {(0, 1): b"x"}), profile="finger"))
+    assert {draft.uuid for draft in station.datasheets.drafts()} == {NODE, other}
+    assert station.datasheets.drop_draft(NODE)
+    assert not station.datasheets.drop_draft(NODE)
+    assert [draft.uuid for draft in station.datasheets.drafts()] == [other]
 
 
-def test_a_node_costs_little_in_the_file(store: Store) -> None:
+def test_a_node_costs_little_in_the_file(station: Station) -> None:
     """Issue 13 row 12: 5 kB with one datasheet, 2 KiB for each older one; signatures and digests do not deflate."""
     blocks = load_profile("tactile-finger-sensor").build(NODE).blocks
     nodes = 40
 
     def pages() -> int:
-        return int(store.execute("PRAGMA page_count")[0][0]) * 4096
+        return int(station._store.execute("PRAGMA page_count")[0][0]) * 4096
 
     def keep(version: int) -> int:
         before = pages()
-        with store.transaction():
+        with station.transaction():
             for number in range(nodes):
                 image = Image(bytes([number]) * 10, {**blocks, (0, 128): os.urandom(1200), (0, 12): bytes([version])})
-                store.put_node(NodeRecord(image.uuid, name=f"node {number}"))
-                store.put_datasheet(image, "tactile-finger-sensor")
+                station.nodes.restore(NodeRecord(image.uuid, name=f"node {number}"))
+                station.datasheets.put(image, "tactile-finger-sensor")
         return (pages() - before) // nodes
 
     assert keep(0) <= 5000

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import StoreError
+from teds_provision.station.station import Station
 from teds_provision.station.store import NodeRecord, Store
 
 NODE = bytes(range(10))
@@ -24,19 +25,20 @@ NODE = bytes(range(10))
 WRITER = """
 import sys
 from pathlib import Path
-from teds_provision.station.store import KeyRecord, NodeRecord, Store
+from teds_provision.station.station import Station
+from teds_provision.station.store import KeyRecord, NodeRecord
 node = bytes(range(10))
-store = Store.open(Path(sys.argv[1]), create=True)
-known = store.node(node)
+store = Station.make(Path(sys.argv[1]))
+known = store.nodes.get(node)
 number = known.sequence if known else 0
 while True:
     number += 1
     key_id = f"{number:016x}"
     with store.transaction():
-        store.put_node(NodeRecord(node, sequence=number, epoch=number))
-        store.add_key(KeyRecord(node, number, key_id, "pending", number, b"w" * 49))
-        store.activate_key(node, key_id)
-        store.audit.append("write", node, "done", {"number": number})
+        store.nodes.restore(NodeRecord(node, sequence=number, epoch=number))
+        store.keys.add(KeyRecord(node, number, key_id, "pending", number, b"w" * 49))
+        store.keys.activate(node, key_id)
+        store.audit("write", node, "done", number=number)
     print(number, flush=True)
 """
 
@@ -68,12 +70,12 @@ def test_a_writer_killed_at_any_instant_loses_nothing_it_had_committed(home: Pat
     for _ in range(12):
         lines = kill_after(python(WRITER, home), moments.uniform(0, 0.05))
         said = int(lines[-1])
-        with Store.open(home) as store:
-            node = store.node(NODE)
+        with Station.inspect(home) as store:
+            node = store.nodes.get(NODE)
             assert node is not None
             assert node.sequence in (said, said + 1)  # it may have died between the commit and the word
-            assert [key.key_id for key in store.keys(NODE)] == [f"{node.sequence:016x}"]
-            verdict = store.audit.check()
+            assert [key.key_id for key in store.keys.keys_of(NODE)] == [f"{node.sequence:016x}"]
+            verdict = store.audit_log.check()
             assert (verdict.intact, verdict.count) == (True, node.sequence)
             assert store.damage() is None
     assert said > 20
@@ -89,28 +91,29 @@ def test_init_killed_at_any_instant_can_be_run_again(home: Path) -> None:
     for _ in range(12):
         shutil.rmtree(home, ignore_errors=True)
         lines = kill_after(python(code, home), moments.uniform(0, 0.006))
-        with Store.open(home, create=True) as store:
+        with Station.make(home) as store:
             assert lines[1:] in ([], [store.id])
-            store.put_node(NodeRecord(NODE))
+            store.nodes.restore(NodeRecord(NODE))
             assert store.damage() is None
 
 
 def test_two_processes_write_at_once_and_nothing_is_lost(home: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from teds_provision.station.store import NodeRecord, Store\n"
-        "store = Store.open(Path(sys.argv[1]), create=True)\n"
+        "import sys; from pathlib import Path; from teds_provision.station.station import Station\n"
+        "from teds_provision.station.store import NodeRecord\n"
+        "store = Station.make(Path(sys.argv[1]))\n"
         "for n in range(150):\n"
-        "    store.put_node(NodeRecord(bytes([int(sys.argv[2])]) * 8 + n.to_bytes(2, 'big')))\n"
-        "    store.audit.append('write', None, 'done', {'by': sys.argv[2]})\n"
+        "    store.nodes.restore(NodeRecord(bytes([int(sys.argv[2])]) * 8 + n.to_bytes(2, 'big')))\n"
+        "    store.audit('write', None, 'done', by=sys.argv[2])\n"
         "print(store.id)"
     )
     both = [python(code, home, number) for number in (1, 2)]
     spoken = [process.communicate() for process in both]
     assert [process.returncode for process in both] == [0, 0], spoken
-    with Store.open(home) as store:
+    with Station.inspect(home) as store:
         assert {line.strip() for line, _ in spoken} == {store.id}
-        assert len(store.nodes()) == 300
-        verdict = store.audit.check()
+        assert len(store.nodes.all()) == 300
+        verdict = store.audit_log.check()
         assert (verdict.intact, verdict.count) == (True, 300)
 
 
@@ -119,19 +122,20 @@ import os, resource, sys
 sys.dont_write_bytecode = True
 from pathlib import Path
 from teds_provision.errors import StoreError
-from teds_provision.station.store import Draft, Store
+from teds_provision.station.station import Station
+from teds_provision.station.store import Draft
 from teds_provision.teds.image import Image
-store = Store.open(Path(sys.argv[1]), create=True)
+store = Station.make(Path(sys.argv[1]))
 if sys.argv[2] != "0":
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
 done = 0
 try:
     for number in range(1000):
-        store.put_draft(Draft(uuid := number.to_bytes(10, "big"), Image(uuid, {(0, 1): os.urandom(20000)})))
+        store.datasheets.keep_draft(Draft(uuid := number.to_bytes(10, "big"), Image(uuid, {(0, 1): os.urandom(20000)})))
         done += 1
 except StoreError as failure:
     print(done, failure.exit_code, failure.message, failure.hint)
-    print(len(store.nodes()), store.damage())
+    print(len(store.nodes.all()), store.damage())
 """
 
 
@@ -155,8 +159,8 @@ def test_a_file_that_may_not_grow_gives_a_clear_error_and_keeps_what_was_there(h
     done, words = filled_until_it_failed(home, 600_000)
     assert done > 3
     assert "the disk failed or is full" in words
-    with Store.open(home) as store:
-        drafts = [store.draft(number.to_bytes(10, "big")) for number in range(done + 1)]
+    with Station.inspect(home) as store:
+        drafts = [store.datasheets.draft(number.to_bytes(10, "big")) for number in range(done + 1)]
         assert [draft is not None for draft in drafts] == [True] * done + [False]
 
 
@@ -171,14 +175,15 @@ def test_a_full_disk_gives_a_clear_error(home: Path) -> None:
     assert "no space left" in words or "full" in words
 
 
-def test_a_read_only_disk_gives_a_clear_error(store: Store, home: Path) -> None:
-    store.put_node(NodeRecord(NODE))
-    store.close()
+def test_a_read_only_disk_gives_a_clear_error(station: Station, home: Path) -> None:
+    station.nodes.restore(NodeRecord(NODE))
+    station.close()
     code = (
         "import sys; from pathlib import Path; from teds_provision.errors import StoreError\n"
-        "from teds_provision.station.store import NodeRecord, Store, StoreLock\n"
+        "from teds_provision.station.station import Station\n"
+        "from teds_provision.station.store import NodeRecord, StoreLock\n"
         "def write():\n"
-        "    with Store.open(Path(sys.argv[1]), create=True) as store: store.put_node(NodeRecord(bytes(10)))\n"
+        "    with Station.make(Path(sys.argv[1])) as made: made.nodes.restore(NodeRecord(bytes(10)))\n"
         "def lock():\n"
         "    with StoreLock(Path(sys.argv[1]), command='write'): pass\n"
         "for act in (write, lock):\n"
@@ -194,27 +199,27 @@ def test_a_read_only_disk_gives_a_clear_error(store: Store, home: Path) -> None:
     assert [line.count("read-only") for line in run.stdout.splitlines()] == [1, 1], run.stdout
 
 
-def test_sqlite_running_out_of_pages_is_a_full_disk(store: Store) -> None:
-    store.execute("PRAGMA max_page_count = 30")
+def test_sqlite_running_out_of_pages_is_a_full_disk(station: Station) -> None:
+    station._store.execute("PRAGMA max_page_count = 30")
 
     def fill() -> None:
-        with store.transaction():
+        with station.transaction():
             for number in range(2000):
-                store.put_node(NodeRecord(number.to_bytes(10, "big"), name="x" * 100))
+                station.nodes.restore(NodeRecord(number.to_bytes(10, "big"), name="x" * 100))
 
     with pytest.raises(StoreError, match="no space left"):
         fill()
-    assert store.nodes() == []
-    store.execute("PRAGMA max_page_count = 100000")
-    store.put_node(NodeRecord(NODE))
-    assert len(store.nodes()) == 1
+    assert station.nodes.all() == []
+    station._store.execute("PRAGMA max_page_count = 100000")
+    station.nodes.restore(NodeRecord(NODE))
+    assert len(station.nodes.all()) == 1
 
 
 def test_directory_and_files_are_for_their_owner_alone(home: Path) -> None:
     before = os.umask(0)
     try:
-        with Store.open(home, create=True) as store:
-            store.put_node(NodeRecord(NODE))
+        with Station.make(home) as store:
+            store.nodes.restore(NodeRecord(NODE))
             modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in home.iterdir()}
     finally:
         os.umask(before)
@@ -297,11 +302,11 @@ def test_a_store_of_a_newer_version_is_refused(store: Store, home: Path) -> None
         Store.open(home)
 
 
-def test_a_damaged_file_never_raises_anything_foreign(store: Store, home: Path) -> None:
+def test_a_damaged_file_never_raises_anything_foreign(station: Station, home: Path) -> None:
     for number in range(500):
-        store.put_node(NodeRecord(number.to_bytes(10, "big"), name=f"node {number}"))
-        store.audit.append("write", None, "done", {"number": number})
-    store.close()
+        station.nodes.restore(NodeRecord(number.to_bytes(10, "big"), name=f"node {number}"))
+        station.audit("write", None, "done", number=number)
+    station.close()
     good = (home / "store.sqlite3").read_bytes()
     chance = random.Random(3)
     refused = 0
@@ -311,26 +316,26 @@ def test_a_damaged_file_never_raises_anything_foreign(store: Store, home: Path) 
         bad[start : start + 300] = chance.randbytes(300)
         (home / "store.sqlite3").write_bytes(bad)
         try:
-            with Store.open(home) as again:
-                again.nodes()
-                again.keys(NODE)
-                list(again.audit.entries())
-                refused += not again.audit.check().intact or again.damage() is not None
-                again.put_node(NodeRecord(NODE))
+            with Station.inspect(home) as again:
+                again.nodes.all()
+                again.keys.keys_of(NODE)
+                list(again.audit_log.entries())
+                refused += not again.audit_log.check().intact or again.damage() is not None
+                again.nodes.restore(NodeRecord(NODE))
         except StoreError as failure:
             refused += bool(failure.hint)
     assert refused > 10
 
 
-def test_a_truncated_file_never_raises_anything_foreign(store: Store, home: Path) -> None:
+def test_a_truncated_file_never_raises_anything_foreign(station: Station, home: Path) -> None:
     for number in range(300):
-        store.put_node(NodeRecord(number.to_bytes(10, "big")))
-    store.close()
+        station.nodes.restore(NodeRecord(number.to_bytes(10, "big")))
+    station.close()
     good = (home / "store.sqlite3").read_bytes()
     for length in (1, 50, 100, 512, 4095, 4096, 4097, len(good) // 2, len(good) - 1):
         (home / "store.sqlite3").write_bytes(good[:length])
-        with suppress(StoreError), Store.open(home) as again:
-            again.nodes()
+        with suppress(StoreError), Station.inspect(home) as again:
+            again.nodes.all()
             assert again.damage() is not None, f"{length} octets pass for the whole file"
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import StoreError
+from teds_provision.station.station import Station
 from teds_provision.station.store import NodeRecord, Store
 from teds_provision.station.store.database import open_copy
 
@@ -25,11 +26,12 @@ READER = """
 import sys
 from pathlib import Path
 from teds_provision.errors import StoreError
-from teds_provision.station.store import NodeRecord, Store
-store = Store.open(Path(sys.argv[1]))
-print(len(store.nodes()), store.audit.check().intact, store.frozen is not None)
+from teds_provision.station.station import Station
+from teds_provision.station.store import NodeRecord
+store = Station.inspect(Path(sys.argv[1]))
+print(len(store.nodes.all()), store.audit_log.check().intact, store._store.frozen is not None)
 try:
-    store.put_node(NodeRecord(bytes(10)))
+    store.nodes.restore(NodeRecord(bytes(10)))
 except StoreError as failure:
     print(failure.exit_code, failure.message)
 """
@@ -39,12 +41,13 @@ except StoreError as failure:
 def home(tmp_path: Path) -> Path:
     """A home that a process left by kill -9: one node in the file, one in its write-ahead log alone."""
     home = tmp_path / "home"
-    with Store.open(home, create=True) as store:
-        store.put_node(NodeRecord(ONE))
-        store.audit.append("test", ONE, "done")
+    with Station.make(home) as store:
+        store.nodes.restore(NodeRecord(ONE))
+        store.audit("test", ONE, "done")
     script = (
-        "import os, sys; from pathlib import Path; from teds_provision.station.store import NodeRecord, Store\n"
-        f"Store.open(Path({str(home)!r})).put_node(NodeRecord({TWO!r})); os._exit(0)"
+        "import os, sys; from pathlib import Path; from teds_provision.station.station import Station\n"
+        "from teds_provision.station.store import NodeRecord\n"
+        f"Station.inspect(Path({str(home)!r})).nodes.restore(NodeRecord({TWO!r})); os._exit(0)"
     )
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
     assert (home / "store.sqlite3-wal").stat().st_size > 0

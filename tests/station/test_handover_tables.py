@@ -7,95 +7,99 @@ from dataclasses import replace
 import pytest
 
 from teds_provision.errors import PolicyError, StoreError, UsageError
-from teds_provision.station.store import Handover, Holder, RevocationRecord, Store, Tombstone, TrustRecord
+from teds_provision.station.station import Station
+from teds_provision.station.store import Handover, Holder, RevocationRecord, Tombstone, TrustRecord
 
 NODE = bytes(range(10))
 LAB = TrustRecord("lab", "station", b"\x04" + bytes(64), "ab" * 32)
 
 
-def test_a_trusted_station_is_listed_and_removed_by_name(store: Store) -> None:
-    store.put_trust(LAB)
-    assert store.trusted() == [LAB]
-    assert store.remove_trust("lab")
-    assert not store.remove_trust("lab")
-    assert store.trusted() == []
+def test_a_trusted_station_is_listed_and_removed_by_name(station: Station) -> None:
+    station.policy.restore_trust(LAB)
+    assert station.policy.trust_rows() == [LAB]
+    assert station.policy.distrust("lab")
+    assert not station.policy.distrust("lab")
+    assert station.policy.trust_rows() == []
 
 
 @pytest.mark.parametrize("digits", ["ab" * 32, "AB" * 32, "ab" * 8])
-def test_a_trusted_station_is_removed_by_fingerprint(store: Store, digits: str) -> None:
-    store.put_trust(LAB)
-    assert store.remove_trust(digits)
-    assert store.trusted() == []
+def test_a_trusted_station_is_removed_by_fingerprint(station: Station, digits: str) -> None:
+    station.policy.restore_trust(LAB)
+    assert station.policy.distrust(digits)
+    assert station.policy.trust_rows() == []
 
 
-def test_few_digits_or_ambiguous_ones_remove_nothing(store: Store) -> None:
+def test_few_digits_or_ambiguous_ones_remove_nothing(station: Station) -> None:
     other = replace(LAB, name="shop", fingerprint="ab" * 31 + "cd")
-    store.put_trust(LAB)
-    store.put_trust(other)
-    assert not store.remove_trust("abab")
+    station.policy.restore_trust(LAB)
+    station.policy.restore_trust(other)
+    assert not station.policy.distrust("abab")
     with pytest.raises(UsageError):
-        store.remove_trust("ab" * 8)
-    assert store.trusted() == [LAB, other]
+        station.policy.distrust("ab" * 8)
+    assert station.policy.trust_rows() == [LAB, other]
 
 
-def test_a_name_does_not_silently_change_its_key(store: Store) -> None:
-    store.put_trust(LAB)
+def test_a_name_does_not_silently_change_its_key(station: Station) -> None:
+    station.policy.restore_trust(LAB)
     with pytest.raises(PolicyError):
-        store.put_trust(replace(LAB, fingerprint="cd" * 32))
+        station.policy.restore_trust(replace(LAB, fingerprint="cd" * 32))
     with pytest.raises(PolicyError):
-        store.put_trust(replace(LAB, role="ca"))
-    assert store.trusted() == [LAB]
+        station.policy.restore_trust(replace(LAB, role="ca"))
+    assert station.policy.trust_rows() == [LAB]
 
 
-def test_a_key_can_be_renamed_and_can_have_both_roles(store: Store) -> None:
-    store.put_trust(LAB)
-    store.put_trust(replace(LAB, name="bench"))
-    store.put_trust(replace(LAB, name="owner", role="ca"))
-    assert [(record.name, record.role) for record in store.trusted()] == [("bench", "station"), ("owner", "ca")]
+def test_a_key_can_be_renamed_and_can_have_both_roles(station: Station) -> None:
+    station.policy.restore_trust(LAB)
+    station.policy.restore_trust(replace(LAB, name="bench"))
+    station.policy.restore_trust(replace(LAB, name="owner", role="ca"))
+    assert [(record.name, record.role) for record in station.policy.trust_rows()] == [
+        ("bench", "station"),
+        ("owner", "ca"),
+    ]
 
 
-def test_a_handover_is_kept_per_direction(store: Store) -> None:
+def test_a_handover_is_kept_per_direction(station: Station) -> None:
     out = Handover("b1", "out", "move", ("ab" * 32,), "open", "[]", "cd" * 32, None, "2026-01-01T00:00:00Z")
     back = replace(out, direction="in", peers=("cd" * 32, "ef" * 32))
-    store.put_handover(out)
-    store.put_handover(back)
-    store.put_handover(replace(out, state="closed", receipt="eyJ"))
-    assert store.handover("b1", "out") == replace(out, state="closed", receipt="eyJ")
-    assert store.handover("b1", "in") == back
-    assert len(store.handovers()) == 2
-    assert store.remove_handover("b1", "in")
-    assert not store.remove_handover("b1", "in")
+    station.handovers.put(out)
+    station.handovers.put(back)
+    station.handovers.put(replace(out, state="closed", receipt="eyJ"))
+    assert station.handovers.get("b1", "out") == replace(out, state="closed", receipt="eyJ")
+    assert station.handovers.get("b1", "in") == back
+    assert len(station.handovers.all()) == 2
+    assert station.handovers.remove("b1", "in")
+    assert not station.handovers.remove("b1", "in")
 
 
-def test_a_tombstone_says_where_a_node_went(store: Store) -> None:
+def test_a_tombstone_says_where_a_node_went(station: Station) -> None:
     stone = Tombstone(NODE, "ab" * 32, "b1")
-    store.put_tombstone(stone)
-    assert store.tombstone(NODE) == stone
-    assert store.tombstones() == [stone]
-    store.remove_tombstones([NODE])
-    assert store.tombstone(NODE) is None
+    station.policy.put_tombstone(stone)
+    assert station.policy.tombstone(NODE) == stone
+    assert station.policy.tombstones() == [stone]
+    station.policy.take_back([NODE])
+    assert station.policy.tombstone(NODE) is None
 
 
-def test_holders_are_listed_per_node_and_in_all(store: Store) -> None:
+def test_holders_are_listed_per_node_and_in_all(station: Station) -> None:
     one, two = Holder(NODE, "ab" * 32), Holder(bytes(10), "cd" * 32, mode="move")
-    store.put_holder(one)
-    store.put_holder(two)
-    assert store.holders(NODE) == [one]
-    assert store.holders() == [two, one]
-    assert store.remove_holder(NODE, "ab" * 32)
-    assert not store.remove_holder(NODE, "ab" * 32)
+    station.keys.put_holder(one)
+    station.keys.put_holder(two)
+    assert station.keys.holders(NODE) == [one]
+    assert station.keys.holders() == [two, one]
+    assert station.keys.remove_holder(NODE, "ab" * 32)
+    assert not station.keys.remove_holder(NODE, "ab" * 32)
 
 
-def test_a_revocation_is_kept_with_its_statement(store: Store) -> None:
+def test_a_revocation_is_kept_with_its_statement(station: Station) -> None:
     revocation = RevocationRecord(NODE, None, "stolen", "eyJ.x.y")
-    store.put_revocation(revocation)
-    assert store.revocation(NODE) == revocation
-    assert store.revocations() == [revocation]
-    assert store.remove_revocation(NODE)
-    assert store.revocation(NODE) is None
+    station.policy.deny(revocation)
+    assert station.policy.revocation(NODE) == revocation
+    assert station.policy.revocations() == [revocation]
+    assert station.policy.forgive(NODE)
+    assert station.policy.revocation(NODE) is None
 
 
-def test_a_point_of_the_wrong_length_is_not_trusted(store: Store) -> None:
+def test_a_point_of_the_wrong_length_is_not_trusted(station: Station) -> None:
     with pytest.raises(StoreError):
-        store.put_trust(replace(LAB, point=b"\x04"))
-    assert store.trusted() == []
+        station.policy.restore_trust(replace(LAB, point=b"\x04"))
+    assert station.policy.trust_rows() == []

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import StoreError
-from teds_provision.station.groups import Groups, is_valid_name, valid_name
-from teds_provision.station.measurements import Measurements
+from teds_provision.station.groups import is_valid_name, valid_name
+from teds_provision.station.station import Station
 from teds_provision.station.store import Store
 from teds_provision.station.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, statements
 from tests.bench import make_station
@@ -73,9 +73,9 @@ def test_a_measurement_of_an_earlier_schema_gets_an_owner(tmp_path: Path) -> Non
         connection.execute(f"PRAGMA application_id={APPLICATION_ID}")
         connection.execute("PRAGMA user_version=12")
         connection.commit()
-    with closing(Store.open(home)) as store:
-        kept = {measurement.id: measurement for measurement in store.measurements()}
-        measurements = Measurements(store, Groups(store, home, None), home)  # type: ignore[arg-type]
+    with closing(Station.inspect(home)) as store:
+        kept = {measurement.id: measurement for measurement in store.measurements._rows()}
+        measurements = store.measurements
         continued = measurements.settings_to_continue("arm")
         assert [measurement.id for measurement in measurements.all()] == ["kept"], (
             "the next reader removes that of a dead command"
@@ -114,9 +114,9 @@ def test_groups_of_an_earlier_schema_are_kept_once(tmp_path: Path) -> None:
         connection.execute(f"PRAGMA application_id={APPLICATION_ID}")
         connection.execute("PRAGMA user_version=13")
         connection.commit()
-    with closing(Store.open(home)) as store:
-        found = {group.name: group.uuids for group in store.groups()}
-        assert store.node(nodes[0]) is not None
+    with closing(Station.inspect(home)) as store:
+        found = {group.name: group.uuids for group in store.groups.all()}
+        assert store.nodes.get(nodes[0]) is not None
     assert found.pop("arm") == (nodes[0], nodes[2])
     assert found.pop("left hand") == (nodes[0],)
     assert found == {valid_name(label): (nodes[1],) for label in labels[1]}

@@ -95,7 +95,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Home]:
         north.pins.put(WhitelistEntry(uuid, fingerprint(point), assurance="tap", name=f"node {uuid[0]}"))
         north.nodes.remember(uuid, point=point)
         north.keys.set_ca_of(uuid, point)
-        north.nodes.keep_firmware(uuid, bytes(42), in_session=True, signed=True)
+        north.firmware_reports.keep(uuid, bytes(42), in_session=True, signed=True)
         north.policy.deny(RevocationRecord(uuid, None, "lost", f"a ban of {uuid.hex()}", "2026-11-21T00:00:00Z"))
         assert north.policy.lift(uuid)
         with north.transaction():

@@ -127,8 +127,8 @@ def test_a_node_whose_last_verdict_was_not_good_is_not_finished(station: Station
     boards = [Board(uuid=bytes([number]) * 10) for number in range(2)]
     for board in boards:
         provision(station, board)
-    row = station.nodes.reading(boards[1].uuid)
+    row = station.datasheets.reading(boards[1].uuid)
     assert row is not None
-    station.nodes.keep_reading(replace(row, checks='[["form", "failed", "a checksum is wrong"]]'))
+    station.datasheets.keep_reading(replace(row, checks='[["form", "failed", "a checksum is wrong"]]'))
     contacts = [_at(board, 0x10 + number) for number, board in enumerate(boards)]
     assert pick_single_node(station, contacts).identity.uuid == boards[1].uuid

@@ -93,7 +93,7 @@ def test_a_spare_of_the_same_type_takes_the_calibration_with_its_unit(
     spare = Board(uuid=bytes.fromhex("5eed0000000000000001"))
     provisioned(station, spare, BuildOrder(ANGLE))
     take_over(station, plan_takeover(station, board.uuid, spare.uuid, copy_calibration=True), None)
-    draft = station.nodes.draft(spare.uuid)
+    draft = station.datasheets.draft(spare.uuid)
     assert draft is not None
     channel = Sheet.from_image(draft.image).channel(1)
     assert channel is not None
@@ -107,7 +107,7 @@ def test_a_datasheet_by_document_does_not_carry_a_calibration_to_another_unit(
 ) -> None:
     """As PUT /teds writes it: the board's calibration beside a channel that is another one."""
     with talk(board) as node:
-        blocks = dict(station.nodes.datasheet(board.uuid).unsigned_blocks())  # type: ignore[union-attr]
+        blocks = dict(station.datasheets.datasheet(board.uuid).unsigned_blocks())  # type: ignore[union-attr]
         blocks[1, AccessCode.CHANNEL] = load_profile("load-cell").build(board.uuid).blocks[1, AccessCode.CHANNEL]
         with pytest.raises(WrongBoardError, match="in rad, not in N"):
             write_sheet(station, node, blocks, SilentReporter())
@@ -117,7 +117,7 @@ def test_a_datasheet_by_document_does_not_carry_a_calibration_to_another_unit(
         with pytest.raises(WrongBoardError):
             plan_sheet(station, node, blocks)
         assert plan_sheet(station, node, blocks, retype=True).changes
-    assert station.nodes.draft(board.uuid) is None, "nothing was begun"
+    assert station.datasheets.draft(board.uuid) is None, "nothing was begun"
 
 
 def angle() -> tuple[Calibration, Channel]:

@@ -231,7 +231,7 @@ def test_a_plain_report_replaces_none_of_a_session(station: Station) -> None:
     board = FirmwareBoard()
     given(station, board, ANGLE)
     keep_firmware(station, board.uuid, FirmwareReading(OLD, sealed=False))
-    kept = station.nodes.firmware(board.uuid)
+    kept = station.firmware_reports.get(board.uuid)
     assert kept is not None
     assert (kept.report, kept.in_session, kept.signed) == (GOOD.encode(), True, GOOD.encode())
 
@@ -242,4 +242,4 @@ def test_a_report_that_another_program_wrote_does_not_count(station: Station) ->
     station.flush()
     with closing(sqlite3.connect(station.home / "store.sqlite3")) as file, file:
         file.execute("UPDATE firmware SET report = ?", (OLD.encode(),))
-    assert station.nodes.firmware(board.uuid) is None
+    assert station.firmware_reports.get(board.uuid) is None

@@ -84,10 +84,10 @@ def shown(station: Station, board: Board) -> tuple[str | None, str | None]:
 
 
 def test_the_row_names_the_digest_of_each_teds_the_command_and_the_session(station: Station, board: Board) -> None:
-    row = station.nodes.reading(board.uuid)
+    row = station.datasheets.reading(board.uuid)
     assert row is not None
     assert (row.by, row.whole, row.in_session) == ("provision", True, True)
-    image = station.nodes.datasheet(board.uuid)
+    image = station.datasheets.datasheet(board.uuid)
     assert image is not None
     assert set(readings.digests_of(row)) == set(image.blocks)
     assert shown(station, board) == ("authentic", "session")
@@ -97,7 +97,7 @@ def test_a_security_teds_alone_is_no_datasheet(station: Station) -> None:
     board = Board()
     with talk(board) as node:
         identify(station, node)
-    assert station.nodes.datasheet(board.uuid) is None
+    assert station.datasheets.datasheet(board.uuid) is None
     assert shown(station, board) == (None, None)
     assert known_node_keys(station, board.uuid).key == board.key.point, "who builds knows its key all the same"
 
@@ -117,12 +117,12 @@ def test_a_station_that_imported_the_key_measures_at_once(tmp_path: Path, mode: 
 
 
 def test_a_kept_image_that_lacks_a_teds_of_field_108_is_none(station: Station, board: Board) -> None:
-    image = station.nodes.datasheet(board.uuid)
+    image = station.datasheets.datasheet(board.uuid)
     assert image is not None
-    station._store.put_datasheet(replace(image, blocks={NAME: image.blocks[NAME], SECURITY: image.blocks[SECURITY]}))
-    assert station.nodes.datasheet(board.uuid) is None
+    station.datasheets.put(replace(image, blocks={NAME: image.blocks[NAME], SECURITY: image.blocks[SECURITY]}))
+    assert station.datasheets.datasheet(board.uuid) is None
     assert looked(station, board).verified.verdict == "authentic"
-    assert station.nodes.datasheet(board.uuid) == image
+    assert station.datasheets.datasheet(board.uuid) == image
 
 
 # -- kept, and read again --------------------------------------------------------------------------------------------
@@ -131,15 +131,15 @@ def test_a_kept_image_that_lacks_a_teds_of_field_108_is_none(station: Station, b
 def test_a_kept_image_stands_for_no_row_but_the_one_that_was_read_of_it_in_a_session(
     station: Station, board: Board
 ) -> None:
-    row = station.nodes.reading(board.uuid)
+    row = station.datasheets.reading(board.uuid)
     assert row is not None
     other = row.digests[:-1] + bytes([row.digests[-1] ^ 1])
     for changed in (replace(row, digests=other), replace(row, c=None)):
-        station._store.drop_reading(board.uuid)
-        assert station._store.put_reading(changed)
+        station.datasheets.forget_reading(board.uuid)
+        assert station.datasheets._put_reading(changed)
         found = looked(station, board)
         assert not found.kept, "all of it was read"
-        again = station.nodes.reading(board.uuid)
+        again = station.datasheets.reading(board.uuid)
         assert again is not None
         assert again.digests == row.digests, "it was read"
         assert (found.verified.verdict, found.judged.origin) == ("authentic", "session")
@@ -195,7 +195,7 @@ def test_another_security_teds_makes_everything_be_read(station: Station, board:
 
         provision(station, node, BuildOrder(name="other"), accept=lambda _who: None, reporter=SilentReporter())
     assert shown(station, board) == ("authentic", "session")
-    image = station.nodes.datasheet(board.uuid)
+    image = station.datasheets.datasheet(board.uuid)
     assert image is not None
     assert {(0, code) for _, code in image} >= {NAME}
 
@@ -212,28 +212,28 @@ def test_c_tells_a_restart(first: int, opens: int) -> None:
 
 def test_what_is_said_in_no_session_changes_no_row(station: Station, board: Board) -> None:
     """A stranger on the bus answers for the node: the row that was read in a session stays, and so does the verdict."""
-    before = station.nodes.reading(board.uuid)
+    before = station.datasheets.reading(board.uuid)
     changed_in_flash(board)
     with talk(board) as node:
         who = identify(station, node)
         plain = verify_node(station, node, read_image(node), who.point, why="the node does not open a session")
     assert plain.verified.verdict == "unproven"
     assert plain.origin == "plain"
-    assert station.nodes.reading(board.uuid) == before
+    assert station.datasheets.reading(board.uuid) == before
     assert shown(station, board) == ("authentic", "session")
 
 
 def test_a_reading_in_no_session_is_replaced_by_any(station: Station) -> None:
     row = NodeReading(bytes(10), "2026-01-01T00:00:00Z", "verify", None, True, b"")
-    assert station.nodes.keep_reading(row)
-    assert station.nodes.keep_reading(replace(row, by="other"))
-    assert station.nodes.keep_reading(replace(row, by="measure", c=bytes(8)))
-    assert not station.nodes.keep_reading(replace(row, by="late"))
-    assert station.nodes.reading(bytes(10)) == replace(row, by="measure", c=bytes(8))
+    assert station.datasheets.keep_reading(row)
+    assert station.datasheets.keep_reading(replace(row, by="other"))
+    assert station.datasheets.keep_reading(replace(row, by="measure", c=bytes(8)))
+    assert not station.datasheets.keep_reading(replace(row, by="late"))
+    assert station.datasheets.reading(bytes(10)) == replace(row, by="measure", c=bytes(8))
 
 
 def test_a_row_that_no_reading_of_ours_made_is_never_authentic(station: Station) -> None:
-    station.nodes.keep_reading(NodeReading(bytes(10), utc_now(), "x", bytes(8), True, b""))
+    station.datasheets.keep_reading(NodeReading(bytes(10), utc_now(), "x", bytes(8), True, b""))
     judged = readings.verdict_of(station, bytes(10))
     assert judged is not None
     assert judged.verified.verdict == "unsigned"
@@ -270,7 +270,7 @@ def test_a_reset_forgets_the_reading(station: Station, board: Board) -> None:
 
 def test_a_board_that_was_replaced_under_its_uuid_has_no_reading(station: Station, board: Board) -> None:
     station.pins.unpin(board.uuid)
-    assert station.nodes.reading(board.uuid) is None
+    assert station.datasheets.reading(board.uuid) is None
 
 
 # -- behind a measurement --------------------------------------------------------------------------------------------
@@ -297,7 +297,7 @@ def test_the_rest_is_read_behind_the_measurement(station: Station, board: Board)
     assert looked(station, board).kept
     assert len(read_behind(station, board)) >= len(board.state.blocks)
     assert shown(station, board) == ("authentic", "session")
-    row = station.nodes.reading(board.uuid)
+    row = station.datasheets.reading(board.uuid)
     assert row is not None
     assert row.by == "ncap"
 

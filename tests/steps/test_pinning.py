@@ -66,7 +66,7 @@ def test_a_node_given_away_and_provisioned_elsewhere_does_not_come_back_on_a_hin
     provision(station, board)
     station.keys.remove(board.uuid)
     station.handovers.put(Handover("one", "out", "move", ("ab" * 32,), "closed", "{}"))
-    station._store.put_tombstone(Tombstone(board.uuid, "ab" * 32, "one"))
+    station.policy.put_tombstone(Tombstone(board.uuid, "ab" * 32, "one"))
     with talk(board) as node, pytest.raises(PolicyError, match="was moved"):
         step(station, node, replace(identify(station, node), state=NodeState.FACTORY))
     assert station.policy.tombstone(board.uuid) is not None

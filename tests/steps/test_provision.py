@@ -178,13 +178,13 @@ def test_a_sequence_far_behind_is_caught_up_in_steps_once_a_person_says_so(stati
     station.nodes.remember(board.uuid, sequence=200_000)
     with pytest.raises(PolicyError, match="far ahead"):
         run(station, board, order=replace(ANGLE, name="far ahead"))
-    draft = station.nodes.draft(board.uuid)
+    draft = station.datasheets.draft(board.uuid)
     assert draft is not None
     with talk(board) as node:
         require_session(station, node)
         write(station, node, draft.image, jump=True)
     assert board.state.sequence == 200_001
-    assert station.nodes.draft(board.uuid) is None
+    assert station.datasheets.draft(board.uuid) is None
 
 
 def test_a_node_reset_by_hand_is_provisioned_again(station: Station, board: Board) -> None:

@@ -151,7 +151,7 @@ def test_in_its_session_a_node_is_held_against_what_this_station_saw(station: St
         verified = verify_at_node(station, node, identify(station, node)).verified
     assert verified.verdict == "not authentic"
     assert [check.name for check in verified.checks if check.result == "failed"] == ["sequence"]
-    assert station.nodes.datasheet(board.uuid) == newer, "what it had stays known"
+    assert station.datasheets.datasheet(board.uuid) == newer, "what it had stays known"
 
 
 def test_one_uuid_at_two_addresses_is_a_conflict_that_names_both(board: Board) -> None:

@@ -226,10 +226,10 @@ def test_what_a_stranger_signed_is_no_floor_for_sequence_and_epoch(
         station_key_signature=stranger.credentials().station_signature,
     )
     signed = sign_datasheet(theirs, board.uuid, stranger.credentials())
-    station.nodes.keep_datasheet(image.with_block(SECURITY, signed))
+    station.datasheets.keep_datasheet(image.with_block(SECURITY, signed))
     assert freshness_floor_of(station, board.uuid, None) == FreshnessFloor()
     broken = replace(ours, sequence=900, key_epoch=900).encode()
-    station.nodes.keep_datasheet(image.with_block(SECURITY, broken))
+    station.datasheets.keep_datasheet(image.with_block(SECURITY, broken))
     assert freshness_floor_of(station, board.uuid, None) == FreshnessFloor(), "field 100 is not over these numbers"
 
 

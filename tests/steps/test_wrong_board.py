@@ -88,7 +88,7 @@ def test_a_finished_board_does_not_silently_become_another_one(
     assert angle.tim.flash == before
     with pytest.raises(WrongBoardError):
         build(station, before.uuid, order(tmp_path, named))
-    assert station.nodes.draft(before.uuid) is None
+    assert station.datasheets.draft(before.uuid) is None
 
 
 def test_with_retype_it_becomes_one_and_the_hardware_has_the_last_word(

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.errors import VaultError
-from teds_provision.station.store import KeyRecord, Store
+from teds_provision.station.station import Station
+from teds_provision.station.store import KeyRecord
 from teds_provision.vault import node_key_context
 from teds_provision.vault.file_vault import FileVault
 from teds_provision.vault.master import MasterKeys, Material
@@ -71,15 +72,15 @@ def test_a_master_change_cut_at_any_point_keeps_every_key(tmp_path: Path, vault:
     def place(record: KeyRecord) -> bytes:
         return node_key_context(STORE, record.uuid, record.epoch, record.slot)
 
-    with Store.open(tmp_path / "home", create=True) as store:
+    with Station.make(tmp_path / "home") as store:
         for number in range(3):
             blank = KeyRecord(NODE, number, f"{number:016x}", "pending", number, b"")
-            store.add_key(
+            store.keys.add(
                 KeyRecord(NODE, number, f"{number:016x}", "pending", number, vault.wrap(key, context=place(blank)))
             )
 
         def all_open(with_vault: FileVault) -> bool:
-            return all(with_vault.unwrap(record.wrapped, context=place(record)) == key for record in store.all_keys())
+            return all(with_vault.unwrap(record.wrapped, context=place(record)) == key for record in store.keys.all())
 
         def rewrap(record: KeyRecord) -> bytes:
             opened = vault.unwrap(record.wrapped, context=place(record))
@@ -87,7 +88,7 @@ def test_a_master_change_cut_at_any_point_keeps_every_key(tmp_path: Path, vault:
 
         vault.add_master()
         assert all_open(FileVault.open(tmp_path, STORE, Person()))
-        store.replace_keys(rewrap)
+        store.keys.wrap_anew(rewrap)
         assert all_open(FileVault.open(tmp_path, STORE, Person()))
         vault.retire_masters()
         vault.retire_masters()

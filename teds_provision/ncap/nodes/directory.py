@@ -19,9 +19,9 @@ from teds_provision.api.operations import MOST_NODES
 from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.sinks import for_readers
+from teds_provision.station.overview import Search
 from teds_provision.station.shown_units import shown_units, units_of_profile
 from teds_provision.station.station import Station
-from teds_provision.station.store import Search
 from teds_provision.station.store.records import iso
 from teds_provision.steps.inventory import with_verdicts
 from teds_provision.steps.readings import NodeVerdict
@@ -84,7 +84,7 @@ class NodeDirectory:
 
     def _refresh(self, uuids: Iterable[str] | None) -> None:
         with self._reading:  # what was read earlier never takes the place of what was read later
-            every = self._station.nodes.find(Search()) if uuids is None else map(bytes.fromhex, dict.fromkeys(uuids))
+            every = self._station.overview.find(Search()) if uuids is None else map(bytes.fromhex, dict.fromkeys(uuids))
             wanted = list(every)
             found = list(with_verdicts(self._station, wanted))
             rows = {row["uuid"]: row for row, _ in found}
@@ -104,7 +104,7 @@ class NodeDirectory:
             known = self._channels.get(uuid)
         if known is not None and known[0] in (digest, _READ_NOW):
             return known[1]
-        image = self._station.nodes.datasheet(bytes.fromhex(uuid))
+        image = self._station.datasheets.datasheet(bytes.fromhex(uuid))
         shown = shown_units(self._station, bytes.fromhex(uuid))
         sheet = Sheet.from_image(image).shown_in(shown) if image is not None else None
         channels = [channel_facts(channel) for channel in sheet.channels] if sheet is not None else []

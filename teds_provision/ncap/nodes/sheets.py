@@ -63,7 +63,7 @@ class Sheets:
             found = self._node_jobs.with_node(uuid, "its datasheet is read", self._read)
             self._directory.refresh([uuid])
             return found
-        kept = held or self._station.nodes.datasheet(bytes.fromhex(uuid))
+        kept = held or self._station.datasheets.datasheet(bytes.fromhex(uuid))
         judged = verdict_of(self._station, bytes.fromhex(uuid))
         if kept is None or judged is None:
             raise NotFoundError(

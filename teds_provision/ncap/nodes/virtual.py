@@ -196,7 +196,7 @@ class Virtuals:
 
     def _require_free(self, uuid: bytes, address: int, name: str, on_bus: Container[str]) -> None:
         """Refuse a UUID, an address or a name that another node has: that one would be tried again for ever."""
-        if uuid.hex() in self._all or self._station.nodes.is_known(uuid) or uuid.hex() in on_bus:
+        if uuid.hex() in self._all or self._station.overview.is_known(uuid) or uuid.hex() in on_bus:
             raise KnownUuidError(
                 f"The datasheet has the UUID of node {uuid.hex()}, which this station already knows.",
                 hint='Two nodes with one UUID cannot be told apart. Give the new one its own UUID ("new_uuid": true).',
@@ -284,7 +284,7 @@ class Virtuals:
         with station.durable("virtual"):
             station.pins.remove(octets)
             station.keys.remove(octets)  # the node's own copy goes with its folder: nothing could be opened with it
-            station.nodes.drop_draft(octets)
+            station.datasheets.drop_draft(octets)
             if station.nodes.get(octets) is not None:  # its name is free again
                 station.nodes.remember(octets, name=None, retired=DECOMMISSIONED)
             station.measurements.hand_on(octets, None)

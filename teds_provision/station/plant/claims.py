@@ -53,7 +53,7 @@ class Claims:
         return found
 
     def of_nodes(self, uuids: Sequence[bytes]) -> dict[bytes, dict[str, str]]:
-        """Return what stations (fingerprints) claim of a page of nodes, JSON."""
+        """Return what stations (fingerprints) claim of a chunk of nodes, JSON."""
         found: dict[bytes, dict[str, str]] = {}
         rows = self._store.execute(
             f"SELECT uuid, station, claim FROM claims JOIN chains USING(chain) WHERE uuid IN ({places(uuids)})", uuids
@@ -63,7 +63,7 @@ class Claims:
         return found
 
     def nodes(self, after: bytes, most: int) -> list[bytes]:
-        """Return nodes with a claim of any station, by UUID, a batch at a time."""
+        """Return nodes with a claim of any station, by UUID, a chunk at a time."""
         rows = self._store.execute(
             "SELECT DISTINCT uuid FROM claims WHERE uuid > ? ORDER BY uuid LIMIT ?", (after, most)
         )
@@ -74,7 +74,7 @@ class Claims:
         self._store.execute_many(
             "INSERT OR REPLACE INTO claims VALUES(?, ?, ?)", ((uuid, chain, claim) for uuid, claim in claims.items())
         )
-        self._store.execute_many("INSERT OR IGNORE INTO to_judge VALUES(?)", ((uuid,) for uuid in claims))
+        self.queue(claims)
 
     def forget(self, chain: int) -> None:
         """Remove everything that was folded of a chain, to fold it again."""
@@ -120,10 +120,10 @@ class Claims:
             " SET counts = max(counts, excluded.counts)",
             (hash, chain, int(counts), uuid, statement),
         )
-        self._store.execute("INSERT OR IGNORE INTO to_judge VALUES(?)", (uuid,))
+        self.queue([uuid])
 
     def bans_of(self, uuids: Sequence[bytes]) -> list[tuple[bytes, str, str, bool, str]]:
-        """Return the bans of a page of nodes: UUID, H, on whose pages, whether one of them counts, the signed text."""
+        """Return the bans of a chunk of nodes: UUID, H, on whose pages, whether one of them counts, the signed text."""
         rows = self._store.execute(
             "SELECT uuid, hash, station, counts, statement FROM statements JOIN chains USING(chain)"
             f" WHERE lifts = 0 AND uuid IN ({places(uuids)}) ORDER BY uuid, hash, station",
@@ -153,7 +153,7 @@ class Claims:
     # -- what follows for nodes --------------------------------------------------------------------------------------
 
     def put_conflicts(self, conflicts: Mapping[bytes, Mapping[str, str]]) -> None:
-        """Keep the conflicts of each of these nodes (a page of them), in place of those that were."""
+        """Keep the conflicts of each of these nodes (a chunk of them), in place of those that were."""
         uuids = list(conflicts)
         self._store.execute(f"DELETE FROM conflicts WHERE uuid IN ({places(uuids)})", uuids)
         self._store.execute_many(
@@ -169,6 +169,10 @@ class Claims:
     def to_judge(self, most: int) -> list[bytes]:
         """Return nodes that are to be judged again."""
         return [row[0] for row in self._store.execute("SELECT uuid FROM to_judge ORDER BY uuid LIMIT ?", (most,))]
+
+    def queue(self, uuids: Iterable[bytes]) -> None:
+        """Queue nodes to be judged again."""
+        self._store.execute_many("INSERT OR IGNORE INTO to_judge VALUES(?)", ((uuid,) for uuid in uuids))
 
     def queue_all(self) -> None:
         """Queue every node with a claim or a ban to be judged again."""

@@ -153,6 +153,16 @@ class Plant:
                 self._store.execute(f"DELETE FROM {table}")
             self._store.execute("DELETE FROM meta WHERE name IN ('plant-returned', 'plant-seen-heads')")
 
+    def join(self, registry: str, url: str | None) -> None:
+        """Take part in a registry (the vault opens); all that is kept of another one is forgotten."""
+        mac = self._row_macs.note("plant", registry)
+        before = self.record()
+        if before is not None and before.registry != registry:
+            self.forget()
+            before = None
+        record = before or PlantRecord(registry)
+        self.put_record(replace(record, left=None, url=url or record.url, mac=mac))
+
     @property
     def joined(self) -> PlantRecord | None:
         """What this station joined and has not left; None if others' statements count as without a plant."""
@@ -202,22 +212,6 @@ class Plant:
         if held is not None and not held.has(self._identity.fingerprint, role):
             raise PolicyError(f"This station does not have the role {role} in {held.name}, so it {what}.", hint=hint)
 
-    def require_undisputed(self, uuid: bytes) -> None:
-        """Raise PlantConflictError if stations know two keys of a node that this one would key for the first time.
-
-        It holds until a keeper, or an operator here, pins one.
-        """
-        if self.joined is None:
-            return
-        entry = self._store.whitelisted(uuid)
-        own_word = entry is not None and entry.fingerprint is not None and entry.assurance != "registry"
-        disputed = next((why for _, name, why in self.claims.conflicts(uuid) if name == "two keys"), None)
-        if disputed is not None and not own_word and not self._store.keys(uuid):
-            raise PlantConflictError(
-                f"The plant's stations know two keys for node {uuid.hex()}: {disputed}.",
-                hint=f"A keeper must pin one of them, or you do: whitelist add {uuid.hex()} --fingerprint F",
-            )
-
     def removed_had(self, uuid: bytes, epoch: int, key_id: str, holders: Collection[str]) -> bool:
         """Return True if a removed station is among ``holders`` or, by claims that count, has had this link key."""
         held = self.roster
@@ -230,8 +224,11 @@ class Plant:
             for removed in held.removed
         )
 
-    def signer_rules(self) -> SignerRules | None:
-        """Return whose signatures count; None if no plant was joined."""
+    def signer_rules(self, added: Collection[str]) -> SignerRules | None:
+        """Return whose signatures count; None if no plant was joined.
+
+        ``added``: the fingerprints of stations that a person trusts here.
+        """
         held = self.roster
         if held is None:
             return None
@@ -248,8 +245,7 @@ class Plant:
             ),
             "",
         )
-        added = frozenset(trusted.fingerprint for trusted in self._store.trusted() if trusted.role == "station")
-        return SignerRules(held, self._identity.ca, counted, behind, added - held.by_key.keys(), self._words)
+        return SignerRules(held, self._identity.ca, counted, behind, frozenset(added) - held.by_key.keys(), self._words)
 
     def _words(self, digest: bytes) -> list[signer.SignatureClaim]:
         return [signer.SignatureClaim(*signed) for signed in self.claims.signers(digest)]
@@ -277,7 +273,7 @@ class Plant:
         with self._store.together():
             self._store.execute("INSERT INTO outbox(id, event) VALUES(?, ?)", (told["id"], text))
             if uuid is not None:  # its node is judged again at the next fold
-                self._store.execute("INSERT OR IGNORE INTO to_judge VALUES(?)", (bytes.fromhex(uuid),))
+                self.claims.queue([bytes.fromhex(uuid)])
 
     def outbox(self, most: int) -> list[tuple[int, str, str]]:
         """Return the oldest events that wait for a page: number, id, JSON."""

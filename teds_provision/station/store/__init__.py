@@ -6,6 +6,7 @@ from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
     from teds_provision.station.store.audit import AuditEntry, AuditFilter, AuditLog, AuditVerdict, is_failure
+    from teds_provision.station.store.database import chunks
     from teds_provision.station.store.lock import NodeLock, StoreLock
     from teds_provision.station.store.records import (
         DatasheetRecord,
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
         utc_now,
     )
     from teds_provision.station.store.store import Store
-    from teds_provision.station.store.tables.nodes import BulkRows, chunks
-    from teds_provision.station.store.tables.overview import NodeOverview, Search
 else:
     __getattr__ = lazy(
         __name__,
@@ -41,8 +40,7 @@ else:
             " FirmwareRecord KeptMeasurement NodeReading NodeRecord RevocationRecord"
             " StationRecord Tombstone TrustRecord WhitelistEntry utc_now",
             "store": "Store",
-            "tables.overview": "NodeOverview Search",
-            "tables.nodes": "BulkRows chunks",
+            "database": "chunks",
         },
     )
 
@@ -51,7 +49,6 @@ __all__ = [
     "AuditFilter",
     "AuditLog",
     "AuditVerdict",
-    "BulkRows",
     "DatasheetRecord",
     "Draft",
     "ExportEligibility",
@@ -64,11 +61,9 @@ __all__ = [
     "KeyFlags",
     "KeyRecord",
     "NodeLock",
-    "NodeOverview",
     "NodeReading",
     "NodeRecord",
     "RevocationRecord",
-    "Search",
     "StationRecord",
     "Store",
     "StoreLock",

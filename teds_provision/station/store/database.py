@@ -11,8 +11,9 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
@@ -98,11 +99,19 @@ PAGE = 500
 """Rows that are looked up, read or written at once."""
 _REMEMBERED = 100
 _Record = TypeVar("_Record")
+_Value = TypeVar("_Value")
 
 
 def places(values: Sized) -> str:
     """Return a ``?`` for each value, as a statement has them."""
     return ", ".join("?" * len(values))
+
+
+def chunks(values: Iterable[_Value], length: int = PAGE) -> Iterator[list[_Value]]:
+    """Divide many values into batches, as many as one statement looks up at once."""
+    rest = iter(values)
+    while batch := list(islice(rest, length)):
+        yield batch
 
 
 class Database(Connection):

@@ -10,13 +10,6 @@ from typing import TYPE_CHECKING, Literal, Self
 from teds_provision.errors import BadDataError, StoreError
 from teds_provision.station.store.audit import AuditLog
 from teds_provision.station.store.database import FILE_NAME, Database
-from teds_provision.station.store.tables.datasheets import DatasheetTables
-from teds_provision.station.store.tables.facts import FactTables
-from teds_provision.station.store.tables.handovers import HandoverTables
-from teds_provision.station.store.tables.keys import KeyTables
-from teds_provision.station.store.tables.measurements import MeasurementTables
-from teds_provision.station.store.tables.nodes import BulkTables, NodeTables
-from teds_provision.station.store.tables.overview import OverviewTables
 
 if TYPE_CHECKING:
     import sqlite3
@@ -24,17 +17,7 @@ if TYPE_CHECKING:
 _ID_OCTETS = 16
 
 
-class Store(
-    Database,
-    NodeTables,
-    KeyTables,
-    DatasheetTables,
-    HandoverTables,
-    BulkTables,
-    FactTables,
-    MeasurementTables,
-    OverviewTables,
-):
+class Store(Database):
     """The file of one station: its identifier, its audit log, transactions and statements.
 
     Every method is durable when it returns, and all of them raise StoreError (or StoreLockedError) if the file fails.
@@ -70,10 +53,6 @@ class Store(
         if store.damage() is not None:
             raise BadDataError("The store in the backup is damaged.")
         return store
-
-    @property
-    def _database(self) -> Self:  # type: ignore[override]
-        return self
 
     @property
     def home(self) -> Path:

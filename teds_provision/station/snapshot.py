@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Final
 from teds_provision.errors import StoreError
 from teds_provision.files import whole_draft
 from teds_provision.lazy import late
+from teds_provision.station.station import Station
 from teds_provision.station.store.connection import as_store_failure
 from teds_provision.station.store.database import FILE_NAME
-from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
     import sqlite3
@@ -34,7 +34,7 @@ class Relation(Enum):
     DIVERGED = "a state that went another way"
 
 
-def place(copy: Store, home: Path) -> None:
+def place(copy: Station, home: Path) -> None:
     """Make a copy the store of a home that has none: the whole file, or none. The caller holds the StoreLock.
 
     Raises StoreError: a store is there already, or it cannot be written.
@@ -44,18 +44,19 @@ def place(copy: Store, home: Path) -> None:
         raise StoreError(f"There is a store in {home} already.", hint="Restore into another --home.")
     try:
         with whole_draft(path, replace=False) as (draft, _):
-            with closing(sqlite3.connect(draft)) as target, copy._lock, copy._translated():
+            store = copy._store
+            with closing(sqlite3.connect(draft)) as target, store._lock, store._translated():
                 target.execute("PRAGMA journal_mode=OFF")  # a draft that fails goes whole
-                copy._connection.backup(target)
+                store._connection.backup(target)
             for left in ("-wal", "-shm"):  # of a store that is gone: they would be replayed into this one
                 path.with_name(FILE_NAME + left).unlink(missing_ok=True)
     except (OSError, sqlite3.Error) as error:
         raise as_store_failure(error, path) from error
 
 
-def totals(store: Store) -> dict[str, int]:
-    """Count whitelist, nodes, keys and trusted keys of a store."""
-    count = store.one
+def totals(station: Station) -> dict[str, int]:
+    """Count whitelist, nodes, keys and trusted keys of a station's store."""
+    count = station._store.one
     return {table: int((count(f"SELECT count(*) FROM {table}") or (0,))[0]) for table in _COUNTED}
 
 
@@ -78,9 +79,9 @@ def is_damage(failure: StoreError) -> bool:
     return isinstance(cause, sqlite3.Error) and getattr(cause, "sqlite_errorcode", 0) & 0xFF in _DAMAGE
 
 
-def relation(copy: Store, live: Store) -> Relation:
+def relation(copy: Station, live: Station) -> Relation:
     """Compare the audit logs of a copy and of a store: the one that goes on after the end of the other is the newer."""
-    ours, theirs = live.audit.check(), copy.audit.check()
+    ours, theirs = live.audit_log.check(), copy.audit_log.check()
     if (ours.count, ours.head) == (theirs.count, theirs.head):
         return Relation.SAME
     if _hash_at(live, theirs.count) == theirs.head:
@@ -90,19 +91,19 @@ def relation(copy: Store, live: Store) -> Relation:
     return Relation.DIVERGED
 
 
-def extend_audit(live: Store, copy: Store) -> int:
+def extend_audit(live: Station, copy: Station) -> int:
     """Append what a newer copy's audit log goes on with; returns how many entries. Call it inside a transaction."""
-    database, after = live, live.audit.check().count
-    rows = copy.execute("SELECT * FROM audit WHERE seq > ? ORDER BY seq", (after,))
+    store, after = live._store, live.audit_log.check().count
+    rows = copy._store.execute("SELECT * FROM audit WHERE seq > ? ORDER BY seq", (after,))
     for row in rows:
-        database.execute("INSERT INTO audit VALUES(?, ?, ?, ?, ?, ?, ?, ?)", row)
+        store.execute("INSERT INTO audit VALUES(?, ?, ?, ?, ?, ?, ?, ?)", row)
     if rows:
-        live.audit._remember(int(rows[-1][0]), bytes(rows[-1][-1]))
+        live.audit_log._remember(int(rows[-1][0]), bytes(rows[-1][-1]))
     return len(rows)
 
 
-def _hash_at(store: Store, seq: int) -> str:
+def _hash_at(station: Station, seq: int) -> str:
     if seq == 0:
-        return store.audit._root.hex()
-    entry = next(store.audit.entries(seq - 1), None)
+        return station.audit_log._root.hex()
+    entry = next(station.audit_log.entries(seq - 1), None)
     return entry.hash if entry is not None and entry.seq == seq else ""

@@ -1,4 +1,4 @@
-"""All that is known of nodes, put together from every table: found by one query, read a page at a time.
+"""All that is known of nodes, put together from every table: found by one query, read a chunk at a time.
 
 A node is known here that was met, whitelisted, brought by a bundle, moved away or denied.
 """
@@ -9,9 +9,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from teds_provision.station.store.database import PAGE, Database, places
+from teds_provision.station.datasheets import unpacked
+from teds_provision.station.store.database import PAGE, places
 from teds_provision.station.store.records import UUID_OCTETS
-from teds_provision.station.store.tables.datasheets import unpacked
+from teds_provision.station.store.store import Store
 from teds_provision.teds.origin import ORIGIN, Origin, origin_of
 
 _TABLES = ("nodes", "whitelist", "keys", "tombstones", "revocations")
@@ -64,28 +65,29 @@ class WaitingNodes:
     rotations: tuple[bytes, ...]
 
 
-class OverviewTables:
-    """The part of the store that reads all tables at once; see :class:`teds_provision.station.store.Store`."""
+class Overview:
+    """All that one station knows of its nodes, across all topics; read only."""
 
-    _database: Database
+    def __init__(self, store: Store) -> None:
+        self._store = store
 
     def find(self, search: Search) -> list[bytes]:
         """Return the UUIDs of the nodes that are meant, ascending."""
         terms, values = _terms(search)
         statement = f"""SELECT k.uuid FROM {_KNOWN} k LEFT JOIN nodes n ON n.uuid = k.uuid
             LEFT JOIN whitelist w ON w.uuid = k.uuid WHERE {" AND ".join(terms) or "1"} ORDER BY k.uuid"""
-        return [bytes(uuid) for (uuid,) in self._database.execute(statement, values)]
+        return [bytes(uuid) for (uuid,) in self._store.execute(statement, values)]
 
-    def overview(self, uuids: Sequence[bytes]) -> Iterator[NodeOverview]:
-        """Give what is known of these nodes, in their order, a page at a time; holds no lock between pages."""
+    def nodes(self, uuids: Sequence[bytes]) -> Iterator[NodeOverview]:
+        """Give what is known of these nodes, in their order, a chunk at a time; holds no lock between chunks."""
         for first in range(0, len(uuids), PAGE):
             yield from self._page(uuids[first : first + PAGE])
 
-    def tally(self, today: str) -> WaitingNodes:
+    def waiting(self, today: str) -> WaitingNodes:
         """Return the nodes that wait for an operator; ``today`` is a day, ISO 8601."""
 
         def some(statement: str, *values: Any) -> tuple[bytes, ...]:
-            return tuple(bytes(uuid) for (uuid,) in self._database.execute(statement, values))
+            return tuple(bytes(uuid) for (uuid,) in self._store.execute(statement, values))
 
         gone = "(SELECT uuid FROM tombstones UNION SELECT uuid FROM revocations)"
         return WaitingNodes(
@@ -106,14 +108,8 @@ class OverviewTables:
 
     def is_known(self, uuid: bytes) -> bool:
         """Return True if anything is known of a node."""
-        row = self._database.one(f"SELECT {_IS_KNOWN}", (uuid,))
+        row = self._store.one(f"SELECT {_IS_KNOWN}", (uuid,))
         return row is not None and bool(row[0])
-
-    def named(self, name: str) -> bytes | None:
-        """Return the UUID of the only node of exactly this name, None if none or several have it."""
-        statement = "SELECT uuid FROM nodes WHERE name = ? UNION SELECT uuid FROM whitelist WHERE name = ? LIMIT 2"
-        rows = self._database.execute(statement, (name, name))
-        return bytes(rows[0][0]) if len(rows) == 1 else None
 
     def _page(self, uuids: Sequence[bytes]) -> Iterator[NodeOverview]:
         nodes = self._rows("nodes", _NODE, uuids)
@@ -146,12 +142,12 @@ class OverviewTables:
 
         Only a node whose reading lists a TEDS at the place of the Origin TEDS has its image looked at.
         """
-        listed = self._database.execute(
+        listed = self._store.execute(
             f"SELECT uuid FROM readings WHERE uuid IN ({places(uuids)}) AND instr(digests, ?) > 0", [*uuids, _ORIGIN]
         )
         found: dict[bytes, Origin] = {}
         for (uuid,) in listed:
-            row = self._database.one("SELECT blocks FROM datasheets WHERE uuid = ? ORDER BY row DESC LIMIT 1", (uuid,))
+            row = self._store.one("SELECT blocks FROM datasheets WHERE uuid = ? ORDER BY row DESC LIMIT 1", (uuid,))
             try:
                 origin = origin_of(unpacked(uuid, row[0]).blocks) if row is not None else None
             except ValueError:  # whoever reads the datasheet itself reports the damage
@@ -166,7 +162,7 @@ class OverviewTables:
     def _lists(
         self, table: str, columns: Sequence[str], uuids: Sequence[bytes], order: str
     ) -> dict[bytes, list[dict[str, Any]]]:
-        rows = self._database.execute(
+        rows = self._store.execute(
             f"SELECT uuid, {', '.join(columns)} FROM {table} WHERE uuid IN ({places(uuids)}) ORDER BY {order}", uuids
         )
         found: dict[bytes, list[dict[str, Any]]] = {}

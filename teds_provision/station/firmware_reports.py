@@ -1,0 +1,71 @@
+"""What each node last reported of its firmware (About), and under which report its datasheet was signed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from teds_provision.station.row_macs import MacRow, RowMacs, Values
+from teds_provision.station.store.database import places
+from teds_provision.station.store.records import FirmwareRecord, utc_now
+from teds_provision.station.store.store import Store
+
+
+class FirmwareReports:
+    """The firmware reports of the nodes of one station, by UUID; ``station/firmware.py`` judges them."""
+
+    def __init__(self, store: Store, row_macs: RowMacs) -> None:
+        self._store, self._row_macs = store, row_macs
+
+    def get(self, uuid: bytes) -> FirmwareRecord | None:
+        """Return what a node last reported of its firmware, None if nothing is known."""
+        return self.get_many([uuid]).get(uuid)
+
+    def get_many(self, uuids: Sequence[bytes]) -> dict[bytes, FirmwareRecord]:
+        """Return what a chunk of nodes last reported, by UUID; what another program wrote does not count."""
+        found = self._store.read(_record, f"SELECT * FROM firmware WHERE uuid IN ({places(uuids)})", uuids)
+        return {record.uuid: record for record in found if self._counts(record)}
+
+    def keep(self, uuid: bytes, report: bytes, *, in_session: bool, signed: bool = False) -> None:
+        """Keep a node's answer to About (empty: it reports none); only one in a session replaces one of a session.
+
+        ``signed``: its datasheet was signed under this firmware. An answer that is known is not written again.
+        """
+        with self._store.together():
+            before = self.get(uuid)
+            if before is not None and before.in_session and not in_session:
+                return
+            known = before is not None and (before.report, before.in_session) == (report, in_session)
+            at = before.at if before is not None and known else utc_now()
+            kept = before.signed if before is not None else None
+            record = FirmwareRecord(uuid, report, in_session, at, report if signed else kept)
+            if record != before:
+                self._put(record)
+
+    def _put(self, record: FirmwareRecord) -> None:
+        """Write a report with its MAC; without one, and so only a hint, as long as the vault is closed."""
+        mac = self._row_macs.mac("firmware", _bound(record)) if self._row_macs.active else None
+        values = (record.uuid, record.report, record.in_session, record.at, record.signed, mac)
+        self._store.execute(f"INSERT OR REPLACE INTO firmware VALUES({places(values)})", values)
+
+    def forget(self, uuid: bytes) -> None:
+        """Forget the report of a node that was reset, or of a board that was replaced."""
+        self._store.execute("DELETE FROM firmware WHERE uuid = ?", (uuid,))
+
+    def _counts(self, record: FirmwareRecord) -> bool:
+        """Return True if a report counts: its MAC is right, or the vault is closed, or it is a hint anyway."""
+        return not record.in_session or self._row_macs.counts(record.mac, "firmware", _bound(record))
+
+    def mac_rows(self) -> Iterator[MacRow]:
+        """Yield every report of a session, for a check of its MAC."""
+        for record in self._store.read(_record, "SELECT * FROM firmware ORDER BY uuid"):
+            if record.in_session:
+                yield f"the firmware report of {record.uuid.hex()}", record.mac, "firmware", _bound(record)
+
+
+def _record(uuid: bytes, report: bytes, in_session: int, at: str, *rest: Any) -> FirmwareRecord:
+    return FirmwareRecord(uuid, report, bool(in_session), at, *rest)
+
+
+def _bound(record: FirmwareRecord) -> Values:
+    return (record.uuid, record.report, str(int(record.in_session)), record.at, record.signed)
