@@ -11,14 +11,15 @@ CPU_m0 := -mcpu=cortex-m0plus -DTEDS_BEARSSL_M15
 CPU_m4 := -mcpu=cortex-m4
 CPU_m33 := -mcpu=cortex-m33
 CPUS := m0 m4 m33
-# All on CAN; security alone; with NFC; with NFC and BLE.
+# All on CAN; security alone; with updates; with NFC; with NFC and BLE.
 LIBRARY_full :=
 LIBRARY_security := -DTEDS_OPERATION=0 -DTEDS_CAN_FD=0
+LIBRARY_managed := -DTEDS_MANAGED=1
 LIBRARY_nfc := -DTEDS_NFC=1
 LIBRARY_ble := -DTEDS_NFC=1 -DTEDS_BLE=1
 
 .PHONY: arm
-arm: $(foreach cpu,$(CPUS),$(foreach what,full.a security.a nfc.a ble.a measure.elf steps.elf,$(BUILD)/arm/$(cpu)-$(what))) \
+arm: $(foreach cpu,$(CPUS),$(foreach what,full.a security.a managed.a nfc.a ble.a measure.elf steps.elf,$(BUILD)/arm/$(cpu)-$(what))) \
   $(BUILD)/arm/m4-node.elf
 
 define LIBRARY_RULE
@@ -29,7 +30,7 @@ $(BUILD)/arm/$(1)-$(2).a: $(SOURCES) $(HEADERS)
 	@rm -f $$@
 	$(ARM)ar rcs $$@ $(BUILD)/arm/$(1)-$(2)/*.o
 endef
-$(foreach cpu,$(CPUS),$(foreach size,full security nfc ble,$(eval $(call LIBRARY_RULE,$(cpu),$(size)))))
+$(foreach cpu,$(CPUS),$(foreach size,full security managed nfc ble,$(eval $(call LIBRARY_RULE,$(cpu),$(size)))))
 
 define BEARSSL_RULE
 $(BUILD)/arm/$(1)-bearssl.a: port/bearssl/teds_bearssl.c $(wildcard port/bearssl/*.txt) $(HEADERS) arm.mk
