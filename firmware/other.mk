@@ -33,14 +33,14 @@ $(foreach cpu,$(OTHERS),$(eval $(call OTHER_RULE,$(cpu))))
 CHECKS := bugprone-*,cert-*,clang-analyzer-*,-bugprone-easily-swappable-parameters,-cert-err33-c,-bugprone-branch-clone,-clang-analyzer-security.insecureAPI.*
 analyse: misra
 	cppcheck --std=c99 --enable=warning,performance,portability --inline-suppr --error-exitcode=1 --quiet \
-	  -DTEDS_NFC=1 -DTEDS_BLE=1 -Iinclude -Isrc src port/bearssl
+	  -DTEDS_NFC=1 -DTEDS_BLE=1 -DTEDS_MANAGED=1 -Iinclude -Isrc src port/bearssl
 	clang-tidy-14 --quiet --warnings-as-errors='*' --checks='-*,$(CHECKS)' $(SOURCES) -- \
-	  -std=c99 -DTEDS_NFC=1 -DTEDS_BLE=1 -Iinclude -Isrc
+	  -std=c99 -DTEDS_NFC=1 -DTEDS_BLE=1 -DTEDS_MANAGED=1 -Iinclude -Isrc
 
 # MISRA C:2012 by cppcheck's addon: which rules are broken is what docs/misra.md lists with reasons.
 misra:
 	@mkdir -p $(BUILD)
-	cppcheck --std=c99 --addon=misra --quiet -DTEDS_NFC=1 -DTEDS_BLE=1 -Iinclude -Isrc src port/bearssl 2>$(BUILD)/misra.txt
+	cppcheck --std=c99 --addon=misra --quiet -DTEDS_NFC=1 -DTEDS_BLE=1 -DTEDS_MANAGED=1 -Iinclude -Isrc src port/bearssl 2>$(BUILD)/misra.txt
 	@for rule in $$(grep -o 'misra-c2012-[0-9.]*[0-9]' $(BUILD)/misra.txt | sed 's/misra-c2012-//' | sort -u); do \
 	  grep -q "^| $$rule |" docs/misra.md || \
 	    { echo "MISRA C:2012 rule $$rule is not in docs/misra.md:"; grep -A1 "c2012-$$rule]" $(BUILD)/misra.txt; exit 1; }; done

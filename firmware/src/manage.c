@@ -92,9 +92,10 @@ enum { OF_NO_CONCERN, OFF, LENGTH, SHA, REFUSAL, MATCH };
 static unsigned key_of(const item *key)
 {
     static const struct {
-        char name[6];
+        const char *name;
         uint8_t length, key;
-    } known[] = {{"off", 3, OFF}, {"len", 3, LENGTH}, {"sha", 3, SHA}, {"rc", 2, REFUSAL}, {"err", 3, REFUSAL}, {"match", 5, MATCH}};
+    } known[] = {{"off", 3, OFF},    {"len", 3, LENGTH},  {"sha", 3, SHA},
+                 {"rc", 2, REFUSAL}, {"err", 3, REFUSAL}, {"match", 5, MATCH}};
     for (size_t i = 0; i < sizeof known / sizeof known[0]; i++) {
         if (key->value == known[i].length && memcmp(key->octets, known[i].name, key->value) == 0) {
             return known[i].key;

@@ -200,6 +200,7 @@ static void fill_firmware(teds_port *port, const board *own)
     }
     if (own->firmware.has_images) {
         port->manage = port_manage;
+        port->manage_octets = IMAGES_PACKET;
         port->restart = port_restart;
     }
 }

@@ -407,6 +407,7 @@ bool memory_images(memory_board *board, const uint8_t *owner, size_t length, boo
     board->has_images = true;
     board->port.about = image_about;
     board->port.manage = image_manage;
+    board->port.manage_octets = IMAGES_PACKET;
     board->port.restart = image_restart;
     return images_owner(&board->images, owner, length) == 0;
 }
