@@ -32,13 +32,16 @@ if TYPE_CHECKING:
     import pathlib
     from pathlib import Path
 
-    from teds_provision.cli import shell_completion, start
+    from teds_provision.cli import file_kinds, shell_completion, start
 else:
     shell_completion, start = late("teds_provision.cli.shell_completion"), late("teds_provision.cli.start")
+    file_kinds = late("teds_provision.cli.file_kinds")  # for errors about a file
     difflib, json, pathlib = late("difflib"), late("json"), late("pathlib")  # --help needs none of them
 
 ENVIRONMENT_PREFIX = "TEDS_PROVISION"
 INTERRUPTED, BROKEN_PIPE = 130, 141
+_OF_A_FILE: Final = (2, 3, 7, 8)
+"""Exit codes of errors that a file of another kind can cause."""
 _NO_NAMES: Final = frozenset({errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR})
 """Error numbers for names that the system rejects, wherever they are first used."""
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF})
@@ -223,7 +226,10 @@ def run(arguments: list[str]) -> int:
         return _misused(arguments, error)
     except TedsProvisionError as error:
         _traceback(arguments)
-        return _fail(arguments, error.exit_code, error.code, error.message, error.hint)
+        kind = file_kinds.mistaken_file(arguments) if error.exit_code in _OF_A_FILE else ""
+        named = kind.partition(" is ")[2].rstrip(".")
+        hint = f"{kind} {error.hint}".rstrip() if kind and named not in error.message else error.hint
+        return _fail(arguments, error.exit_code, error.code, error.message, hint)
     except OSError as error:
         return _untold(arguments, error)
     except Exception as error:  # noqa: BLE001 - the last line of defence: a foreign exception is a bug of ours

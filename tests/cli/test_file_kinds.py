@@ -1,0 +1,69 @@
+"""A file of another kind is named for what it is, by every command that takes a file of a format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from teds_provision.cli.file_kinds import mistaken_file
+from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
+from tests.bench import PASSPHRASE
+
+from .shell import call
+
+UUID = bytes.fromhex("8d4d9da65281f7000000")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """One file of each kind that a person has at hand."""
+    there = tmp_path / "files"
+    there.mkdir()
+    (there / "angle.csv").write_text("# date: 2026-11-26\nraw,value [degree]\n0,0\n65535,360\n")
+    (there / "boards.csv").write_text("uuid,name,profile\n,a,gripper\n")
+    (there / "gripper.toml").write_text('extends = "gripper"\ntitle = "Mine"\n')
+    (there / "image.json").write_text(Image(UUID, load_profile("gripper").build(UUID).blocks).to_json())
+    (there / "list.xml").write_text('<?xml version="1.0"?>\n<whitelist/>\n')
+    (there / "bus.dbc").write_text('VERSION ""\nNS_ :\nBO_ 1 A: 8 B\n')
+    (there / "report.pdf").write_bytes(b"%PDF-1.7\n")
+    pem = call(home, "--json", "init").json["public_key"]
+    (there / "station.pem").write_text(pem)
+    monkeypatch.chdir(there)
+    return there
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "kind"),
+    [
+        (["show", "angle.csv"], 8, "angle.csv is a calibration (CSV)."),
+        (["verify", "list.xml"], 8, "list.xml is a whitelist."),
+        (["whitelist", "import", "image.json"], 8, "image.json is a TEDS image."),
+        (["import-keys", "station.pem"], 8, "station.pem is a public key (PEM)."),
+        (["restore", "image.json"], 8, "image.json is a TEDS image."),
+        (["trust", "add", "x", "boards.csv"], 8, "boards.csv is a sheet of boards (CSV)."),
+        (["trust", "ca", "import", "station.pem"], 7, "station.pem is a public key (PEM)."),
+        (["init", "--certificate", "station.pem"], 8, "station.pem is a public key (PEM)."),
+        (["build", UUID.hex(), "-p", "gripper", "--calibration", "1=gripper.toml"], 8, "a transducer profile (TOML)."),
+        (["provision", "--batch=angle.csv"], 8, "angle.csv is a calibration (CSV)."),
+        (["node", "create", "node", "--teds", "bus.dbc"], 8, "bus.dbc is a DBC file."),
+        (["record", "info", "report.pdf"], 8, "report.pdf is a PDF."),
+        (["profile", "check", "./boards.csv"], 3, "boards.csv is a sheet of boards (CSV)."),
+    ],
+    ids=lambda words: " ".join(words[:2]) if isinstance(words, list) else "",
+)
+def test_a_file_of_another_kind_is_named(home: Path, folder: Path, words: list[str], code: int, kind: str) -> None:
+    del folder
+    said = call(home, "--json", *words, passphrase=PASSPHRASE)
+    assert said.code == code, said
+    assert kind in said.json["error"]["hint"], said
+
+
+def test_a_file_of_the_right_kind_is_not_explained(home: Path, folder: Path) -> None:
+    """A mistake inside it is reported alone."""
+    for words in (["show", "image.json"], ["provision", "--batch", "boards.csv", "-p", "gripper"], ["show", "none"]):
+        assert mistaken_file(words) == ""
+    (folder / "angle.csv").write_text("raw,value [degree]\n0,zero\n")
+    said = call(home, "--json", "calibrate", "fit", "angle.csv").json["error"]
+    assert "angle.csv is" not in said["hint"]
