@@ -381,6 +381,10 @@ class Client:
         found: Applied = self.request("PUT", f"/nodes/{quote(node, safe='')}/channels/{channel}", body)
         return found
 
+    def locate(self, node: str, seconds: int = 10) -> None:
+        """Make a node blink or beep for so many seconds, at most 60; 0 stops it."""
+        self.request("POST", f"/nodes/{quote(node, safe='')}/locate", {"seconds": seconds})
+
     def release_actuator(self, node: str, channel: int) -> bool | None:
         """Release an actuator; return whether the node reports that it is safe, None without a report."""
         found: Applied = self.request("PUT", f"/nodes/{quote(node, safe='')}/channels/{channel}", {"hold": 0})

@@ -12,6 +12,7 @@ from teds_provision.api.schema import Meta
 
 Uuid = Annotated[str, Meta(pattern="^[0-9a-f]{20}$", description="20 hex digits")]
 Time = Annotated[float, Meta(description="unix seconds")]
+_FirmwareOrigin = TypedDict("_FirmwareOrigin", {"from": Literal["session", "plain"]})
 _Origin = TypedDict("_Origin", {"from": Literal["session", "kept", "plain"]})  # a keyword of Python
 
 
@@ -151,6 +152,17 @@ class Wrapped(TypedDict):
     sha256: str | None
 
 
+class Firmware(_FirmwareOrigin):
+    """What a node reports of its firmware, and whether its type accepts it. A report proves no image."""
+
+    text: Annotated[str, Meta(description="board and application")] | None
+    version: Annotated[str, Meta(description="null: it does not report its firmware")] | None
+    build: int | None
+    image: Annotated[str, Meta(description="digest of the running image, 64 hex digits")] | None
+    state: Literal["not-reported", "bad", "other", "outdated", "on-trial", "pending", "good", "unjudged"]
+    changed: Annotated[bool, Meta(description="another image than when its datasheet was last signed")]
+
+
 class Node(TypedDict):
     """A node, as far as it is known."""
 
@@ -186,7 +198,15 @@ class Node(TypedDict):
     measurement: str | None
     measuring: NotRequired[Report | None]
     power: dict[str, Any] | None
+    firmware: Firmware | None
     channels: list[Channel]
+
+
+class Located(TypedDict):
+    """A node that blinks or beeps."""
+
+    uuid: Uuid
+    seconds: Annotated[int, Meta(description="0: it stopped")]
 
 
 class Group(TypedDict):

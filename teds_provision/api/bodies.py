@@ -40,6 +40,13 @@ class Nothing:
 
 
 @dataclass(frozen=True)
+class Locate:
+    """POST /nodes/{uuid}/locate."""
+
+    seconds: Annotated[int, Meta(minimum=0, maximum=60, description="for how long it blinks; 0 stops it")]
+
+
+@dataclass(frozen=True)
 class SheetText:
     """PUT /nodes/{uuid}/teds."""
 

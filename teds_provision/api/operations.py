@@ -78,6 +78,8 @@ OPERATIONS: Final = (
     Operation("POST", "/nodes/{uuid}/provision",
               "Provision a node (next: whichever is tapped next), or stop waiting for it.", answers.Provisioning,
               bodies.Order, status=202),
+    Operation("POST", "/nodes/{uuid}/locate", "Make a node blink or beep, to see which one it is.", answers.Located,
+              bodies.Locate),
     Operation("GET", "/nodes/{uuid}/channels/{number}", "Get a channel with its last value.", answers.Channel),
     Operation("PUT", "/nodes/{uuid}/channels/{number}", "Set an actuator and hold it, or let it go.", answers.Applied,
               bodies.SetPoint),

@@ -97,6 +97,7 @@ KINDS = ("periodic", "event", "free")
 @click.option(
     "--require", type=FileToRead(), metavar="FILE", help="Requirements of the task, checked against the datasheets."
 )
+@click.option("--require-firmware", is_flag=True, help="Refuse nodes whose firmware their type does not accept.")
 @click.option("--scalar-rate", type=Number(0, 1000), default=10.0, show_default=True, metavar="HZ",
               help="Rate of single-value topics.")  # fmt: skip
 @link_options
@@ -148,7 +149,11 @@ def measure(
     if group and duration is None:
         kept = _carried_on(app, station, kept)
     job = measure_room.running.measurement_job.MeasurementJob(
-        station, kept, request=measure_room.request.MeasurementRequest(timeout=links.timeout)
+        station,
+        kept,
+        request=measure_room.request.MeasurementRequest(
+            timeout=links.timeout, require_firmware=wished["require_firmware"]
+        ),
     )
     for uuid in uuids:
         station.unlock(uuid)

@@ -102,6 +102,7 @@ _FILE = FileToRead(exists=True)
 @click.option("--actuators/--no-actuators", default=True, show_default=True, help="Accept set points from ROS topics.")
 @click.option("--dead-man", type=WholeNumber(20, 10_000), default=1000, show_default=True, metavar="MS",
               help="Time without set points before an actuator goes to its safe state.")  # fmt: skip
+@click.option("--require-firmware", is_flag=True, help="Measure no nodes whose firmware their type does not accept.")
 @file_units_option
 @click.option("--trust-dcc", type=_FILE, multiple=True, metavar="CERT.pem",
               help="Require calibration certificates signed by this one, or under this CA; repeatable.")  # fmt: skip

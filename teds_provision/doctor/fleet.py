@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, Final
 
 from teds_provision import teds
@@ -12,9 +13,10 @@ from teds_provision.errors import BadDataError, NotFoundError, StoreChangedError
 from teds_provision.files import read_text
 from teds_provision.limits import LIMITS, load_toml
 from teds_provision.sanitize import counted
+from teds_provision.station.firmware import FirmwareDemands, known_firmware
 from teds_provision.station.node_keys import deferred_until
 from teds_provision.station.station import Station
-from teds_provision.station.store import utc_now
+from teds_provision.station.store import chunks, utc_now
 from teds_provision.station.store.database import has_store
 
 _SHOWN: Final = 5
@@ -88,6 +90,22 @@ def store_file(system: System) -> Iterator[Finding]:
         yield Finding("store file", "failed", why, "teds-provision restore FILE (a backup)")
 
 
+def _firmware(station: Station) -> tuple[list[bytes], list[bytes]]:
+    """Return the nodes whose firmware their type does not accept, and those that another image runs on than before."""
+    demands = FirmwareDemands(station.home)
+    odd, changed = [], []
+    for page in chunks(station.firmware_reports.all()):
+        nodes = station.nodes.get_many([record.uuid for record in page])
+        for record in page:
+            node = nodes.get(record.uuid)
+            known = known_firmware(record, partial(demands.of, node.profile if node is not None else None))
+            if known is not None and known.state not in ("good", "unjudged", "on-trial", "pending"):
+                odd.append(record.uuid)
+            if known is not None and known.changed:
+                changed.append(record.uuid)
+    return odd, changed
+
+
 @check("nodes", "store")
 def nodes(system: System) -> Iterator[Finding]:
     """Report what needs an operator: ended calibrations, duplicate names, drafts, unverified nodes, rotations."""
@@ -96,6 +114,7 @@ def nodes(system: System) -> Iterator[Finding]:
     with Station.inspect(system.home) as station:
         tally = station.overview.waiting(datetime.now(UTC).strftime("%Y-%m-%d"))
         due = station.keys.rotations_due()
+        odd, changed = _firmware(station)
     begins = {uuid: deferred_until(why) or "" for uuid, why in due.items()}
     later = tuple(uuid for uuid in tally.rotations if begins.get(uuid, "") > utc_now())
     own = tuple(uuid for uuid in tally.rotations if uuid not in later)
@@ -105,6 +124,8 @@ def nodes(system: System) -> Iterator[Finding]:
         (tally.twice, "with a name that another node has", "Give them different names: build UUID --name, sign, write"),
         (tally.drafts, "with a datasheet that was built but not written", "teds-provision draft list"),
         (tally.unverified, "keyed but never verified", "teds-provision verify UUID"),
+        (odd, "with firmware that their type does not accept", "teds-provision update UUID IMAGE"),
+        (changed, "whose firmware changed since calibration", "Calibrate again, or: verify UUID --accept-firmware"),
         (own, "whose key must be rotated", "Open a session once: teds-provision verify UUID"),
         (
             later,

@@ -51,7 +51,9 @@ from teds_provision.measure.verified_session import (
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import idle
 from teds_provision.protocol.operation.stream_commands import SOON
+from teds_provision.station.firmware import firmware_of
 from teds_provision.station.station import Station
+from teds_provision.steps.firmware import firmware_warning, read_firmware, require_good_firmware
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.teds.sheet import Channel
 
@@ -109,6 +111,7 @@ class NodeSupervisor:
         self._driven: TopicActuators | None = None
         self._told = ""
         self._comes_back = False  # it is let go for a while, and its room is kept for it
+        self._firmware_warning = ""
         self._why = ""  # why it was asked to end, for its last report
         self._thread = self._new_thread()
 
@@ -321,6 +324,10 @@ class NodeSupervisor:
                 self._proven = node.sealed
             if self._request.require is not None:
                 self._request.require.offer(self.uuid, trusted.sheet, self._stop)
+            runs = firmware_of(self._station, self.uuid, read_firmware(node))
+            if self._request.require_firmware:
+                require_good_firmware(self.uuid, runs)
+            self._firmware_warning = firmware_warning(runs)
             self.verified, self._announced = trusted, 0.0
             answers = False
             try:
@@ -349,7 +356,7 @@ class NodeSupervisor:
         self.streams.described()
         if actuators:
             self._driven = self._take_up(bus, trusted, actuators, address)
-        notes = [plans.slowed] if plans.slowed else []
+        notes = [note for note in (plans.slowed, self._firmware_warning) if note]
         notes += [problem for heard in self.streams.running.values() for problem in heard.interpreter.problems.values()]
         self.ever_ran, self.error = True, None
         self._retry_policy.has_run()

@@ -91,6 +91,7 @@ class MeasurementRequest:
     unsigned: bool = False  # raw values are wanted also of a node with an unsigned datasheet
     unverified: bool = False  # only nodes with an unsigned datasheet, calibrated by it and marked so
     require: Requirements | None = None
+    require_firmware: bool = False  # only nodes whose firmware their type accepts
     newcomers: bool = False  # nodes come and go: no room is kept for one that is away, and its first error ends it
     by: str = "measure"  # the command that a reading of the datasheet is put down to
     beside: Mapping[bytes, str] = field(default_factory=dict)  # which process measures a node too, in words

@@ -40,6 +40,7 @@ from teds_provision.ncap.settings import Detection, Settings, own_source
 from teds_provision.ncap.sinks import DaemonSinks
 from teds_provision.ncap.web.tokens import Tokens
 from teds_provision.station.station import Station
+from teds_provision.steps.commands import locate_here
 from teds_provision.talk.conversation import Conversation
 
 _log = logging.getLogger(__name__)
@@ -75,6 +76,7 @@ class Daemon:
             sinks,
             self._admits,
             dead_man=settings.dead_man,
+            require_firmware=settings.require_firmware,
         )
         self.node_locks.given = self._free_again
         self._takes_set_points = sinks.take_set_points
@@ -350,6 +352,11 @@ class Daemon:
             watch.look_at_all()
         self._stop.wait(_DISCOVERY)
         return self.directory.nodes()
+
+    def locate(self, uuid: str, seconds: int) -> None:
+        """Make a node blink for so many seconds, 0: stop; raises FrozenError while it is measured."""
+        station = self.station
+        self.node_jobs.with_node(uuid, "locate", lambda node: locate_here(station, node, seconds))
 
     def known(self, text: str) -> str:
         """Return the UUID that a path names, of a known node; raises NotFoundError, UsageError."""

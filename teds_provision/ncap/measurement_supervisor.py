@@ -110,7 +110,9 @@ class MeasurementSupervisor:
         admits: Callable[[SetPointCommand], bool],
         *,
         dead_man: int = DEAD_MAN,
+        require_firmware: bool = False,
     ) -> None:
+        self._require_firmware = require_firmware
         self._station, self._directory, self._live, self._node_locks = station, roster, live, turns
         self._unverified: UnsignedNodes | None = None
         self._adopted: set[bytes] = set()
@@ -629,7 +631,9 @@ class MeasurementSupervisor:
             running.kept,
             more=lambda take: self._sinks.more(running.kept, take),
             admits=self._admits if self._sinks.moves(running.kept) else None,
-            request=MeasurementRequest(patient=True, by="ncap", unverified=unverified),
+            request=MeasurementRequest(
+                patient=True, by="ncap", unverified=unverified, require_firmware=self._require_firmware
+            ),
             opened=self._sinks.open,
         )
 

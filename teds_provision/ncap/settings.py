@@ -35,7 +35,8 @@ class Settings:
     are URLs by the names under which a measurement may name them; ``record`` is a folder for a recording of each
     measurement. ``actuators``: set points may come by topics of ROS. ``measure`` selects nodes to measure as they come,
     at ``rate`` in Hz at most; ``frozen``: only those selected at the start. ``dead_man`` in ms is for all actuators
-    whose measurement has no other. ``registry``: the registry that was joined is followed. ``trace`` is an open one:
+    whose measurement has no other. ``require_firmware``: only nodes whose
+    firmware their type accepts. ``registry``: the registry that was joined is followed. ``trace`` is an open one:
     every frame of every link is written.
     """
 
@@ -58,6 +59,7 @@ class Settings:
     measure: str | None = None
     rate: float | None = None
     frozen: bool = False
+    require_firmware: bool = False
     registry: bool = False
     metrics: bool = False
     clause_12: bool = False

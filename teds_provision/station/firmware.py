@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from teds_provision.errors import BadDataError, GarbledError, NotFoundError, StoreError
 from teds_provision.protocol.messages.firmware import FirmwareFlag, FirmwareReport
@@ -17,6 +17,7 @@ from teds_provision.station.store.records import FirmwareRecord
 from teds_provision.teds.profile import default_folders, load_profile
 from teds_provision.teds.profile.firmware import FirmwareDemand
 
+CHANGED: Final = "firmware changed since calibration"
 FirmwareState = Literal["not-reported", "bad", "other", "outdated", "on-trial", "pending", "good", "unjudged"]
 
 

@@ -26,6 +26,11 @@ class FirmwareReports:
         found = self._store.read(_record, f"SELECT * FROM firmware WHERE uuid IN ({places(uuids)})", uuids)
         return {record.uuid: record for record in found if self._counts(record)}
 
+    def all(self) -> Iterator[FirmwareRecord]:
+        """Yield what every node last reported, by UUID; what another program wrote does not count."""
+        found = self._store.read(_record, "SELECT * FROM firmware ORDER BY uuid")
+        return (record for record in found if self._counts(record))
+
     def keep(self, uuid: bytes, report: bytes, *, in_session: bool, signed: bool = False) -> None:
         """Keep a node's answer to About (empty: it reports none); only one in a session replaces one of a session.
 

@@ -13,8 +13,10 @@ from teds_provision.protocol.messages.firmware import ABOUT
 from teds_provision.protocol.messages.frames import Function, Reason, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.firmware import (
+    CHANGED,
     FirmwareReading,
     FirmwareState,
+    KnownFirmware,
     decoded_report,
     state_of,
 )
@@ -94,6 +96,23 @@ def require_firmware(uuid: bytes, demand: FirmwareDemand | None, reading: Firmwa
         f"Board {node} {_REFUSED[state]}{named}{f' (wanted: {wanted})' if wanted else ''}. Nothing was signed.",
         hint=f"Install other firmware, then try again: agree {node}, update {node} IMAGE, provision.",
     )
+
+
+def require_good_firmware(uuid: bytes, known: KnownFirmware | None) -> None:
+    """Refuse a node to measure with whose firmware is not good (or unjudged, if its type demands none)."""
+    state = known.state if known is not None else "not-reported"
+    if state not in ("good", "unjudged"):
+        raise FirmwareError(
+            f"The firmware of node {uuid.hex()} is {state}.",
+            hint=f"See nodes {uuid.hex()}; to install other firmware: update {uuid.hex()} IMAGE",
+        )
+
+
+def firmware_warning(known: KnownFirmware | None) -> str:
+    """Return what a measurement says of a node's firmware, "" for nothing."""
+    if known is None or known.state in ("good", "unjudged"):
+        return CHANGED if known is not None and known.changed else ""
+    return f"its firmware is {known.state}" + (f", and {CHANGED}" if known.changed else "")
 
 
 def keep_firmware(station: Station, uuid: bytes, reading: FirmwareReading | None, *, signed: bool = False) -> None:

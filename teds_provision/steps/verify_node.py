@@ -72,6 +72,7 @@ def verify_in_session(station: Station, node: Conversation, *, by: str) -> NodeV
     judged again all the same: trust, bans and pins may have changed.
     """
     identity, c = read_identity(node), node.open_counter
+    keep_firmware(station, node.uuid, read_firmware(node))
     octets = read_block(node, SECURITY)
     known = freshness_floor_of(station, node.uuid, identity)
     image = readings.cached_image_if_current(station, node, octets, known)

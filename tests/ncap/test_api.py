@@ -100,6 +100,14 @@ def test_a_node_has_its_verdict_with_checks_and_its_channels_with_units(asked: C
     assert opening["high"] == pytest.approx(0.11)
     assert opening["uncertainty"] == pytest.approx(1e-4)
     assert opening["topic"] == "/bench/hand/opening"
+    assert node["firmware"] is not None
+    assert node["firmware"]["text"] == "virtual/teds-provision"
+    assert (node["firmware"]["from"], node["firmware"]["state"]) == ("session", "unjudged")
+    asked.locate("hand", 5)
+    asked.locate("hand", 0)
+    with pytest.raises(ApiError) as caught:
+        asked.locate("hand", 61)
+    assert caught.value.status == 422
     assert asked.node(hand[:6])["uuid"] == hand
     assert hand in {node["uuid"] for node in asked.nodes()}
 

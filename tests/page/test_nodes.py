@@ -33,6 +33,7 @@ def test_nodes_are_shown_with_verdict_link_and_channels(browser: Browser, lab: L
             card.get_by_text("Authentic", exact=True).wait_for()
             assert "CAN" in card.inner_text()
             assert re.search(r"(80|79) %", card.inner_text()), card.inner_text()
+            assert "virtual/teds-provision" in card.inner_text()
         nodes.get_by_role("link", name="hand").click()
         page.get_by_role("heading", name="hand", exact=True).wait_for()
         rows = page.get_by_role("table", name="Channels and their latest values")
@@ -42,6 +43,10 @@ def test_nodes_are_shown_with_verdict_link_and_channels(browser: Browser, lab: L
         page.get_by_text("Security check:").click()
         assert page.get_by_text("passed", exact=True).count() > 10
         assert lab.nodes["hand"].uuid in page.locator(".uuid").inner_text().replace(" ", "")
+        page.get_by_role("button", name="Locate").click()
+        page.get_by_role("status").filter(has_text="The board blinks for 10 seconds.").wait_for(state="attached")
+        assert lab.board is not None
+        lab.board.wait_for('"locate"')
 
 
 def test_an_empty_home_says_what_to_do_next_and_a_tap_opens_the_node(browser: Browser, fresh: Lab) -> None:

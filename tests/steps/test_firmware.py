@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sqlite3
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from teds_provision.doctor.checks import System
+from teds_provision.doctor.fleet import nodes
 from teds_provision.protocol.messages.firmware import ABOUT, FirmwareFlag, FirmwareReport
 from teds_provision.protocol.messages.frames import Reply
 from teds_provision.protocol.messages.identity import NodeState
@@ -17,7 +19,13 @@ from teds_provision.station.firmware import FirmwareReading, firmware_of, state_
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.firmware import FirmwareError, keep_firmware, read_firmware
+from teds_provision.steps.firmware import (
+    FirmwareError,
+    firmware_warning,
+    keep_firmware,
+    read_firmware,
+    require_good_firmware,
+)
 from teds_provision.steps.identify import identify
 from teds_provision.steps.inventory import inventory
 from teds_provision.steps.provision import ProvisionResult, add_to_whitelist, provision
@@ -243,3 +251,40 @@ def test_a_report_that_another_program_wrote_does_not_count(station: Station) ->
     with closing(sqlite3.connect(station.home / "store.sqlite3")) as file, file:
         file.execute("UPDATE firmware SET report = ?", (OLD.encode(),))
     assert station.firmware_reports.get(board.uuid) is None
+
+
+def test_doctor_names_what_a_type_does_not_accept_and_what_changed(station: Station, tmp_path: Path) -> None:
+    board = FirmwareBoard()
+    given(station, board, profile(tmp_path, TABLE))
+    station.flush()
+    assert [finding.result for finding in nodes(System(station.home))] == ["ok"]
+    board.report = OLD
+    look(station, board)
+    station.flush()
+    told = {finding.why for finding in nodes(System(station.home)) if finding.result == "warning"}
+    assert told == {
+        f"1 with firmware that their type does not accept: {board.uuid.hex()}.",
+        f"1 whose firmware changed since calibration: {board.uuid.hex()}.",
+    }
+
+
+@pytest.mark.parametrize(
+    ("report", "warns"),
+    [
+        (GOOD, ""),
+        (TRIAL, "its firmware is on-trial"),
+        (OLD, "its firmware is outdated, and firmware changed since calibration"),
+        (FirmwareReport("nrf/angle", (1, 9, 0), 0, bytes([8]) * 32), "firmware changed since calibration"),
+    ],
+)
+def test_a_measurement_warns_or_refuses(station: Station, tmp_path: Path, report: FirmwareReport, warns: str) -> None:
+    board = FirmwareBoard()
+    given(station, board, profile(tmp_path, TABLE))
+    board.report = report
+    with met(board, on_bus(board)) as node:
+        require_session(station, node)
+        known = firmware_of(station, board.uuid, read_firmware(node))
+    assert firmware_warning(known) == warns
+    refused = "its firmware is" in warns
+    with pytest.raises(FirmwareError) if refused else nullcontext():
+        require_good_firmware(board.uuid, known)

@@ -313,6 +313,7 @@ class NodeDirectory:
                 "measurement": seen.measurement,
                 "measuring": seen.report,
                 "power": seen.power,
+                "firmware": row.get("firmware"),
             }
         called, unverified = self.called(uuid)
         out["unverified"] = unverified

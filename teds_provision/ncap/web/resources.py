@@ -62,6 +62,7 @@ class Resources:
             Route("/nodes/{uuid}/past", self.past),
             Route("/nodes/{uuid}/teds", self.teds, methods=["GET", "PUT"]),
             Route("/nodes/{uuid}/provision", self.provision, methods=["GET", "POST"]),
+            Route("/nodes/{uuid}/locate", self.locate, methods=["POST"]),
             Route("/nodes/{uuid}/channels/{number:int}", self.channel, methods=["GET", "PUT"]),
             Route("/groups", self.groups, methods=["GET", "POST"]),
             Route("/groups/{name:path}", self.group, methods=["PUT", "DELETE"]),
@@ -286,6 +287,13 @@ class Resources:
             )
         shown, digest = await changing(sheets.plan, uuid, content, accept=accept, retype=retype, expected=expected)
         return JSONResponse(shown, headers=_tagged(digest))
+
+    async def locate(self, request: Request) -> Response:
+        """POST /nodes/UUID/locate."""
+        body = await body_of(request, bodies.Locate)
+        uuid = await self._node_of(request)
+        await changing(self._daemon.locate, uuid, body.seconds)
+        return JSONResponse({"uuid": uuid, "seconds": body.seconds})
 
     async def provision(self, request: Request) -> Response:
         """GET, POST /nodes/UUID/provision; UUID ``next``: whichever node is tapped next."""

@@ -48,6 +48,7 @@ export const paths = {
   node: (uuid) => at("nodes", uuid),
   past: (uuid) => `${at("nodes", uuid)}/past`,
   teds: (uuid) => `${at("nodes", uuid)}/teds`,
+  locate: (uuid) => `${at("nodes", uuid)}/locate`,
   provision: (uuid) => `${at("nodes", uuid)}/provision`,
   channel: (uuid, number) => `${at("nodes", uuid)}/channels/${number}`,
   group: (name) => at("groups", name),

@@ -20,10 +20,23 @@ export function facts(node) {
   else if (node.mode) out.push(h("span", { class: "warn" }, icon("clock"), node.mode));
   else if (node.state) out.push(h("span", {}, node.state));
   if (node.wrapped) out.push(h("span", { class: "warn", title: "The proof ends at the wrapper, not at the sensor." }, icon("warn"), `wrapped: ${node.wrapped.name} (${node.wrapped.kind})`));
+  if (node.firmware) out.push(firmware(node.firmware));
   if (node.whitelisted === false) out.push(h("span", { class: "warn" }, icon("warn"), "not on the whitelist"));
   if (node.groups?.length) out.push(h("span", {}, icon("list"), node.groups.join(", ")));
   if (node.power) out.push(power(node.power));
   return out;
+}
+
+const FIRMWARE = { bad: "ruled out by its type", other: "not of its type", outdated: "outdated", "on-trial": "on trial", pending: "another starts at the next restart" };
+
+/** Firmware and what its type thinks of it, in words; hostile text as everything that a node says. */
+function firmware(told) {
+  const build = told.build ? `+${told.build}` : "";
+  const name = told.version === null ? "firmware not reported" : `${told.text} ${told.version}${build}`.trim();
+  const words = [name, FIRMWARE[told.state], told.from === "plain" ? "not verified" : null, told.changed ? "changed since calibration" : null];
+  const warn = told.changed || ["bad", "other", "outdated", "not-reported"].includes(told.state);
+  const title = told.image ? `Image ${told.image}. The node reports this; it is no proof of the image.` : "The node reports this; it is no proof of the image.";
+  return h("span", { class: warn ? "firmware warn" : "firmware", title }, icon(warn ? "warn" : "list"), words.filter(Boolean).join(", "));
 }
 
 /** Battery and charging in words. */

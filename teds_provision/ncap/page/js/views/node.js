@@ -1,6 +1,7 @@
 // One node: who it is, and its three tabs.
 
-import { chip, fill, h, icon, keyed, text } from "../dom.js";
+import { paths, post } from "../api.js";
+import { button, chip, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
 import { grouped, nameOf, verdict } from "../format.js";
 import { on, state } from "../state.js";
 import { DatasheetTab } from "./datasheet.js";
@@ -17,6 +18,8 @@ export class NodePanel {
     this.open = null;
     this.title = h("h2", { tabindex: "-1" });
     this.head = h("div", { class: "node-facts" });
+    this.locate = button("Locate", { class: "quiet", title: "Make the board blink or beep for 10 seconds.", onclick: () => this.blink() });
+    this.error = h("div", { role: "alert" });
     this.checks = h("details", { class: "checks" }, h("summary", {}), h("ul", {}));
     this.tabs = h(
       "nav",
@@ -31,6 +34,8 @@ export class NodePanel {
       this.title,
       h("p", { class: "uuid", title: "UUID" }, grouped(uuid)),
       this.head,
+      h("p", {}, this.locate),
+      this.error,
       this.checks,
     );
     fill(parent, this.header, this.tabs, this.body);
@@ -46,6 +51,7 @@ export class NodePanel {
     const node = this.node;
     if (!node) return;
     text(this.title, nameOf(node));
+    this.locate.disabled = state.connection !== "live" || state.status?.write === false || node.present === false;
     const [tone, sign, words, why] = verdict(node);
     const heard = node.heard && node.heard.verdict !== node.verdict ? chip("warn", "ask", `Not verified: ${node.heard.verdict}`, "The node sent this outside a session, where anyone on the link could have sent it. It changes nothing.") : null;
     const kept = node.from === "kept" ? chip("plain", "clock", "Kept", "The node has restarted since its datasheet was read. The rest is being read again.") : null;
@@ -55,6 +61,16 @@ export class NodePanel {
     const passed = checks.filter((check) => check.result === "passed").length;
     text(this.checks.firstChild, checks.length ? `Security check: ${passed} of ${checks.filter((one) => one.result !== "skipped").length} passed` : "Key");
     keyed(this.checks.lastChild, [...checks, ...(node.fingerprint ? [{ name: "fingerprint", print: node.fingerprint }] : [])], (check) => check.name + (check.result ?? "") + (check.why ?? ""), checkLine);
+  }
+
+  async blink() {
+    this.error.replaceChildren();
+    try {
+      await post(paths.locate(this.uuid), { seconds: 10 });
+      say("The board blinks for 10 seconds.");
+    } catch (error) {
+      fill(this.error, trouble(error));
+    }
   }
 
   tab(name) {

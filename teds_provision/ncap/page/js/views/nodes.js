@@ -104,7 +104,7 @@ export function nodesView(main, rest) {
     element.tick.hidden = !bulk.on;
     element.tick.firstChild.checked = bulk.chosen.has(node.uuid);
     element.tick.firstChild.setAttribute("aria-label", `Select ${nameOf(node)}`);
-    const told = JSON.stringify([node.name, node.verdict, node.read?.at, node.unverified, node.from, node.busy, node.virtual, node.wrapped?.name, node.link, node.present, node.state, node.mode, node.power, node.groups, node.whitelisted, node.channels?.map((one) => one.name)]);
+    const told = JSON.stringify([node.name, node.verdict, node.read?.at, node.unverified, node.from, node.busy, node.virtual, node.wrapped?.name, node.firmware, node.link, node.present, node.state, node.mode, node.power, node.groups, node.whitelisted, node.channels?.map((one) => one.name)]);
     if (element.told === told) return;
     element.told = told;
     const [tone, sign, words, why] = verdict(node);
