@@ -8,16 +8,22 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from functools import lru_cache
-from typing import Protocol
-
-from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
-from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, decode_dss_signature, encode_dss_signature
-from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_public_key
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, Protocol
 
 from teds_provision.errors import BadDataError
+from teds_provision.lazy import late
+
+if TYPE_CHECKING:
+    from cryptography import exceptions
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec, utils
+else:
+    ec = late("cryptography.hazmat.primitives.asymmetric.ec")
+    exceptions = late("cryptography.exceptions")
+    hashes = late("cryptography.hazmat.primitives.hashes")
+    serialization = late("cryptography.hazmat.primitives.serialization")
+    utils = late("cryptography.hazmat.primitives.asymmetric.utils")
 
 POINT_OCTETS = 65
 SIGNATURE_OCTETS = 64
@@ -49,7 +55,7 @@ class SoftwareKey:
 
     def __init__(self, secret: int | ec.EllipticCurvePrivateKey) -> None:
         self._key = ec.derive_private_key(secret, ec.SECP256R1()) if isinstance(secret, int) else secret
-        self.point: bytes = self._key.public_key().public_bytes(Encoding.X962, PublicFormat.UncompressedPoint)
+        self.point: bytes = _uncompressed(self._key.public_key())
 
     @classmethod
     def generate(cls) -> SoftwareKey:
@@ -75,7 +81,7 @@ class SoftwareKey:
 
     def sign_digest(self, digest: bytes) -> bytes:
         """SIG(key, message) by its SHA-256, see :class:`PrivateKey`."""
-        der = self._key.sign(digest, ec.ECDSA(Prehashed(hashes.SHA256()), deterministic_signing=True))
+        der = self._key.sign(digest, ec.ECDSA(utils.Prehashed(hashes.SHA256()), deterministic_signing=True))
         return raw_signature(der)
 
     def ecdh(self, peer: bytes) -> bytes:
@@ -88,7 +94,7 @@ class SoftwareKey:
 
 def raw_signature(der: bytes) -> bytes:
     """Turn a DER ECDSA signature into r ‖ s with s in the lower half, 64 octets."""
-    r, s = decode_dss_signature(der)
+    r, s = utils.decode_dss_signature(der)
     return r.to_bytes(32, "big") + min(s, GROUP_ORDER - s).to_bytes(32, "big")
 
 
@@ -118,7 +124,10 @@ def is_point(point: bytes) -> bool:
     return True
 
 
-_OF_DIGEST = ec.ECDSA(Prehashed(hashes.SHA256()))
+@cache
+def _of_digest() -> ec.ECDSA:
+    return ec.ECDSA(utils.Prehashed(hashes.SHA256()))
+
 
 Verify = Callable[[bytes, bytes, bytes], bool]
 """Returns True if a signature (64 octets) is SIG(point, message); :func:`verify`, or a chip that does it."""
@@ -132,8 +141,8 @@ def verify(point: bytes, message: bytes, signature: bytes) -> bool:
     if not 0 < r < GROUP_ORDER or not 0 < s <= _HALF_ORDER:
         return False
     try:
-        public_key(point).verify(encode_dss_signature(r, s), hashlib.sha256(message).digest(), _OF_DIGEST)
-    except (InvalidSignature, BadDataError):
+        public_key(point).verify(utils.encode_dss_signature(r, s), hashlib.sha256(message).digest(), _of_digest())
+    except (exceptions.InvalidSignature, BadDataError):
         return False
     return True
 
@@ -145,7 +154,8 @@ def fingerprint(point: bytes) -> str:
 
 def to_pem(point: bytes) -> str:
     """SubjectPublicKeyInfo PEM of a point."""
-    return public_key(point).public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo).decode()
+    form = serialization.PublicFormat.SubjectPublicKeyInfo
+    return public_key(point).public_bytes(serialization.Encoding.PEM, form).decode()
 
 
 def from_pem(text: bytes) -> bytes:
@@ -153,8 +163,8 @@ def from_pem(text: bytes) -> bytes:
     if b"PRIVATE KEY" in text:
         raise BadDataError("This file holds a private key where a public one belongs.")
     try:
-        key = load_pem_public_key(text)
-    except UnsupportedAlgorithm as error:
+        key = serialization.load_pem_public_key(text)
+    except exceptions.UnsupportedAlgorithm as error:
         raise BadDataError(
             "This is no P-256 key: its kind is not known here; stations and CAs have P-256 keys."
         ) from error
@@ -162,7 +172,11 @@ def from_pem(text: bytes) -> bytes:
         raise BadDataError("This file holds no public key in PEM form.") from error
     if not isinstance(key, ec.EllipticCurvePublicKey) or not isinstance(key.curve, ec.SECP256R1):
         raise BadDataError("This is not a P-256 key; stations and CAs have P-256 keys.")
-    return key.public_bytes(Encoding.X962, PublicFormat.UncompressedPoint)
+    return _uncompressed(key)
+
+
+def _uncompressed(key: ec.EllipticCurvePublicKey) -> bytes:
+    return key.public_bytes(serialization.Encoding.X962, serialization.PublicFormat.UncompressedPoint)
 
 
 # Labelled messages of the profile. Labels of signatures end in 00.

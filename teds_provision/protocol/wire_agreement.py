@@ -12,11 +12,10 @@ import hashlib
 import hmac
 import os
 from dataclasses import dataclass, field
-
-from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadDataError, GarbledError, KeyMismatchError, NotAuthenticError, PolicyError
+from teds_provision.lazy import late
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import (
     POINT_OCTETS,
@@ -32,6 +31,13 @@ from teds_provision.protocol.keys import (
 from teds_provision.protocol.messages.frames import Command, Function, security_command
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.kdf import hkdf
+else:
+    hashes = late("cryptography.hazmat.primitives.hashes")
+    hkdf = late("cryptography.hazmat.primitives.kdf.hkdf")
 
 NONCE_OCTETS = 16
 TAG_OCTETS = 16
@@ -97,7 +103,7 @@ def transcript(
 
 def derive(shared: bytes, nonce: bytes, script: bytes) -> LinkKey:
     """Link key and tags from Z = ECDH(E, En) ‖ ECDH(station, En) (64 octets), nonceN and T."""
-    okm = HKDF(hashes.SHA256(), 48, nonce, b"TEDS1 link key\0" + script).derive(shared)
+    okm = hkdf.HKDF(hashes.SHA256(), 48, nonce, b"TEDS1 link key\0" + script).derive(shared)
     key, confirmation = okm[:16], okm[16:]
     return LinkKey(
         key,

@@ -9,17 +9,18 @@ from typing import TYPE_CHECKING
 
 from teds_provision.errors import NotAuthenticError, NotFoundError, PolicyError, VaultError
 from teds_provision.lazy import late
+from teds_provision.protocol import keys
 from teds_provision.station.row_macs import KEY_OCTETS, MacRow, RowMacs, Values, changed
 from teds_provision.station.store.database import places
 from teds_provision.station.store.records import StationRecord
 from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
-    from teds_provision.protocol import keys, wire_agreement
+    from teds_provision.protocol import wire_agreement
     from teds_provision.vault import Vault
     from teds_provision.vault.master import MasterKeys
-else:  # cryptography: not for commands that only list
-    wire_agreement, keys = late("teds_provision.protocol.wire_agreement"), late("teds_provision.protocol.keys")
+else:  # the codec of the TEDS: not for commands that only list
+    wire_agreement = late("teds_provision.protocol.wire_agreement")
 
 DEFAULT_NAME = "station"
 _FACTS = ", ".join(column.name for column in fields(StationRecord))

@@ -9,6 +9,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 from teds_provision.lazy import late
+from teds_provision.protocol import keys
 from teds_provision.protocol.fingerprints import is_whole, same_key
 from teds_provision.station.datasheets import Datasheets
 from teds_provision.station.node_keys import NodeKeys
@@ -20,9 +21,9 @@ from teds_provision.station.store.records import ExportEligibility, NodeRecord, 
 from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
-    from teds_provision.protocol import keys, wire_agreement
-else:  # cryptography: not for commands that only list
-    wire_agreement, keys = late("teds_provision.protocol.wire_agreement"), late("teds_provision.protocol.keys")
+    from teds_provision.protocol import wire_agreement
+else:  # the codec of the TEDS: not for commands that only list
+    wire_agreement = late("teds_provision.protocol.wire_agreement")
 
 _values = attrgetter(*(column.name for column in fields(WhitelistEntry)))
 

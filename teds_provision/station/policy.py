@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from teds_provision.errors import NotWhitelistedError, PolicyError, UsageError
 from teds_provision.lazy import late
+from teds_provision.protocol import keys
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.station.handovers import Handovers
 from teds_provision.station.identity import StationIdentity
@@ -31,10 +32,9 @@ from teds_provision.station.store.records import (
 from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
-    from teds_provision.protocol import keys
     from teds_provision.protocol.plant import event, signer
 else:  # cryptography: not for commands that only list
-    keys, event = late("teds_provision.protocol.keys"), late("teds_provision.protocol.plant.event")
+    event = late("teds_provision.protocol.plant.event")
 
 _MIN_FINGERPRINT_PREFIX: Final = 16  # what people are shown
 _DIGITS: Final = 16

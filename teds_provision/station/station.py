@@ -41,7 +41,7 @@ from teds_provision.errors import (
     VaultError,
     VaultLockedError,
 )
-from teds_provision.lazy import late
+from teds_provision.protocol import keys
 from teds_provision.station.bulk import Bulk
 from teds_provision.station.datasheets import Datasheets
 from teds_provision.station.firmware_reports import FirmwareReports
@@ -63,11 +63,9 @@ from teds_provision.station.store.dump import RowSource, dump, load
 from teds_provision.vault.base import node_key_context
 
 if TYPE_CHECKING:
-    from teds_provision.protocol import keys, wire_agreement
+    from teds_provision.protocol import wire_agreement
     from teds_provision.vault import Ask, Vault
     from teds_provision.vault.master import MasterKeys
-else:  # cryptography: not for commands that only list
-    keys = late("teds_provision.protocol.keys")
 
 
 __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", "not_initialised"]

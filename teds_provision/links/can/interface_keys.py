@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import functools
 import importlib
+import inspect
 import re
-from typing import TYPE_CHECKING, Final
-
-from teds_provision.lazy import late
-
-if TYPE_CHECKING:
-    import inspect
-else:
-    inspect = late("inspect")  # for a bus with special keys
+from typing import Final
 
 _PICKED: Final = re.compile(r"""kwargs(?:\.get\(|\.pop\(|\[)\s*["'](\w+)["']|:param [^:\n]*?(\w+):""")
 """A key that an interface picks out of what it is given, or that its documentation names."""

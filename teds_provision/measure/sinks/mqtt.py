@@ -20,6 +20,7 @@ from __future__ import annotations
 import json
 import math
 import secrets
+import socket
 import stat
 import sys
 import threading
@@ -40,12 +41,11 @@ from teds_provision.measure.sinks.names import Topics, slug
 from teds_provision.teds.units import display_unit, short_unit
 
 if TYPE_CHECKING:
-    import socket
     import ssl
 
     from teds_provision.teds.units import WrittenUnit
 else:
-    socket, ssl = late("socket"), late("ssl")
+    ssl = late("ssl")
 
 DISCOVERY = "homeassistant"
 FILES: Final = ("password-file", "ca", "cert", "key")

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from teds_provision.errors import BadDataError, NotFoundError, TedsProvisionError, UsageError
-from teds_provision.lazy import late
 from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.inspection import read_anew
 from teds_provision.ncap.nodes.node_jobs import NodeJobs
@@ -22,17 +21,13 @@ from teds_provision.steps.teds_read import read_image
 from teds_provision.steps.verify import Verification, freshness_floor_of, session_check, verify_image
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
+from teds_provision.teds import curve as curves_of_guard
 from teds_provision.teds.calibration.model import is_finite
 from teds_provision.teds.channel import TURN
 from teds_provision.teds.formats import TedsBlock, placed, write_blocks
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.sheet import Sheet
 from teds_provision.teds.show import describe, shown_to_json
-
-if TYPE_CHECKING:
-    from teds_provision.teds import curve as curves_of_guard
-else:  # numpy
-    curves_of_guard = late("teds_provision.teds.curve")
 
 FORMATS: Final = {"json": "application/json", "xml": "application/xml", "hex": "text/plain; charset=utf-8"}
 _POINTS: Final = 200

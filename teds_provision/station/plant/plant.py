@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from teds_provision.errors import PolicyError, StoreChangedError, StoreError
 from teds_provision.files import read_limited, write_whole
 from teds_provision.lazy import late
+from teds_provision.protocol import keys
 from teds_provision.station.identity import StationIdentity
 from teds_provision.station.plant.alarms import Alarms
 from teds_provision.station.plant.claims import Claims
@@ -27,12 +28,11 @@ from teds_provision.station.store.records import utc_now
 from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
-    from teds_provision.protocol import keys
     from teds_provision.protocol.plant import claim, document, event, roster, signer
     from teds_provision.protocol.plant.roster import Role
     from teds_provision.vault import Vault
 else:  # cryptography: not for commands that only list
-    keys, event = late("teds_provision.protocol.keys"), late("teds_provision.protocol.plant.event")
+    event = late("teds_provision.protocol.plant.event")
     claim, document = late("teds_provision.protocol.plant.claim"), late("teds_provision.protocol.plant.document")
     roster, signer = late("teds_provision.protocol.plant.roster"), late("teds_provision.protocol.plant.signer")
 
