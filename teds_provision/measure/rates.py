@@ -101,7 +101,7 @@ def _why(limit: Limit, around: Surroundings) -> str:
 
 def _sensors(station: Station, uuid: bytes, request: MeasurementRequest) -> list[Channel]:
     """Return the sensors of a node that are sampled at a rate, and requested."""
-    image = station.nodes.datasheet(uuid)
+    image = station.datasheets.datasheet(uuid)
     channels = Sheet.from_image(image).channels if image is not None else ()
     wanted = request.channels
     return [
