@@ -181,7 +181,7 @@ class Node(TypedDict):
     virtual: bool
     wrapped: Wrapped | None
     unverified: Annotated[
-        bool, Meta(description="name, channels and values are what it says itself; nobody signed that")
+        bool, Meta(description="name, channels and values are its own claims; its datasheet is unsigned")
     ]
     fingerprint: NotRequired[str | None]
     epoch: NotRequired[int]
@@ -229,7 +229,7 @@ class Measurement(TypedDict):
 
     id: str
     group: str | None
-    match: Annotated[str | None, Meta(description="whoever comes and is meant by this; uuids are those that are in")]
+    match: Annotated[str | None, Meta(description="expression of the nodes to measure; uuids are those that match now")]
     frozen: bool
     uuids: list[Uuid]
     channels: NotRequired[list[int]]

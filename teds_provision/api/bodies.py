@@ -122,11 +122,15 @@ class NewMeasurement:
     match: (
         Annotated[
             str,
-            Meta(minLength=1, maxLength=1000, description="measure whoever comes: all, type:P, name:GLOB, group:G, …"),
+            Meta(
+                minLength=1,
+                maxLength=1000,
+                description="measure each node that comes: all, type:P, name:GLOB, group:G, …",
+            ),
         ]
         | None
     ) = None
-    frozen: Annotated[bool, Meta(description="nobody joins later, and no writer has a node let go")] | None = None
+    frozen: Annotated[bool, Meta(description="no node joins later, and no writer has one released")] | None = None
     channels: list[Number] | None = None
     rate: Annotated[float, Meta(minimum=0.001, maximum=1e6, description="Hz, else the datasheet's")] | None = None
     kind: Kind | None = None

@@ -126,7 +126,7 @@ def _warnings(station: Station, recovery: bytes | None, useless: int) -> list[st
             "it opens with the same token only."
         )
     if recovery is not None and recovery in (station.point, station.ca):
-        warnings.append("It is sealed to a key of this station: if the station is lost, nobody can open it.")
+        warnings.append("It is sealed to a key of this station: if the station is lost, it cannot be opened.")
     if useless:
         warnings.append(
             f"{counted(useless, 'key')} in the store cannot be opened under this vault; run teds-provision doctor."

@@ -400,7 +400,7 @@ def address_moves(probe: Probe) -> str:
     probe.sealed_good(_set_address(target))
     if isinstance(probe.contact.link, MultiStationLink):
         there = probe.contact.link.there(home)
-        holds(there is None, f"After Set CAN address somebody still answers at {home}.")
+        holds(there is None, f"After Set CAN address a node still answers at {home}.")
     return f"from {home} to {target}; 17 for another one within 10 s"
 
 

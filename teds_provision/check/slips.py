@@ -150,7 +150,7 @@ class Agreement:
             over(label, request, nonce, epoch, rest, digest),
             transcript_label_without_00=(
                 over(label[:-1], request, nonce, epoch, rest, digest),
-                'the label "TEDS1 transcript" of T stands without its 00',
+                'the label "TEDS1 transcript" of T lacks its 00',
             ),
             transcript_without_label=(over(request, nonce, epoch, rest, digest), "T has no label"),
             transcript_epoch_little_endian=(
@@ -193,17 +193,17 @@ class Agreement:
             ),
             transcript_one_time_before_epoch=(
                 over(label, request, nonce, en, epoch, uuid, node, digest),
-                "En stands before the epoch in T",
+                "En comes before the epoch in T",
             ),
             transcript_one_time_first=(
                 over(label, request, en, nonce, epoch, uuid, node, digest),
-                "En stands before nonceN in T",
+                "En comes before nonceN in T",
             ),
             transcript_without_nonce=(over(label, request, epoch, rest, digest), "T leaves out nonceN"),
             transcript_without_uuid=(over(label, request, nonce, epoch, en, node, digest), "T leaves out the UUID"),
             transcript_node_before_uuid=(
                 over(label, request, nonce, epoch, en, node, uuid, digest),
-                "P(node) stands before the UUID in T",
+                "P(node) comes before the UUID in T",
             ),
             transcript_without_node=(over(label, request, nonce, epoch, en, uuid, digest), "T leaves out P(node)"),
             transcript_points_without_04=(
@@ -248,11 +248,11 @@ class Agreement:
             salt_and_ikm_swapped=(_hkdf(nonce, shared, label + script, 64), "salt and ikm of HKDF are swapped"),
             info_label_without_00=(
                 _hkdf(shared, nonce, label[:-1] + script, 64),
-                'the label "TEDS1 link key" in info of HKDF stands without its 00',
+                'the label "TEDS1 link key" in info of HKDF lacks its 00',
             ),
             info_without_transcript=(_hkdf(shared, nonce, label, 64), "info of HKDF is the label without T"),
             info_without_label=(_hkdf(shared, nonce, script, 64), "info of HKDF is T without the label"),
-            info_transcript_first=(_hkdf(shared, nonce, script + label, 64), "T stands before the label in info"),
+            info_transcript_first=(_hkdf(shared, nonce, script + label, 64), "T comes before the label in info"),
             without_salt=(_hkdf(shared, None, label + script, 64), "HKDF has no salt; nonceN is due"),
             without_extract=(
                 HKDFExpand(hashes.SHA256(), 64, label + script).derive(shared),
@@ -298,7 +298,7 @@ class Agreement:
             if slip is None:
                 messages += _ways(
                     b"",
-                    sign_label_without_00=(label[:-1] + right, 'the label "TEDS1 agree" of sigN stands without its 00'),
+                    sign_label_without_00=(label[:-1] + right, 'the label "TEDS1 agree" of sigN lacks its 00'),
                     sign_without_label=(right, "sigN is over T without its label"),
                     sign_with_uuid=(label + self.uuid + right, "sigN is over the UUID as well"),
                     sign_of_request=(label + self.request, "sigN is over the payload of Request, not over T"),
@@ -390,7 +390,7 @@ def of_node_key(uuid: bytes, node: bytes, signature: bytes) -> Slip | None:
     label = b"TEDS1 node key\0"
     ways = _ways(
         label + uuid + node,
-        label_without_00=(label[:-1] + uuid + node, 'the label "TEDS1 node key" stands without its 00'),
+        label_without_00=(label[:-1] + uuid + node, 'the label "TEDS1 node key" lacks its 00'),
         without_label=(uuid + node, "it is made without its label"),
         without_uuid=(label + node, "it leaves out the UUID"),
         uuid_last=(label + node + uuid, "the UUID stands behind P(node)"),
@@ -405,7 +405,7 @@ def of_prove(uuid: bytes, node: bytes, challenge: bytes, proof: bytes) -> Slip |
     label = b"TEDS1 prove\0"
     ways = _ways(
         label + uuid + challenge,
-        label_without_00=(label[:-1] + uuid + challenge, 'the label "TEDS1 prove" stands without its 00'),
+        label_without_00=(label[:-1] + uuid + challenge, 'the label "TEDS1 prove" lacks its 00'),
         without_label=(uuid + challenge, "it is made without its label"),
         without_uuid=(label + challenge, "it leaves out the UUID"),
         uuid_last=(label + challenge + uuid, "the UUID stands behind the challenge"),
@@ -419,7 +419,7 @@ def of_reset(uuid: bytes, node: bytes, epoch: int, challenge: bytes, proof: byte
     label, number = b"TEDS1 reset\0", epoch.to_bytes(4, "big")
     ways = _ways(
         reset_message(uuid, epoch, challenge),
-        label_without_00=(label[:-1] + uuid + number + challenge, 'the label "TEDS1 reset" stands without its 00'),
+        label_without_00=(label[:-1] + uuid + number + challenge, 'the label "TEDS1 reset" lacks its 00'),
         without_label=(uuid + number + challenge, "it is made without its label"),
         without_uuid=(label + number + challenge, "it leaves out the UUID"),
         without_epoch=(label + uuid + challenge, "it leaves out the epoch"),
@@ -533,11 +533,11 @@ def of_session(key: bytes, uuid: bytes, one_time: PrivateKey, reply: bytes) -> S
             salt_and_ikm_swapped=(_hkdf(key, shared, label + uuid + both, 96), "salt and ikm of HKDF are swapped"),
             info_label_without_00=(
                 _hkdf(shared, key, label[:-1] + uuid + both, 96),
-                'the label "TEDS1 session" in info of HKDF stands without its 00',
+                'the label "TEDS1 session" in info of HKDF lacks its 00',
             ),
             info_without_label=(_hkdf(shared, key, uuid + both, 96), "info of HKDF has no label"),
             info_without_uuid=(_hkdf(shared, key, label + both, 96), "info of HKDF leaves out the UUID"),
-            info_node_first=(_hkdf(shared, key, label + uuid + node + station, 96), "En stands before Es in info"),
+            info_node_first=(_hkdf(shared, key, label + uuid + node + station, 96), "En comes before Es in info"),
             info_without_points=(_hkdf(shared, key, label + uuid, 96), "info of HKDF leaves out Es and En"),
             without_salt=(_hkdf(shared, None, label + uuid + both, 96), "HKDF has no salt; K is due"),
             without_extract=(
@@ -564,7 +564,7 @@ def of_session(key: bytes, uuid: bytes, one_time: PrivateKey, reply: bytes) -> S
                     mac_without_key_id=(_hmac(under, b"node open" + both)[:16], "the tag leaves out keyId"),
                     mac_node_first=(
                         _hmac(under, b"node open" + identifier + node + station)[:16],
-                        "En stands before Es in the tag",
+                        "En comes before Es in the tag",
                     ),
                     mac_last_16_octets=(
                         _hmac(under, b"node open" + identifier + both)[16:],
@@ -646,7 +646,7 @@ def of_data_message(key: bytes, run: int, counter: int, message: bytes) -> Slip 
 
     keys = _ways(
         run_key(label),
-        run_label_without_00=(run_key(label[:-1]), 'the label "TEDS1 stream" of the run\'s key stands without its 00'),
+        run_label_without_00=(run_key(label[:-1]), 'the label "TEDS1 stream" of the run\'s key lacks its 00'),
         run_drive_label=(run_key(b"TEDS1 drive\0"), "the key of the stream is made with the label of Drive"),
         run_little_endian=(run_key(label, run.to_bytes(2, "little")), "run is little-endian in the run's key"),
         run_before=(run_key(label, (run - 1).to_bytes(2, "big")), "the run's key is that of the run before"),

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @command('teds-provision revoke 8d4d --why "stolen with the arm"', "teds-provision revoke --lift 8d4d --yes")
 @click.argument("uuid")
 @click.option("--why", metavar="TEXT", help="Reason, shown to everyone who meets the node, and logged.")
-@click.option("--lift", is_flag=True, help="Lift the ban on this station, whoever issued it.")
+@click.option("--lift", is_flag=True, help="Lift the ban on this station, also one that another station issued.")
 @yes_option
 @dry_run_option
 @pass_app

@@ -326,7 +326,7 @@ def _verdict(node: dict[str, Any]) -> str:
     if node["verdict"] is None:
         return "not verified yet"
     if node.get("unverified"):
-        return "unverified (nobody signed its datasheet)"
+        return "unverified (its datasheet is not signed)"
     kept = " (stored copy, except the Security TEDS)" if node["verdict"]["from"] == "kept" else ""
     return f"{node['verdict']['verdict']}{kept}"
 

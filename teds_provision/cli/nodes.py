@@ -153,7 +153,7 @@ def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) 
         holders = ", ".join(name for names in says["holders"].values() for name in names)
         written = f", datasheet {says['sequence']} by {says['written_by']}" if says["written_by"] else ""
         banned = f", revoked by {', '.join(says['revoked'])}" if says["revoked"] else ""
-        held = f"held by {holders} (epoch {says['epoch']})" if says["holders"] else "held by nobody"
+        held = f"held by {holders} (epoch {says['epoch']})" if says["holders"] else "no holder"
         line = "  ".join(filter(None, (node["uuid"], shown(node["name"] or ""), f"{held}{written}{banned}")))
         app.lines([line, *(f"  {conflict['name']}: {shown(conflict['why'])}" for conflict in node["conflicts"])])
 

@@ -47,7 +47,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "calibrate zero": frozenset({"value", "unit", "accept-calibration", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "set": frozenset({"unit", "hold", "dead-man", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "mode": frozenset({"via", "nfc", "can", "ble", "timeout", "trace"}),
-    "ncap measure": frozenset({"rate", "frozen", "to"}),
+    "ncap measure": frozenset({"rate", "frozen", "to", "stop"}),
     "ncap open": frozenset({"read-only"}),
     "ncap run": frozenset({"detection", "adopt", "yes", "unverified", "measure", "rate", "frozen", "http", "http-allow", "tls-cert", "tls-key", "record", "ros1", "ros2", "mqtt", "actuators", "dead-man", "file-units", "trust-dcc", "registry", "metrics", "http-1451", "nfc", "can", "ble", "trace"}),
     "ncap token add": frozenset({"read-only"}),

@@ -88,7 +88,7 @@ def _run(demo: Demo) -> LineDemoResult:
             except PolicyError as error:
                 step.detail = error.message
                 refused.append("wrong-board" if isinstance(error, WrongBoardError) else "one too many")
-    demo.say("Then somebody changes a TEDS in board two's flash. The office tests boards one and two.")
+    demo.say("Then an intruder changes a TEDS in board two's flash. The office tests boards one and two.")
     _tamper(folders["two"])
     tests = LineRun(office, line.job, only_verify=True)
     for name in ("one", "two"):

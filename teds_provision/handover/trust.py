@@ -313,7 +313,7 @@ def _is_listed(station: Station, wanted: TrustRecord) -> bool:
     for old in named:
         if (old.role, old.point) != (wanted.role, wanted.point):
             raise PolicyError(
-                f"The name {wanted.name!r} already stands for the {old.role} {old.fingerprint[:16]}.",
+                f"The name {wanted.name!r} is already taken by the {old.role} {old.fingerprint[:16]}.",
                 hint=f"Choose another name, or run teds-provision trust remove {quote(wanted.name)} first.",
             )
     return bool(named)

@@ -472,7 +472,7 @@ def _taken(
 
 def _refusal(roster: Roster, wanted: SignatureOrder, answer: Answer) -> TedsProvisionError:
     hints = {
-        "job": "Ask whoever runs the office: signer run --job ID.",
+        "job": "Ask the operator of the office: signer run --job ID.",
         "full": "Set the board aside, or ask the keeper for another job.",
         "differs": "Station and office need the same profile and version of the program.",
         "sequence": "Someone at the office must confirm it: signer once FILE --jump",

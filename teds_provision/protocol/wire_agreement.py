@@ -198,7 +198,7 @@ class StationAgreement:
         if not verify(node, agreement_message(script), signature):
             raise NotAuthenticError(
                 "The node's signature on the agreement (sigN) is wrong: it does not hold the key that it shows.",
-                hint="This may be a copied tag, or somebody answers in its place. Do not use it.",
+                hint="This may be a copied tag, or another device answers in its place. Do not use it.",
             )
         if offered <= epoch:
             raise PolicyError(

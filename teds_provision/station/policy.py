@@ -131,7 +131,7 @@ class Policy:
             row = self._store.one("SELECT fingerprint, role FROM trust WHERE name = ?", (record.name,))
             if row and row != (record.fingerprint, record.role):
                 raise PolicyError(
-                    f"The name {record.name!r} already stands for the {row[1]} {row[0][:16]}.",
+                    f"The name {record.name!r} is already taken by the {row[1]} {row[0][:16]}.",
                     hint=f"Choose another name, or run teds-provision trust remove {quote(record.name)} first.",
                 )
             self._store.execute(

@@ -72,7 +72,7 @@ class NotAdoptedError(PolicyError):
 def refuse_adoption(brought: FactoryDatasheet) -> None:
     """Refuse, as without a terminal there is no confirmation. Raises NotAdoptedError."""
     raise NotAdoptedError(
-        f"Node {brought.image.uuid.hex()} brought its own datasheet, and nobody has approved signing it.",
+        f"Node {brought.image.uuid.hex()} brought its own datasheet, which is not approved for signing yet.",
         brought,
         hint="Check it, then add --yes; or write your own datasheet: --profile.",
     )

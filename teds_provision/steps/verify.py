@@ -367,7 +367,7 @@ def _by_itself(image: Image, proofs: _SecurityFields) -> tuple[Check, ...]:
     if not proofs.node_key:
         checks.append(Check("node key", "failed", "field 102 does not sign this key for this UUID"))
     if not shown.signed:
-        return (*checks, Check("signed", "failed", "this is the initial Security TEDS: nobody has signed it yet"))
+        return (*checks, Check("signed", "failed", "this is the initial Security TEDS, which is not signed yet"))
     checks += [
         Check("signed", "passed"),
         _check("signature", proofs.datasheet, _CHANGED),

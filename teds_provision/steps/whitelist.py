@@ -282,7 +282,7 @@ def _entry_of(element: _Element, text: str, leaf: bool, root: bool, reading: _Wh
 
 def _add_several(element: _Element, own: dict[str, str], reading: _WhitelistReader) -> int:
     if len(element.uuids) > 1 and "fingerprint" in own:
-        reading.wrong(element.line, "fingerprint", "it stands beside several UUIDs and belongs to none")
+        reading.wrong(element.line, "fingerprint", "it is beside several UUIDs and belongs to none")
     for line, uuid in element.uuids:
         reading.add(line, {"uuid": uuid})
     return len(element.uuids)

@@ -50,7 +50,7 @@ FAULTS: Final[dict[str, Faulty]] = {
     # -- slips of the key agreement
     "FAULT_TRANSCRIPT_LABEL_WITHOUT_00": _slip(
         "the label of T without its 00", "transcript-label-without-00",
-        agreeing_so(label=b"TEDS1 transcript"), words='"TEDS1 transcript" of T stands without its 00'),
+        agreeing_so(label=b"TEDS1 transcript"), words='"TEDS1 transcript" of T lacks its 00'),
     "FAULT_TRANSCRIPT_EPOCH_LITTLE_ENDIAN": _slip(
         "a little-endian epoch in T", "transcript-epoch-little-endian",
         agreeing_so(epoch=lambda number: number.to_bytes(4, "little"))),

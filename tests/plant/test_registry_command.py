@@ -440,7 +440,7 @@ def test_what_waits_in_pages_counts_as_unsent(desk: Desk) -> None:
         assert north.plant.outbox(1) == []
     assert desk.ask("north", "registry", "status")["unsent"] == 1
     checks = json.loads(desk.run("north", "--json", "doctor").out)["checks"]
-    assert any(check["why"].startswith("1 events unsent") for check in checks if check["name"] == "registry")
+    assert any(check["why"].startswith("1 event unsent, 0 conflicts") for check in checks if check["name"] == "registry")
     pages.parent.unlink()
     (desk.folder / "away").rename(pages.parent)
     desk.ask("north", "registry", "sync")
@@ -472,5 +472,5 @@ def test_a_node_on_which_stations_do_not_agree_says_so_itself(desk: Desk) -> Non
     assert [conflict["name"] for conflict in node["conflicts"]] == ["other pin"]
     assert "conflict     other pin: keepers pin" in desk.run("south", "nodes", UUID).out
     shown = desk.run("south", "nodes", "--plant", UUID).out
-    assert "held by nobody\n" in shown
+    assert "no holder\n" in shown
     assert "1 conflict," in desk.run("south", "registry", "status").out

@@ -171,7 +171,7 @@ class MqttSink(ThreadedSink):
             self._connected.clear()
             self._waits(f"the broker at {self._host} disconnected")
         elif reason == "Keep alive timeout":
-            self._waits(f"whoever listens at {self._host}:{self._port} says nothing for {KEEP_ALIVE} s")
+            self._waits(f"the broker at {self._host}:{self._port} has been silent for {KEEP_ALIVE} s")
         elif not self._why:  # with TLS 1.3 a server refuses a client's certificate after the client's handshake
             tls = self._parts.scheme == "mqtts"
             other = "; it may expect a different client certificate (cert=, key=)"

@@ -36,7 +36,7 @@ _HELP: Final = {
     "teds_live_clients": ("gauge", "Clients of the live channel."),
     "teds_registry_age_seconds": ("gauge", "Since the last sync with the registry."),
     "teds_registry_unsent": ("gauge", "Events that wait for a sync."),
-    "teds_registry_alarms": ("gauge", "Alarms that nobody has seen."),
+    "teds_registry_alarms": ("gauge", "Alarms that are not acknowledged yet."),
 }
 
 

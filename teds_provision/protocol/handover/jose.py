@@ -365,7 +365,7 @@ def _mapping(value: object, what: str) -> dict[str, Any]:
 def _merged(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
     """Join two headers, which must share no name (RFC 7516 section 7.2.1)."""
     if not first.keys().isdisjoint(second):
-        raise BadDataError("A header parameter stands in two headers.")
+        raise BadDataError("A header parameter occurs in two headers.")
     return first | second
 
 

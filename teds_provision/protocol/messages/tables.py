@@ -165,7 +165,7 @@ COMMANDS: Final[dict[tuple[int, int], Spec]] = {
 
 REASONS: Final = {int(reason): reason.name.lower().replace("_", " ") for reason in Reason} | {
     Reason.BAD_FORM: "bad length, checksum or form",
-    Reason.UNKNOWN_KEY: "unknown key (never agree anew because of it)",
+    Reason.UNKNOWN_KEY: "unknown key (never agree again because of it)",
     Reason.BUSY: "busy with another station's transfer, or claimed by another session",
     Reason.NO_SUCH_TEDS: "no such TEDS",
     Reason.WRONG_UUID: "wrong UUID",

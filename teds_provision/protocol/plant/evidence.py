@@ -360,7 +360,7 @@ def _wrong_datasheet(checked: CheckedEvidence, signatures: Signatures, ca: bytes
     if evidence.verdict != PASSED:
         return
     if not shown.signed:
-        yield "nobody signed the datasheet"
+        yield "the datasheet is not signed"
         return
     if not datasheet.is_certified(ca, shown.station_key, shown.station_key_signature):
         yield "the station that signed the datasheet is not certified by this CA (field 104)"

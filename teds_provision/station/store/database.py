@@ -92,7 +92,7 @@ def _require_own(file: Path) -> None:
         return
     if not stat.S_ISREG(status.st_mode) or not is_mine(status):
         what = "a link" if stat.S_ISLNK(status.st_mode) else "not owned by this user"
-        raise StoreError(f"{file} is {what}.", hint="It was put there by somebody else: check it and move it away.")
+        raise StoreError(f"{file} is {what}.", hint="Another program put it there: check it and move it away.")
 
 
 PAGE = 500

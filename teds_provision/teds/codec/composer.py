@@ -179,7 +179,7 @@ def recompose(decoded: DecodedTeds) -> bytes:
     encode from (malformed octets, a message).
     """
     if decoded.verdict in {"malformed", "message"}:
-        raise BadDataError(f"This cannot be encoded anew: its verdict is {decoded.verdict}.")
+        raise BadDataError(f"This cannot be encoded again: its verdict is {decoded.verdict}.")
     width = tuple_width(decoded)
     edition: Edition = decoded.edition or 2007
     fields = table(decoded.access_code) if decoded.access_code is not None else None

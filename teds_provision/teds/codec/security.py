@@ -123,7 +123,7 @@ def require_our_wire(image: Image) -> Image:
     if other:
         raise BadDataError(
             f"The image names {other}.",
-            hint="It is of a time before this wire; nothing of it was released. Read or build the datasheet anew.",
+            hint="It is of a time before this wire; nothing of it was released. Read or build the datasheet again.",
         )
     return image
 
@@ -241,10 +241,12 @@ def _ascending(block: bytes, parts: list[tuple[int, int, int]]) -> tuple[dict[in
     for number, start, end in parts:
         if number == SIGNED_BLOCK:
             if number < last:
-                raise NotCanonicalError(f"Field {number} of the Security TEDS stands out of ascending order or twice.")
+                raise NotCanonicalError(
+                    f"Field {number} of the Security TEDS is out of ascending order or occurs twice."
+                )
             blocks.append(block[start:end])
         elif number <= last:
-            raise NotCanonicalError(f"Field {number} of the Security TEDS stands out of ascending order or twice.")
+            raise NotCanonicalError(f"Field {number} of the Security TEDS is out of ascending order or occurs twice.")
         else:
             values[number] = block[start:end]
             wanted = _OCTETS.get(number)

@@ -111,7 +111,7 @@ def stretches(text: str) -> list[tuple[int, bytes]]:
         if not line.strip():
             continue
         if ended:
-            raise BadDataError(f"Line {number} stands behind the end record.")
+            raise BadDataError(f"Line {number} comes after the end record.")
         kind, address, data = _record(line.strip(), number)
         if kind == DATA:
             pieces += _place(base, address, data)

@@ -344,7 +344,7 @@ def test_who_accepts_and_says_nothing_is_told_as_that(monkeypatch: pytest.Monkey
         sink = open_sink(f"mqtt://127.0.0.1:{port}")
         sink.open([ANGLE], STATION)
         try:
-            until(lambda: sink.stats.detail == f"whoever listens at 127.0.0.1:{port} says nothing for 1 s")
+            until(lambda: sink.stats.detail == f"the broker at 127.0.0.1:{port} has been silent for 1 s")
         finally:
             sink.close()
 

@@ -147,7 +147,7 @@ const short8 = (uuid) => `node ${uuid.slice(0, 8)}`;
 /** "held by north, south (epoch 3), datasheet 7 by north". */
 function heldBy(says) {
   const who = Object.values(says.holders).flat();
-  const held = who.length ? `held by ${who.join(", ")} (epoch ${says.epoch})` : "held by nobody";
+  const held = who.length ? `held by ${who.join(", ")} (epoch ${says.epoch})` : "no holder";
   return says.written_by ? `${held}, datasheet ${says.sequence} by ${says.written_by}` : held;
 }
 
