@@ -279,6 +279,46 @@ def check_can(data: bytes) -> None:
     isotp.read_single(data)
 
 
+def check_smp(data: bytes) -> None:
+    """SMP packets: the body as CBOR, and the virtual node's image manager behind the filter."""
+    from teds_provision.protocol.messages.frames import CommandRefusedError
+    from teds_provision.protocol.messages.smp import LISTED, decode_map, decode_packet
+    from teds_provision.protocol.tim.manage import ManageFilter
+    from tests.protocol.test_manage import Manager
+
+    with suppress(ValueError):
+        decode_map(data)
+    manager = Manager(on_trial=bool(data and data[-1] & 1))
+    filtered = ManageFilter(manager, lambda: 0.0, 2048, claimed=lambda: False, staged_elsewhere=lambda session: None)
+    with suppress(CommandRefusedError):
+        decode_packet(filtered.run(data, None, "can:f1"))  # type: ignore[arg-type]
+    for packet in manager.got:
+        assert packet.command in LISTED
+        decode_map(packet.body)
+
+
+def smp_seeds() -> list[bytes]:
+    """A packet of each listed command."""
+    bodies = ("a0", "a16764", "a167636f6e6669726df5", "a4636f66660063646174614178636c656e0963736861410a")
+    heads = ("0800000100000706", "0a00000100000700", "0a00000b00010700", "0a00001800010701")
+    return [bytes.fromhex(head + body) for head, body in zip(heads, bodies, strict=True)]
+
+
+def check_firmware(data: bytes) -> None:
+    """A firmware image file."""
+    from teds_provision.firmware_image import read_firmware_image
+
+    reads(lambda: read_firmware_image(data))
+
+
+def firmware_seeds() -> list[bytes]:
+    """An image without signature: header, payload, digest."""
+    import hashlib
+
+    head = struct.pack("<IIHHIIBBHII", 0x96F3B83D, 0, 32, 0, 8, 0, 1, 2, 3, 4, 0) + bytes(8)
+    return [head + struct.pack("<HHHH", 0x6907, 40, 0x10, 32) + hashlib.sha256(head).digest()]
+
+
 def can_seeds() -> Iterable[bytes]:
     yield b"\0\x08\x06\7hello\0"
     yield b"\0\x08\x10\x14\7abcde" + b"\0\x08\x21abcdefg" + b"\0\x08\x22abcdefg"
@@ -669,6 +709,8 @@ TARGETS = {
         Target("operation", check_operation, lambda: [bytes(8), bytes(20), b"\0" + bytes(26)]),
         Target("nfc", check_nfc, nfc_seeds, ("Tp", "Ts", "Te", "urn:nfc:sn:")),
         Target("can", check_can, can_seeds, longest=1024),
+        Target("smp", check_smp, smp_seeds, longest=1024),
+        Target("firmware", check_firmware, firmware_seeds, longest=512),
         Target("bundle", check_bundle, bundle_seeds, (*_JSON, "protected", "recipients", "nodes", "alg", "kid")),
         Target("receipt", check_receipt, receipt_seeds, (*_JSON, "imported", "refused", "format", ".")),
         Target("backup", check_backup, backup_seeds, (*_JSON, "schema", "tables")),
