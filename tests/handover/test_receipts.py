@@ -86,7 +86,7 @@ def test_an_undone_move_that_was_imported_all_the_same(pair: Pair) -> None:
     path, exported = pair.export("move")
     undo(pair.north, find_handover(pair.north, exported.plan.id))
     taken = pair.take(path)
-    with pytest.raises(PolicyError, match="took 1 keys in all the same"):
+    with pytest.raises(PolicyError, match="took 1 key in all the same"):
         close(pair.north, taken.receipt)
     assert session(pair.north, pair.board) == 2
     with pytest.raises(PolicyError, match="knows none of the keys"):
