@@ -165,7 +165,7 @@ def nfc_loopback(system: System) -> Iterator[Finding]:
 def nfc(system: System) -> Iterator[Finding]:
     """Open the requested reader, and check what is on it."""
     if system.nfc is None:
-        yield Finding("nfc", "skipped", "No reader was given, so none was opened.", "")
+        yield Finding("nfc", "skipped", "No reader was given, so none was opened.", "teds-provision doctor --nfc usb")
         return
 
     try:
@@ -266,7 +266,9 @@ def _self_test(spec: str) -> tuple[bool, str, str]:
 def can(system: System) -> Iterator[Finding]:
     """Open the bus that was asked for; listen a moment for errors, and for another station of our address."""
     if system.can is None:
-        yield Finding("can", "skipped", "No bus was given, so none was opened.", "")
+        yield Finding(
+            "can", "skipped", "No bus was given, so none was opened.", "teds-provision doctor --can socketcan:can0"
+        )
         return
 
     try:

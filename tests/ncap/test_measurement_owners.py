@@ -137,7 +137,7 @@ def test_ncap_waits_for_the_group_that_a_command_measures_and_gets_it_afterwards
 
 def test_the_log_has_what_is_measured_and_who_requested_it(hall: Hall) -> None:
     service = ncap(hall)
-    uuid, token = hall.nodes["g"].uuid, service.token("plotter")
+    uuid, token = hall.nodes["g"].uuid, service.token("script")
     with service.client(token) as asked:
         made = asked.request("POST", "/measurements", {"uuids": [uuid], "rate": 20})["id"]
 
@@ -148,7 +148,7 @@ def test_the_log_has_what_is_measured_and_who_requested_it(hall: Hall) -> None:
     with service.client() as asked:
         until(lambda: entries(asked, uuid), "its first value is in the history of the node")
         [joined] = entries(asked, uuid)
-    assert (joined["outcome"], joined["facts"]["owner"]) == ("joined", "api:plotter")
+    assert (joined["outcome"], joined["facts"]["owner"]) == ("joined", "api:script")
     service.end()
     service = ncap(hall)
     with service.client() as asked:
@@ -158,20 +158,24 @@ def test_the_log_has_what_is_measured_and_who_requested_it(hall: Hall) -> None:
         told = [(entry["outcome"], entry["actor"]) for entry in entries(asked) if entry["uuid"] is None]
         last = entries(asked)[-1]
     assert [outcome for outcome, _ in told] == ["begun", "paused", "continued", "ended"]
-    assert told[0][1] == "plotter"
-    assert told[-1][1] != "plotter", "whoever ended it is another one"
-    assert {entry["facts"]["owner"] for entry in [last]} == {"api:plotter"}
+    assert told[0][1] == "script"
+    assert told[-1][1] != "script", "whoever ended it is another one"
+    assert {entry["facts"]["owner"] for entry in [last]} == {"api:script"}
     assert last["facts"]["samples"] > 0
     assert last["facts"]["rate"] == 20
 
 
 def test_a_measurement_whose_time_is_over_holds_its_nodes_no_longer(hall: Hall) -> None:
     """It was listed as ended, and its nodes as measured, until somebody deleted it."""
-    with closing(Station.inspect(hall.station.home)) as store:
-        store.measurements.keep(KeptMeasurement("brief", "arm", rate=20.0, ends=time.time() + 6))
-    service = ncap(hall)
-    [shown] = listed(service)
-    assert (shown["id"], shown["group"]) == ("brief", "arm")
+    for seconds in (5, 20, 60):  # a busy machine takes longer than the first to start
+        with closing(Station.inspect(hall.station.home)) as store:
+            store.measurements.keep(KeptMeasurement("brief", "arm", rate=20.0, ends=time.time() + seconds))
+        service = ncap(hall)
+        shown = listed(service)
+        if shown:
+            break
+        service.kill()
+    assert [(one["id"], one["group"]) for one in shown] == [("brief", "arm")]
     until(lambda: not listed(service), "its time is over")
     with service.client() as asked:
         again = asked.request("POST", "/measurements", {"group": "arm", "rate": 20})
