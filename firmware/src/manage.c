@@ -146,6 +146,7 @@ static bool read_map(const uint8_t *octets, size_t length, bool plain, said *out
     level levels[DEPTH];
     size_t depth = 0;
     unsigned key = OF_NO_CONCERN;
+    memset(levels, 0, sizeof levels);
     do {
         level *in_it = depth > 0 ? &levels[depth - 1] : NULL;
         item it;

@@ -335,7 +335,7 @@ def test_of_1_0_only_three_bodies_pass(body: bytes) -> None:
         b"\xa1\x63off\x1b\x00\x00",
         b"\xa1\x63off\x00\x00",  # and more
         b"\xa1\x7f\x63off\xff\x00",
-        b"\xa1\x63off\x1c\x00",
+        b"\xa1\x63off\x1c" + bytes(16),
         b"\xa2\x63off\x00\x63sha\x58\x21" + bytes(33),
         b"\x81\x63off",
         b"\xff",
