@@ -194,6 +194,7 @@ def test_locate_blinks_for_its_time_and_a_new_request_replaces_it() -> None:
     assert desk.firmware.blinks == [5, 60]
     desk.now = 63
     desk.node.poll()
+    desk.node.poll()
     assert desk.firmware.blinks == [5, 60, 0]
     assert locate(b"\0").ok
     desk.now = 200
@@ -373,6 +374,7 @@ def test_numbers_may_be_longer_than_they_need_be() -> None:
         b"\x60",
         b"\x80",
         b"\xa1\x61d\x7f\x60\xff",
+        b"\xba\x80\x00\x00\x00",  # so many pairs that twice their number is 0
     ],
 )
 def test_a_body_that_is_no_map_of_plain_values_is_refused(body: bytes) -> None:
@@ -465,7 +467,7 @@ def test_an_upload_lives_and_keeps_writes_and_others_out() -> None:
     assert other.sealed(write_teds(1, 12, 0, NAME)).ok
 
 
-@pytest.mark.parametrize("answer", [{"off": 1000, "match": True}, {"off": 1000}])
+@pytest.mark.parametrize("answer", [{"off": 1000, "match": True}, {"off": 1000}, {"match": False}])
 def test_an_upload_ends_when_it_is_complete(answer: object) -> None:
     desk = Board.make().keyed()
     desk.firmware.answer = {"off": 960}
