@@ -217,7 +217,7 @@ def test_marks_on_nodes_do_not_go_back_and_come_forward(station: Station, tmp_pa
 def test_a_key_that_the_vault_does_not_open_is_told_when_backing_up(station: Station, tmp_path: Path) -> None:
     with closing(sqlite3.connect(station.home / "store.sqlite3")) as connection, connection:
         connection.execute("UPDATE keys SET wrapped = zeroblob(60) WHERE uuid = ? AND epoch = 1", (ONE,))
-    assert "1 key in the store cannot be opened by this vault" in back_up(station, tmp_path / "b").warnings[0]
+    assert "1 key in the store cannot be opened under this vault" in back_up(station, tmp_path / "b").warnings[0]
 
 
 @pytest.mark.system
