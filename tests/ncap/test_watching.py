@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,6 +19,8 @@ from teds_provision.ncap.nodes import link_watch
 from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
 from teds_provision.ncap.nodes.link_watch import MOST_KNOWN, LinkWatch
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
+from teds_provision.station.store import KeptMeasurement
+from tests.bench import make_station
 from tests.pace import until
 
 
@@ -191,14 +194,15 @@ def test_a_reader_that_is_not_there_keeps_no_command_waiting(
     assert time.monotonic() - began < link_watch.LENDING / 2
 
 
-def test_what_a_measurement_says_of_a_node_that_it_has_no_more_is_no_problem(watch: LinkWatch) -> None:
+def test_what_a_measurement_says_of_a_node_that_it_has_no_more_is_no_problem(watch: LinkWatch, tmp_path: Path) -> None:
     """Each reports once a second: an adopted node was measured, and shown with "Its datasheet is signed now"."""
     nothing: Any = None
     uuid, roster = "ab" * 10, watch._directory
-    measuring = MeasurementSupervisor(nothing, roster, watch._live, NodeLocks(), nothing, nothing, nothing)
+    station = make_station(tmp_path)
+    measuring = MeasurementSupervisor(station, roster, watch._live, NodeLocks(), nothing, nothing, nothing)
     newcomers: Any = object()
     left, has = (
-        RunningMeasurement(SimpleNamespace(id=name), uuids, newcomers)  # type: ignore[arg-type]
+        RunningMeasurement(KeptMeasurement(name, uuids=()), uuids, newcomers)
         for name, uuids in (("unverified", ()), ("adopted", (uuid,)))
     )
     measuring._running = {"unverified": left, "adopted": has}
@@ -208,5 +212,6 @@ def test_what_a_measurement_says_of_a_node_that_it_has_no_more_is_no_problem(wat
         assert roster.seen(uuid).problem is None
     measuring._report(has, NodeReport(uuid, "lost", "No message of the node came for 2.1 s"))
     problem = roster.seen(uuid).problem
+    station.close()
     assert problem is not None
     assert problem["message"] == "No message of the node came for 2.1 s"

@@ -440,7 +440,9 @@ def test_what_waits_in_pages_counts_as_unsent(desk: Desk) -> None:
         assert north.plant.outbox(1) == []
     assert desk.ask("north", "registry", "status")["unsent"] == 1
     checks = json.loads(desk.run("north", "--json", "doctor").out)["checks"]
-    assert any(check["why"].startswith("1 event unsent, 0 conflicts") for check in checks if check["name"] == "registry")
+    assert any(
+        check["why"].startswith("1 event unsent, 0 conflicts") for check in checks if check["name"] == "registry"
+    )
     pages.parent.unlink()
     (desk.folder / "away").rename(pages.parent)
     desk.ask("north", "registry", "sync")
