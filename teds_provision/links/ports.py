@@ -241,7 +241,7 @@ class PacedLink(Protocol):
 
 
 @runtime_checkable
-class SharedBusLink(Protocol):
+class TransferLink(Protocol):
     """A link on which a long transfer has to leave room for the streams of other nodes (CAN)."""
 
     def wait_for_air(self) -> bool:

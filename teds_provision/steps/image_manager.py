@@ -24,7 +24,7 @@ from teds_provision.errors import (
     PolicyError,
 )
 from teds_provision.lazy import how_to_install
-from teds_provision.links.ports import SharedBusLink
+from teds_provision.links.ports import TransferLink
 from teds_provision.protocol.messages.frames import Function, Reason, security_command
 from teds_provision.protocol.messages.smp import (
     LEAST_OCTETS,
@@ -162,7 +162,7 @@ class ImageManager:
         """Return how many octets of the image one packet takes."""
         link = self._node.contact.link
         largest = self._largest
-        if isinstance(link, SharedBusLink) and link.wait_for_air():
+        if isinstance(link, TransferLink) and link.wait_for_air():
             largest = min(largest, _SHORT_PACKET)
         empty = self._image.ImageUploadWriteRequest(off=offset, data=b"", **more)
         return max(1, largest - len(empty.BYTES) - 2)  # the length of the data takes up to 2 octets more

@@ -144,7 +144,7 @@ class CanLink:
         return self._ask(frame, self._last, tries=TRIES, seconds=self._reply_seconds)
 
     def wait_for_air(self) -> bool:
-        """Wait until a long transfer may go on; see ``SharedBusLink.wait_for_air``."""
+        """Wait until a long transfer may go on; see ``TransferLink.wait_for_air``."""
         return self._bus().transfer_pace.wait()
 
     def close(self) -> None:
