@@ -33,7 +33,8 @@ from teds_provision.steps.provision import ProvisionResult
 from teds_provision.steps.sign import SignResult
 from teds_provision.steps.teds_read import NodeSnapshot
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import StepResult
+from teds_provision.talk.progress import DONE, StepResult
+from teds_provision.talk.progress import FAILED as STEP_FAILED
 from teds_provision.teds.certificate import certificate_reference_of
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
@@ -484,4 +485,7 @@ def _named_in(image: Image | None, shown: SecurityTeds) -> tuple[tuple[tuple[int
 
 
 def _step_facts(steps: Sequence[StepResult]) -> tuple[tuple[str, str, int], ...]:
-    return tuple((step.name, step.result, round(step.seconds * 1000)) for step in steps)
+    """Return name, result and milliseconds of steps; a verdict is a step of its own, with the code of its error."""
+    return tuple(
+        (step.name, DONE if step.result == STEP_FAILED else step.result, round(step.seconds * 1000)) for step in steps
+    )
