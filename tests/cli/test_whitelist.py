@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import pytest
 
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeRecord, Store, WhitelistEntry
+from teds_provision.station.store import NodeRecord, WhitelistEntry
 from teds_provision.vault import forget_vaults
 from tests.bench import PASSPHRASE, make_station
 
@@ -65,8 +65,8 @@ def test_export_and_import_go_round(home: Path, tmp_path: Path, form: str) -> No
 def test_an_export_has_the_names_of_nodes_and_import_keeps_them(home: Path, tmp_path: Path, form: str) -> None:
     """Provisioning gives the name to the node, not to its whitelist entry; other readers find an attribute."""
     call(home, "whitelist", "add", ONE, "--fingerprint", KEY)
-    with Store.open(home) as store:
-        store.put_node(NodeRecord(bytes.fromhex(ONE), name='left "hand" <2>'))
+    with Station.inspect(home) as station:
+        station.nodes.restore(NodeRecord(bytes.fromhex(ONE), name='left "hand" <2>'))
     path = tmp_path / f"list.{form}"
     exported = call(home, "whitelist", "export", path)
     assert exported.out == f"Wrote 1 entry as {form} to {path}.\n"
