@@ -125,8 +125,18 @@ def test_a_board_that_lost_power_on_trial_runs_its_old_image_and_takes_the_new_o
     assert (done.result, done.octets) == ("updated", 0), "the image is in the other slot already"
 
 
-@pytest.mark.parametrize("sabotage", ["datasheet", "key", "values", "confirms itself"])
-def test_an_image_that_does_not_prove_itself_is_reverted(bench: UpdateBench, owner: Owner, sabotage: str) -> None:
+@pytest.mark.parametrize(
+    ("sabotage", "why"),
+    [
+        ("datasheet", "shows another datasheet"),
+        ("key", "cannot prove that it holds the key"),
+        ("values", "gives a valid value"),
+        ("confirms itself", "confirmed itself before it was proven"),
+    ],
+)
+def test_an_image_that_does_not_prove_itself_is_reverted(
+    bench: UpdateBench, owner: Owner, sabotage: str, why: str
+) -> None:
     node, flash, key = bench.node, bench.node.tim.flash, bench.node.tim.key
     board, slots = node.board, node._slots
     assert board is not None
@@ -149,6 +159,7 @@ def test_an_image_that_does_not_prove_itself_is_reverted(bench: UpdateBench, own
 
     bench.node.when_restarted(spoil)
     done = bench.update(owner.new)
+    assert why in str(done.error)
     if sabotage == "confirms itself":
         assert (done.result, type(done.error)) == ("refused", PolicyError)
         assert "keeps the new image" in str(done.error)

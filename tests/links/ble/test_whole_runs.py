@@ -22,6 +22,7 @@ from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import SilentReporter, StepResult
 from tests.bench import make_station, on_reader
 from tests.e2e.desk import Desk, Station, results
+from tests.firmware_images import make_key, sign
 from tests.pace import succeeds, until
 from tests.places import free_tcp_port
 
@@ -199,3 +200,18 @@ def test_node_check_and_mode_work_over_the_air(desk: Desk, air: Air) -> None:
     passed = {check["rule"] for check in done["checks"] if check["result"] == "passed"}
     assert {"repetition", "sealed-counter", "open-once"} <= passed
     assert bench.ask("mode", done["uuid"], "--ble", "auto")["uuid"] == done["uuid"]
+
+
+def test_new_firmware_goes_over_the_air(desk: Desk, bench: Station, air: Air) -> None:
+    hci = free_tcp_port()
+    air([], hci=[hci])
+    key = make_key(desk.folder / "owner.pem")
+    old, new = sign(desk.folder, "1.0.0", key), sign(desk.folder, "1.1.0", key)
+    node = desk.node(firmware=(old, key)).start("--ble", f"tcp-client:127.0.0.1:{hci}")
+    bench.provision("nfc", "--profile", ANGLE)
+    before = node.octets
+    done = bench.run("--json", "update", node.uuid, new, "--yes", "--via", "ble")
+    assert done.code == 0, done
+    line = json.loads(done.out.splitlines()[0])
+    assert (line["from"], line["to"], line["result"]) == ("1.0.0", "1.1.0", "updated")
+    assert node.octets == before
