@@ -27,6 +27,7 @@ from teds_provision.cli.options import COMMAND_SETTINGS, command, examples
 from teds_provision.errors import BadDataError, UsageError
 from teds_provision.files import write_whole
 from teds_provision.limits import load_toml
+from teds_provision.links.can import spec
 from teds_provision.station.store import StoreLock
 
 if TYPE_CHECKING:
@@ -207,6 +208,8 @@ def _typed(root: click.Context, name: str, value: str) -> Any:
         read = option_.process_value(click.Context(command, parent=root, info_name=path), given)
     except click.BadParameter as error:
         raise UsageError(f"{name}: {error.message.rstrip('.')}.") from error
+    if option_.name == "can" and isinstance(read, str):
+        spec.parse_spec(read)  # else every command would fail at it
     return read if isinstance(read, bool | int | float) else value
 
 

@@ -21,6 +21,7 @@ from teds_provision.cli.options import (
     examples,
     file_units_option,
 )
+from teds_provision.errors import NotFoundError
 from teds_provision.lazy import late
 from teds_provision.sanitize import counted
 
@@ -148,10 +149,22 @@ def show(app: App, file: Path, channels: tuple[int | str, ...], limit: int | Non
         if left > 0 and (cut := recordings.source.first_instants(entry, wanted, left)) is not None:
             left -= len(cut.time)
             app.lines(list(_events(cut, summary) if app.json else _values(cut, summary)))
+    _require_known(file, summary, channels)
     if app.json:
         app.emit({"event": "end", **summary.to_json(recording)})
     elif summary.messages > (limit or SHOWN):
         app.note(f"{summary.messages} time stamps in all; use --limit to show more.")
+
+
+def _require_known(file: Path, summary: RecordingSummary, channels: Sequence[int | str]) -> None:
+    """Raise NotFoundError for a channel that the whole recording does not have."""
+    known = {(key[1], facts.name) for key, facts in summary.facts.items()}
+    for chosen in channels if known else ():
+        fits = [chosen in (number, name) or str(chosen).casefold() == name.casefold() for number, name in known]
+        if not any(fits):
+            has = ", ".join(f"{number} ({name})" if name else str(number) for number, name in sorted(known))
+            which = chosen if isinstance(chosen, int) else repr(chosen)
+            raise NotFoundError(f"{file} has no channel {which}.", hint=f"It has {has}.")
 
 
 def _wanted(entry: Entry, summary: RecordingSummary, channels: Sequence[int | str]) -> set[tuple[str, int]] | None:

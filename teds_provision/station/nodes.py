@@ -8,16 +8,25 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from functools import lru_cache
+from itertools import islice
 from operator import attrgetter
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import KeyMismatchError, NotFoundError, StoreError, UsageError
+from teds_provision.lazy import late
 from teds_provision.station.plant.plant import Plant
 from teds_provision.station.row_macs import MacRow, RowMacs, changed
 from teds_provision.station.store.database import PAGE, chunks, places
 from teds_provision.station.store.records import UUID_OCTETS, ExportedNode, ExportEligibility, NodeRecord
 from teds_provision.station.store.store import Store
 
+if TYPE_CHECKING:
+    import difflib
+else:
+    difflib = late("difflib")  # for a name that was mistyped
+
+_MOST_NAMES: Final = 10_000
+_LONGEST: Final = 64
 _UUID_DIGITS = 2 * UUID_OCTETS
 _MIN_PREFIX = 4
 _SHOWN_CANDIDATES = 5
@@ -187,15 +196,25 @@ class Nodes:
             found.update(self._store.execute(*_by_prefix(digits)))
         candidates = sorted(uuid for (uuid,) in found)
         if not candidates:
+            near = self._near_names(asked)
+            meant = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
             raise NotFoundError(
                 f"No node is known as {asked!r}.",
-                hint="Give a UUID (20 hex digits, or its first four or more) or a name; see teds-provision nodes.",
+                hint=f"{meant}Give a UUID (20 hex digits, or its first four or more) or a name; see nodes.",
             )
         if len(candidates) > 1:
             shown = ", ".join(uuid.hex() for uuid in candidates[:_SHOWN_CANDIDATES])
             more = f" and {len(candidates) - _SHOWN_CANDIDATES} more" if len(candidates) > _SHOWN_CANDIDATES else ""
             raise UsageError(f"{asked!r} fits several nodes: {shown}{more}.", hint="Give more digits of the UUID.")
         return bytes(candidates[0])
+
+    def _near_names(self, text: str) -> list[str]:
+        """Return names much like a mistyped one, or that begin with it; two at most."""
+        names = sorted({node.name for node in islice(self.all(), _MOST_NAMES) if node.name})
+        folded = {name.casefold(): name for name in names}
+        begun = [name for key, name in folded.items() if key.startswith(text.casefold()[:_LONGEST])]
+        near = difflib.get_close_matches(text.casefold()[:_LONGEST], folded, n=2, cutoff=0.6)
+        return list(dict.fromkeys([*(folded[key] for key in near), *begun]))[:2]
 
     def beginning_with(self, text: str, most: int) -> list[tuple[str, str]]:
         """Return at most so many words that begin with ``text``, each with what it is: names, and UUIDs (20 digits)."""

@@ -179,7 +179,14 @@ def test_a_setting_is_written_beside_what_stands_there_and_taken_away_again(home
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("cann", "x"), ("verify.profile", "x"), ("timeout", "soon"), ("provision.watch", "perhaps"), ("home", "/tmp")],
+    [
+        ("cann", "x"),
+        ("verify.profile", "x"),
+        ("timeout", "soon"),
+        ("provision.watch", "perhaps"),
+        ("home", "/tmp"),
+        ("can", "can0"),
+    ],
 )
 def test_a_setting_that_no_command_takes_is_not_written(home: Path, name: str, value: str) -> None:
     assert call(home, "config", "set", name, value).code == 2

@@ -224,3 +224,10 @@ def test_listing_loads_no_cryptography_and_decodes_no_teds(home: Path) -> None:
         f"print([name for name in {heavy!r} if name in sys.modules])"
     )
     assert python(script).out.splitlines()[-1] == "[]"
+
+
+def test_a_mistyped_name_is_guessed(fleet: Path) -> None:
+    for typed, meant in (("fingr-3", "'finger-3'"), ("IMPORT", "'imported'")):
+        said = call(fleet, "--json", "whitelist", "remove", typed, "--yes").json["error"]
+        assert (said["code"], f"Did you mean {meant}" in said["hint"]) == ("not-found", True), said
+    assert "Did you mean" not in call(fleet, "--json", "group", "create", "x", "zzzz").json["error"]["hint"]

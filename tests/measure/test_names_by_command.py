@@ -89,7 +89,9 @@ def test_a_channel_is_chosen_by_name_wherever_it_is_by_number(hall: Hall, tmp_pa
     assert ended.code == 0, ended
     shown = hall.station.run("record", "show", file, "--channel", "grip force", "--limit", 3)
     assert shown.out.count("grip force") == 3
-    assert hall.station.run("record", "show", file, "--channel", "opening").out == ""
+    said = hall.station.run("record", "show", file, "--channel", "opening")
+    assert (said.code, said.out) == (3, "")
+    assert "It has 3 (grip force)." in said.err
     g.kill()
 
 
