@@ -208,8 +208,8 @@ def _typed(root: click.Context, name: str, value: str) -> Any:
         read = option_.process_value(click.Context(command, parent=root, info_name=path), given)
     except click.BadParameter as error:
         raise UsageError(f"{name}: {error.message.rstrip('.')}.") from error
-    if option_.name == "can" and isinstance(read, str):
-        spec.parse_spec(read)  # else every command would fail at it
+    if option_.name == "can":
+        spec.parse_spec(value)  # else every command would fail at it
     return read if isinstance(read, bool | int | float) else value
 
 
