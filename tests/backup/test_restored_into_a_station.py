@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,14 @@ from teds_provision.errors import PolicyError, UsageError, VaultError
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.snapshot import Relation, place
 from teds_provision.station.station import Station, initialise
-from teds_provision.station.store import Holder, NodeRecord, RevocationRecord, Tombstone, WhitelistEntry
+from teds_provision.station.store import (
+    Handover,
+    Holder,
+    NodeRecord,
+    RevocationRecord,
+    Tombstone,
+    WhitelistEntry,
+)
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
 from teds_provision.vault.software import SoftwareVault
@@ -61,6 +69,27 @@ def test_an_older_state_brings_back_what_is_missing_and_nothing_goes_back(statio
     assert store.policy.tombstone(TWO) is not None
     assert store.pins.row(NEW) is not None
     assert store.audit_log.check().intact
+
+
+def test_a_handover_goes_forward_with_a_newer_backup_and_never_back(station: Station, tmp_path: Path) -> None:
+    begun, stale = Handover("h1", "out", "move", ("cd" * 32,), "open", "{}"), tmp_path / "stale"
+    with station.durable("export"):
+        station.handovers.put(begun)
+    back_up(station, tmp_path / "before")
+    with copy_of(station, tmp_path) as content:
+        stale.mkdir(mode=0o700)
+        place(content.copy, stale)
+    shutil.copy(station.home / "vault.json", stale / "vault.json")
+    with station.durable("export"):
+        station.handovers.put(replace(begun, state="done"))
+        station.audit("export", ONE, "done")
+    back_up(station, tmp_path / "after")
+    assert merge(station._store, opened(tmp_path / "before"), dry_run=False).relation is Relation.OLDER
+    assert [known.state for known in station.handovers.all()] == ["done"]
+    old = Station.open(stale, ask=ask)
+    assert merge(old._store, opened(tmp_path / "after"), dry_run=False).relation is Relation.NEWER
+    assert [known.state for known in old.handovers.all()] == ["done"]
+    old.close()
 
 
 def test_a_revoked_node_stays_revoked_and_off_the_whitelist(station: Station, tmp_path: Path) -> None:

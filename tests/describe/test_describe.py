@@ -63,7 +63,11 @@ def test_a_thing_description_validates_and_its_forms_are_the_api(
     sensors = [channel for channel in node.sheet.channels if not channel.actuator]
     assert len(description["properties"]) == len(sensors)
     [action] = description["actions"].values()
+    assert (action["safe"], action["idempotent"]) == (False, True), (
+        "it moves something; the same value twice does no more"
+    )
     [form] = action["forms"]
+    assert (form["op"], form["htv:methodName"]) == (["invokeaction"], "PUT")
     actuator = next(channel for channel in node.sheet.channels if channel.actuator)
     assert form["href"] == f"api/v1/nodes/{board.uuid.hex()}/channels/{actuator.number}"
     value = action["input"]["properties"]["value"]

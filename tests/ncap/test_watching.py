@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import LinkError
+from teds_provision.links import Notice
 from teds_provision.measure.blocks import NodeReport
 from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor, RunningMeasurement
 from teds_provision.ncap.nodes import link_watch
@@ -153,6 +154,16 @@ def test_a_clock_that_is_set_keeps_no_node_from_being_looked_at_again(
     monkeypatch.setattr(link_watch.time, "time", lambda: now)
     watch.on_sighting(sighting(3))
     assert len(looked) == 2
+
+
+def test_what_a_link_reports_is_published_once_and_what_belongs_to_a_retry_is_not(
+    watch: LinkWatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(watch._live, "event", lambda _kind, **facts: told.append(facts["text"]), raising=False)
+    for kind, text in (("foreign-tag", "a card"), ("foreign-tag", "a card"), ("retry", "again"), ("conflict", "two")):
+        watch._notice(Notice(kind, text))
+    assert told == ["a card", "two"]
 
 
 def test_a_reader_is_lent_again_while_it_is_being_opened(reader: LinkWatch, monkeypatch: pytest.MonkeyPatch) -> None:

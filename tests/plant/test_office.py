@@ -22,7 +22,7 @@ from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import MOST_ANSWERS, RequestAheadError, answer
 from teds_provision.plant.sign_requests import OfficeRefusedError, OfficeSilentError, RemoteOffice, send
 from teds_provision.plant.yield_stats import attempts_of, yield_stats
-from teds_provision.protocol.keys import SoftwareKey, node_key_message, prove_message
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, node_key_message, prove_message
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.job import CalibrationRule, Job
 from teds_provision.protocol.plant.signing import (
@@ -35,7 +35,7 @@ from teds_provision.protocol.plant.signing import (
     seal_request,
 )
 from teds_provision.station.station import Station
-from teds_provision.station.store import RevocationRecord
+from teds_provision.station.store import RevocationRecord, WhitelistEntry
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.codec.model import AccessCode
@@ -128,6 +128,16 @@ def test_a_line_without_sign_makes_authentic_boards_by_its_office(desk: Desk) ->
     assert desk.office.pins.entry(one.uuid) is not None
     assert run.job is not None
     assert [unit.unit for unit in desk.office.plant.line.units(run.job.id)] == [1]
+
+
+def test_what_a_person_pinned_at_the_office_is_not_weakened_by_a_line(desk: Desk) -> None:
+    run, one = desk.run(), board(1)
+    pinned = WhitelistEntry(one.uuid, fingerprint(one.key.point), assurance="tap", name="seen")
+    desk.office.pins.put(pinned)
+    build(run, one)
+    entry = desk.office.pins.entry(one.uuid)
+    assert entry is not None
+    assert (entry.assurance, entry.name) == ("tap", "seen")
 
 
 def test_nothing_is_asked_twice_for_what_the_board_has(desk: Desk) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import NodeRefusedError
+from teds_provision.errors import LinkError, NodeRefusedError
 from teds_provision.protocol.keys import SoftwareKey, station_key_message
 from teds_provision.protocol.messages.frames import Function, Reason, decode_reply, read_teds, security_command
 from teds_provision.protocol.session import StationSession
@@ -140,3 +140,23 @@ def test_a_node_that_stays_busy_is_asked_for_one_patience_and_no_new_session_is_
     assert asked.index(True) == 2, "asked for c, then Open"
     assert sum(asked) >= 2, "it may have been for a moment"
     assert all(asked[2:])
+
+
+@pytest.mark.parametrize(
+    ("via", "answers", "lives"), [("can", True, True), ("can", False, False), ("nfc", True, False)]
+)
+def test_after_a_lost_message_a_node_on_a_bus_is_asked_whether_it_lives(
+    board: Board, via: str, answers: bool, lives: bool
+) -> None:
+    """At a reader it is not: who does not answer there has left the field."""
+
+    class Silent(MemoryLink):
+        def exchange(self, frame: bytes) -> bytes:
+            if not answers:
+                raise LinkError("No answer.")
+            return super().exchange(frame)
+
+    link = Silent(board, via=via, tapped=via == "nfc")
+    with talk(board, link) as node:
+        assert node.lives() is lives
+    assert link.count == int(via == "can" and answers)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from teds_provision.errors import AddressConflictError, LinkError, NodeSilentError, NoNodeError, NoReaderError
+from teds_provision.links.can import bus as bus_module
 from teds_provision.links.can import link as link_module
 from teds_provision.links.can.arrivals import Arrivals
 from teds_provision.links.can.isotp import FUNCTIONAL, Frame
@@ -511,6 +512,20 @@ def test_no_bus_is_named_with_its_cure() -> None:
         CanPort("nonsense:can0")
     with pytest.raises(NoReaderError):
         CanPort("udp_multicast:127.0.0.1")
+
+
+@pytest.mark.parametrize(
+    ("pythons", "ours"),
+    [
+        ("Bus.__init__() got an unexpected keyword argument 'baud'", "takes no baud="),
+        ("Bus.__init__() missing 1 required keyword-only argument: 'serial'", "also needs 'serial'"),
+        ("cannot be combined", "does not take these options: cannot be combined"),
+    ],
+)
+def test_an_option_that_an_interface_does_not_take_is_named(pythons: str, ours: str) -> None:
+    refused = bus_module._unknown_key(parse_spec("slcan:/dev/ttyACM0?bitrate=500000"), TypeError(pythons))
+    assert ours in refused.message
+    assert "own options are bitrate" in refused.hint
 
 
 def test_a_bus_that_closes_is_a_link_failure() -> None:
