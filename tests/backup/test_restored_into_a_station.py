@@ -84,10 +84,10 @@ def test_a_handover_goes_forward_with_a_newer_backup_and_never_back(station: Sta
         station.handovers.put(replace(begun, state="done"))
         station.audit("export", ONE, "done")
     back_up(station, tmp_path / "after")
-    assert merge(station._store, opened(tmp_path / "before"), dry_run=False).relation is Relation.OLDER
+    assert merge(station, opened(tmp_path / "before"), dry_run=False).relation is Relation.OLDER
     assert [known.state for known in station.handovers.all()] == ["done"]
     old = Station.open(stale, ask=ask)
-    assert merge(old._store, opened(tmp_path / "after"), dry_run=False).relation is Relation.NEWER
+    assert merge(old, opened(tmp_path / "after"), dry_run=False).relation is Relation.NEWER
     assert [known.state for known in old.handovers.all()] == ["done"]
     old.close()
 
