@@ -5,6 +5,7 @@
 ``probe``       the board as the rules see it: frames out, replies in, a record of both
 ``slips``       what firmware authors do in place of the right thing, tried until one fits
 ``plain_rules``       rules for any state, and those about the TEDS of a node
+``firmware_rules``  rules of About, Locate and Manage
 ``link_rules``  rules of the link's own frames
 ``frame_rules``  rules of single CAN frames: addresses, ISO-TP, functional requests, Announce
 ``agreement_rules``   rules of factory state, of a node with a key, and of the key agreement; the test agreement
@@ -22,6 +23,7 @@ from teds_provision.lazy import lazy
 if TYPE_CHECKING:
     from teds_provision.check import (
         agreement_rules,
+        firmware_rules,
         frame_rules,
         link_rules,
         measuring_rules,

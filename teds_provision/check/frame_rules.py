@@ -28,16 +28,18 @@ from teds_provision.links.can.isotp import (
 )
 from teds_provision.links.ports import BusFrame, BusFrames
 from teds_provision.protocol.announce import ANNOUNCE, LAST_ADDRESS, Announce, is_announce, uuid_crc
+from teds_provision.protocol.messages.firmware import ABOUT
 from teds_provision.protocol.messages.frames import (
     IDENTIFY,
     Command,
     Function,
+    Reason,
     decode_reply,
     read_teds,
     security_command,
     write_teds,
 )
-from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.messages.tables import describe_command
 from teds_provision.teds.image import SECURITY
 
@@ -195,7 +197,7 @@ def can_other_address(probe: Probe) -> str:
 @rule("can-functional", "CAN", Stage.PLAIN)
 def can_functional(probe: Probe) -> str:
     """Identify alone is answered when everyone is asked: anything else gets no reply, not even a refusal."""
-    asked = (security_command(Function.LIST), security_command(Function.OPEN), security_command(Function.CLOSE))
+    asked = (security_command(Function.LIST), ABOUT, security_command(Function.OPEN), security_command(Function.CLOSE))
     with _stranger(probe) as stranger:
         for command in asked:
             stranger.everyone(single(_body(stranger.transaction(), command), fd=stranger.fd))
@@ -334,6 +336,21 @@ def can_announce(probe: Probe) -> str:
     same = frame.octets[:6] == right[:6] and len(frame.octets) == len(right)  # behind the CRC stands no claim
     holds(same, f"{what}: it announces {frame.octets.hex()}; {right.hex()} is due.")
     return f"announces CRC {own:08x}, {state.name.lower()}"
+
+
+@rule("can-pressed", "CAN", Stage.PLAIN)
+def can_pressed(probe: Probe) -> str:
+    """Check that an Announce of a pressed button claims nothing: the node neither moves nor announces."""
+    link, own, home = probe.framed, uuid_crc(probe.uuid), probe.contact.address
+    assert home is not None
+    if own == _GREATEST or probe.plain(ABOUT).reason == Reason.UNKNOWN_COMMAND:
+        raise NotApplicableError("The node is from before pressed buttons were announced (128.21 gets 1).")
+    with link.single_frames() as frames:
+        frames.send(ANNOUNCE | home, Announce(home, NodeState.FACTORY, _GREATEST, pressed=True).encode())
+        frame = _announced(frames, home, own)
+    what = f"An Announce of a pressed button from the node's own CAN address {home}"
+    holds(frame is None, f"{what}: the node takes it for a claim, and announces.")
+    return "neither moves nor announces"
 
 
 def _announced(frames: BusFrames, home: int, own: int) -> BusFrame | None:

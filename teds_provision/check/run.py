@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from teds_provision.check import (
     agreement_rules,
+    firmware_rules,
     frame_rules,
     link_rules,
     measuring_rules,
@@ -30,7 +31,16 @@ from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter
 
-_REGISTERS = (plain_rules, link_rules, frame_rules, agreement_rules, session_rules, write_rules, measuring_rules)
+_REGISTERS = (
+    plain_rules,
+    firmware_rules,
+    link_rules,
+    frame_rules,
+    agreement_rules,
+    session_rules,
+    write_rules,
+    measuring_rules,
+)
 """The modules whose rules are registered by being imported."""
 _ONLY_FACTORY = "The node has a key. Ask with --factory to have it reset and keyed anew."
 _NEEDS_FACTORY = "Changes the node's key. Ask with --factory."

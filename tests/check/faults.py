@@ -217,6 +217,23 @@ FAULTS: Final[dict[str, Faulty]] = {
         "field 102 without the UUID", "without-uuid", bends.node_key_without_uuid, "*", rule="node-key"),
     "FAULT_IDENTIFY_ANY_PAYLOAD": Faulty(
         "Identify with a payload", "no-payload", "one octet of payload", fault=faulty.identify_any_payload),
+    # -- the firmware
+    "FAULT_ABOUT_FORM": Faulty(
+        "About of another form", "about", "form 2", fault=faulty.about_of_form_2,
+        also=("about-keyed", "about-in-session", "locate", "locate-in-session"), over="can"),
+    "FAULT_ABOUT_ANY_PAYLOAD": Faulty(
+        "About with a payload", "about", "refusal 4 is due", fault=faulty.about_with_any_payload,
+        also=("about-in-session",)),
+    "FAULT_ABOUT_BY_RADIO": Faulty(
+        "About by radio, with a key", "about-keyed", "refusal 3 is due", fault=faulty.about_by_radio),
+    "FAULT_LOCATE_FOR_ANYONE": Faulty(
+        "a keyed board that blinks for anyone", "locate-keyed", "refusal 3 is due", fault=faulty.locates_for_anyone),
+    "FAULT_LOCATE_FOR_LONG": Faulty(
+        "Locate for more than a minute", "locate", "payload 3d: refusal 4 is due", fault=faulty.locates_for_long,
+        also=("locate-in-session",)),
+    "FAULT_MANAGE_UNKNOWN": Faulty(
+        "Manage unknown outside a session", "manage-needs-session", "refusal 3 is due",
+        fault=faulty.manage_is_unknown),
     # -- TEDS
     "FAULT_LIST_TWICE": Faulty(
         "List does not ascend", "list-ascending", "does not ascend", fault=faulty.list_twice),
@@ -478,6 +495,9 @@ FAULTS: Final[dict[str, Faulty]] = {
     "FAULT_CLAIM_REVERSED": Faulty(
         "the greater CRC keeps the address", "can-announce", "the node moved to",
         more_bends.claim_the_wrong_way_round, over="can", also=("*",)),
+    "FAULT_PRESSED_CLAIMS": Faulty(
+        "a pressed button taken for a claim", "can-pressed", "takes it for a claim",
+        more_bends.a_pressed_button_claims, over="can"),
     # -- measurement
     "FAULT_OPERATE_ANY_DIGEST": Faulty(
         "Operate with any digest", "operate-digest", "octet 0 of the digest changed", more_bends.any_digest,

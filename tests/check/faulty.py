@@ -177,6 +177,36 @@ def any_challenge(_board: Board, octets: bytes, reference: Next) -> bytes:
     return reference(octets[:4] + b"\0\x20" + octets[6:].ljust(32, b"\0")[:32]) if _is(octets, 8) else reference(octets)
 
 
+def about_of_form_2(_board: Board, octets: bytes, reference: Next) -> bytes:
+    reply = decode_reply(reference(octets))
+    bent = _is(octets, Function.ABOUT) and reply.ok
+    return (Reply(True, b"\2" + reply.payload[1:]) if bent else reply).encode()
+
+
+def about_with_any_payload(_board: Board, octets: bytes, reference: Next) -> bytes:
+    return reference(octets[:4] + b"\0\0") if _is(octets, Function.ABOUT) else reference(octets)
+
+
+def about_by_radio(board: Board, octets: bytes, reference: Next) -> bytes:
+    if _is(octets, Function.ABOUT):
+        return board.tim.handle(octets, link="can:f1", tapped=False)
+    return reference(octets)
+
+
+def locates_for_anyone(_board: Board, octets: bytes, reference: Next) -> bytes:
+    reply = decode_reply(reference(octets))
+    taken = _is(octets, Function.LOCATE) and reply.reason == Reason.NOT_PERMITTED
+    return (Reply(True) if taken else reply).encode()
+
+
+def locates_for_long(_board: Board, octets: bytes, reference: Next) -> bytes:
+    return reference(octets[:6] + b"\x3c" if _is(octets, Function.LOCATE) and octets[6:] == b"\x3d" else octets)
+
+
+def manage_is_unknown(_board: Board, octets: bytes, reference: Next) -> bytes:
+    return refusal(Reason.UNKNOWN_COMMAND).encode() if _is(octets, Function.MANAGE) else reference(octets)
+
+
 def proof_of_another(_board: Board, octets: bytes, reference: Next) -> bytes:
     good = _is(octets, Function.PROVE) and len(octets) == 38
     return Reply(True, SoftwareKey.generate().sign(octets)).encode() if good else reference(octets)

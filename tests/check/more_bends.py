@@ -233,8 +233,8 @@ def escape_in_a_classic_frame(patch: Patch) -> None:
 
 
 def announces_another_crc(patch: Patch) -> None:
-    def announce(address: int, state: int, crc: int) -> Announce:
-        return Announce(address, state, crc ^ 1)
+    def announce(address: int, state: int, crc: int, pressed: bool = False) -> Announce:
+        return Announce(address, state, crc ^ 1, pressed)
 
     patch.setattr(endpoint, "Announce", announce)
 
@@ -245,6 +245,15 @@ def claim_the_wrong_way_round(patch: Patch) -> None:
     def handle(self: AddressClaim, announce: Announce, own: int, now: float, *, pinned: bool = False) -> int:
         turned = replace(announce, crc=2 * self.crc - announce.crc) if announce.crc != self.crc else announce
         return original(self, turned, own, now, pinned=pinned)
+
+    patch.setattr(AddressClaim, "handle_announce", handle)
+
+
+def a_pressed_button_claims(patch: Patch) -> None:
+    original = AddressClaim.handle_announce
+
+    def handle(self: AddressClaim, announce: Announce, own: int, now: float, *, pinned: bool = False) -> int:
+        return original(self, replace(announce, pressed=False), own, now, pinned=pinned)
 
     patch.setattr(AddressClaim, "handle_announce", handle)
 

@@ -11,12 +11,14 @@ import pytest
 from teds_provision.check.probe import Probe
 from teds_provision.check.rule import RuleResult
 from teds_provision.check.run import CheckReport, check_node
+from teds_provision.protocol.messages.firmware import LOCATE_SECONDS, FirmwareFlag, FirmwareReport
 from teds_provision.protocol.tim import Tim
 from teds_provision.station.station import Station
 from teds_provision.teds.codec.frame import frame
 from tests.protocol.operation.bench import SECOND, FakeHardware, channel_teds
 
-from ..bench import Board, talk
+from .. import bench
+from ..bench import talk
 from ..protocol.desk import META, NAME
 from .faulty import FaultyBus, FaultyLink
 
@@ -34,13 +36,34 @@ class TimedHardware(FakeHardware):
         return self.tick + round(self.clock() * SECOND)
 
 
+FIRMWARE: Final = FirmwareReport("desk/check", (1, 2, 3), 4, bytes(range(32)), FirmwareFlag.LOCATE)
+
+
+class Board(bench.Board):
+    """A node that reports its firmware and has a light to blink with."""
+
+    hardware: TimedHardware | None = None
+
+    def about(self) -> FirmwareReport:
+        return FIRMWARE
+
+    def locate(self, seconds: int) -> None:
+        assert 0 <= seconds <= LOCATE_SECONDS
+
+    def power_on(self) -> None:
+        super().power_on()
+        more: dict[str, Any] = {"max_message": self.max_message, "hardware": self.hardware, "firmware": self}
+        self.tim = Tim(self.key, self.flash, lambda: self.seconds, **more)
+
+
 class Measuring(Board):
     """A node with channels, which a session may claim; their TEDS fit."""
+
+    hardware: TimedHardware
 
     def power_on(self) -> None:
         self.hardware = TimedHardware(clock=lambda: self.seconds)
         super().power_on()
-        self.tim = Tim(self.key, self.flash, lambda: self.seconds, max_message=self.max_message, hardware=self.hardware)
 
 
 def made(over: str = "nfc", *, epoch: int = 4) -> Board:

@@ -44,6 +44,6 @@ SISTERS = {
     "identify", "close-needs-session", "operation-needs-session", "never-held", "query-length", "read-absent",
     "security-state", "factory-open", "confirm-without-request", "keyed-reset", "sealed-tag", "sealed-only-sealed",
     "sealed-command-residues", "repetition-two", "address-back", "write-checks", "update-checks", "commit-form",
-    "commit-digests",
+    "commit-digests", "about-in-session", "locate-in-session",
 }  # fmt: skip
 """Rules whose fault is that of a rule in the table, looked at from another side."""

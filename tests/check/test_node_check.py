@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.check import frame_rules
+from teds_provision.check import firmware_rules, frame_rules
 from teds_provision.check.agreement_rules import ExplainedRequest
 from teds_provision.check.rule import RULES, Stage
 from teds_provision.check.run import CheckReport, check_node
@@ -20,12 +20,13 @@ from teds_provision.steps.agree import reset_node
 from teds_provision.steps.identify import identify
 from tests.protocol.operation.bench import SAFE_VALUE
 
-from ..bench import Board, make_station, talk
+from .. import bench
+from ..bench import make_station, talk
 from . import faulty, nodes
 from .bends import agreeing_so, opening_so
 from .faulty import FaultyBus, FaultyLink
 from .memory_bus import MemoryServer
-from .nodes import names
+from .nodes import Board, names
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -35,7 +36,7 @@ def patch(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     return monkeypatch
 
 
-def checked(station: Station, board: Board, *, factory: bool = True, **link: object) -> CheckReport:
+def checked(station: Station, board: bench.Board, *, factory: bool = True, **link: object) -> CheckReport:
     with pytest.MonkeyPatch.context() as patch:
         return nodes.checked(station, patch, board, factory=factory, **link)
 
@@ -142,6 +143,14 @@ def test_without_factory_a_factory_node_is_left_as_it_was(station: Station) -> N
     assert not names(report, "failed")
     tried = {rule.name for rule in RULES if rule.stage in (Stage.PLAIN, Stage.FACTORY)}
     assert names(report, "passed") == tried - OF_FRAMES - OF_CAN
+
+
+def test_a_node_from_before_about_breaks_no_rule(station: Station) -> None:
+    report = checked(station, bench.Board())
+    assert not names(report, "failed")
+    of_firmware = {rule.name for rule in RULES if rule.run.__module__ == firmware_rules.__name__}
+    assert len(of_firmware) == 7
+    assert of_firmware <= names(report, "skipped")
 
 
 def agreed(station: Station, board: Board) -> None:

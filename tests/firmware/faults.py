@@ -58,6 +58,27 @@ static int hkdf_of(const teds_node *node, const uint8_t *salt, size_t salt_lengt
 
 
 CHANGES: Final[dict[str, Change]] = {
+    "FAULT_ABOUT_FORM": Change("about.c", "#define FORM 1u\n", "#define FORM 2u\n"),
+    "FAULT_ABOUT_ANY_PAYLOAD": Change("about.c", "if (command->length != 0) {", "if (command->length > 9) {"),
+    "FAULT_ABOUT_BY_RADIO": Change(
+        "node.c",
+        "return teds_in_factory(node) || origin->arrival->kind == TEDS_CAN ? 0 : -TEDS_NOT_PERMITTED;",
+        "return 0;",
+    ),
+    "FAULT_LOCATE_FOR_ANYONE": Change(
+        "node.c",
+        "    case TEDS_RESET:\n    case TEDS_LOCATE: return",
+        "    case TEDS_LOCATE: return 0;\n    case TEDS_RESET: return",
+    ),
+    "FAULT_LOCATE_FOR_LONG": Change("about.c", "#define LONGEST_SECONDS 60u", "#define LONGEST_SECONDS 61u"),
+    "FAULT_MANAGE_UNKNOWN": Change(
+        "node.c",
+        "    default: return -TEDS_NOT_PERMITTED; /* Close, and what measures */",
+        "    case TEDS_MANAGE: return -TEDS_UNKNOWN_COMMAND;\n    default: return -TEDS_NOT_PERMITTED; /* Close, and what measures */",
+    ),
+    "FAULT_PRESSED_CLAIMS": Change(
+        "can.c", " ||\n        frame->data[6] == 1) { /* a pressed button claims nothing */", ") {"
+    ),
     # -- the agreement
     "FAULT_TRANSCRIPT_LABEL_WITHOUT_00": Change(
         "agree.c", 'LABEL("TEDS1 transcript")', 'MAC_LABEL("TEDS1 transcript")'

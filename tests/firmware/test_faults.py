@@ -118,6 +118,7 @@ class Board(nodes.Measuring):
             self._draw, lambda: self.seconds, uuid=self.uuid, max_message=2048, max_teds=16384, library=self.library
         )
         node.room = 2049  # FAULT_LIST_LONG
+        node.has_firmware(lambda what, _argument, _octets: nodes.FIRMWARE.encode()[1:] if what == "a" else b"")
         if self.measures:
             self._channels(node)
         assert node.start() == 0
