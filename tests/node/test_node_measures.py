@@ -46,7 +46,7 @@ from teds_provision.protocol.operation.stream_commands import (
     drive,
     stop,
 )
-from teds_provision.protocol.operation.subscription import StreamMessage, StreamPlan
+from teds_provision.protocol.operation.subscription import Receiver, StreamMessage, StreamPlan, TickBounds
 from teds_provision.protocol.operation.timing import TriggerToken, mark_is_honest
 from teds_provision.teds.calibration import load_calibrations
 from teds_provision.teds.image import Image
@@ -489,7 +489,8 @@ def test_between_two_lines_of_a_simulation_every_sample_is_taken_with_the_value_
     station = scene.station("angle")
     station.operate(lease=60)
     plan = StreamPlan.for_channels(0, ((1, 2),), n=5, period=100 * MS, gap=100)
-    receiver, _ = station.subscribe(plan)
+    reply = plan.accept(station.send(plan.command()), TickBounds(0, 1 << 63))  # its clock is a simulation's
+    receiver = Receiver(plan, reply, station.session.message_key)
     receiver._oldest = 10**12  # a simulation at seven times real time: the age of its messages says nothing
     station.clock = replace(station.clock, reply=replace(station.clock.reply, step=0xFFFFFFFF))
     messages = station.hear(receiver, 8)  # some may be left out on a busy machine; what comes is right
