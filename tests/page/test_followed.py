@@ -44,7 +44,7 @@ def test_a_node_is_free_as_soon_as_the_command_that_measured_it_ends(browser: Br
                 card.get_by_role("button", name="Start crane").wait_for()
             page.wait_for_function("button => !button.disabled", arg=button(page, "Provision"))
             page.get_by_role("link", name="Live", exact=True).click()
-            page.get_by_text("Idle.", exact=True).wait_for()
+            page.locator(".mode .state", has_text="Idle.").wait_for()
         with opened(browser, lab, route=f"nodes/{uuid}/provision") as after:
             after.wait_for_function("button => !button.disabled", arg=button(after, "Provision"))
 
@@ -71,7 +71,7 @@ def test_an_earlier_status_begins_no_measurement_again(browser: Browser, lab: La
         while not held:
             page.wait_for_timeout(20)
         page.get_by_role("button", name="Idle").click()
-        page.get_by_text("Idle.", exact=True).wait_for()
+        page.locator(".mode .state", has_text="Idle.").wait_for()
         [(route, answer)] = held
         assert answer.json()["measurements"], "it is from before the end"
         page.evaluate(

@@ -115,7 +115,7 @@ class GroupCard {
     this.element = h("li", { class: "panel group" }, h("div", { class: "panel-head" }, h("h4", {}, name), this.state), this.whose, this.members, h("div", { class: "row" }, field("Rate, Hz", this.rate), this.start, this.stop), this.more, this.error);
     this.element.card = this;
     this.hint = new RateHint(this.rate, () => new URLSearchParams({ group: name }), () => this.again());
-    this.error.before(this.hint.element);
+    this.more.before(this.hint.element);
     this.start.setAttribute("aria-label", `Start ${name}`);
     this.stop.setAttribute("aria-label", `Stop ${name}`);
   }
