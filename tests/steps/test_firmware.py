@@ -17,6 +17,7 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.tim import Tim
 from teds_provision.station.firmware import FirmwareReading, firmware_of, state_of
 from teds_provision.station.station import Station
+from teds_provision.steps import commands
 from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.firmware import (
@@ -288,3 +289,19 @@ def test_a_measurement_warns_or_refuses(station: Station, tmp_path: Path, report
     refused = "its firmware is" in warns
     with pytest.raises(FirmwareError) if refused else nullcontext():
         require_good_firmware(board.uuid, known)
+
+
+@pytest.mark.parametrize("report", [GOOD, None])
+def test_it_costs_identify_one_more_round_trip(
+    station: Station, monkeypatch: pytest.MonkeyPatch, report: FirmwareReport | None
+) -> None:
+    def exchanges() -> int:
+        board = FirmwareBoard(report=report)
+        link = on_bus(board)
+        with met(board, link) as node:
+            commands._identified(station, node, False)
+        return link.count
+
+    with_it = exchanges()
+    monkeypatch.setattr(commands, "read_firmware", lambda _node, *, once: None)
+    assert with_it == exchanges() + 1
