@@ -101,7 +101,7 @@ def test_a_name_stands_for_one_key(north: Station, keys: Path) -> None:
     for number in (21, 22):
         (keys / f"{number}.pem").write_text(to_pem(SoftwareKey(number).point))
     add(north, [candidate(north, "lab", keys / "21.pem", "station")])
-    with pytest.raises(PolicyError, match="already stands for"):
+    with pytest.raises(PolicyError, match="is already taken by"):
         candidate(north, "lab", keys / "22.pem", "station")
     with pytest.raises(UsageError):
         candidate(north, "a\x1b[31m", keys / "22.pem", "station")

@@ -80,7 +80,7 @@ def test_without_a_yes_it_stays_as_it_was(station: Station, tmp_path: Path) -> N
         adopted(station, node, says=PolicyError("no thanks"))
     with (
         Conversation(on_reader(node), notice=lambda _notice: None) as talk,
-        pytest.raises(NotAdoptedError, match="nobody has approved"),
+        pytest.raises(NotAdoptedError, match="not approved for signing yet"),
     ):
         provision(station, talk, ADOPT, accept=lambda _who: None, reporter=SilentReporter())
     assert node.tim.flash.sequence == 0

@@ -143,7 +143,7 @@ def test_an_empty_file_is_named():
         (b"00 0", "3 hex digits"),
         (b":0000000", "Line 1"),
         (b":0100000000FE", "checksum of line 1"),
-        (b":00000001FF\n:00000001FF", "Line 2 stands behind the end"),
+        (b":00000001FF\n:00000001FF", "Line 2 comes after the end"),
         (b":0100000000FF", "no end record"),
         (b":0100000001FE\n:0100000002FD\n:00000001FF", "overlap at address 00000000"),
         (b'{"format": "teds/2"}', '"format"'),
