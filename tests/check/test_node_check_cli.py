@@ -9,6 +9,7 @@ import pytest
 
 from teds_provision.check import (
     agreement_rules,
+    firmware_rules,
     frame_rules,
     link_rules,
     measuring_rules,
@@ -34,7 +35,7 @@ def desk(tmp_path: Path) -> Iterator[Desk]:
 
 
 ROOMS = (
-    agreement_rules, frame_rules, link_rules, measuring_rules, plain_rules, session_rules, write_rules,
+    agreement_rules, firmware_rules, frame_rules, link_rules, measuring_rules, plain_rules, session_rules, write_rules,
 )  # fmt: skip
 """Rules are registered when these are imported."""
 
