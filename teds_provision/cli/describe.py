@@ -31,9 +31,10 @@ FORMS: Final = ("td", "ros2-control", "aas")
 @click.argument("uuids", metavar="UUID…", nargs=-1, required=True)
 @click.option(
     "--as",
-    "form",
+    "forms",
     type=click.Choice(FORMS),
     required=True,
+    multiple=True,
     help="td: W3C Thing Description 1.1; ros2-control: xacro and controllers.yaml; aas: Asset Administration Shell.",
 )
 @click.option(
@@ -45,7 +46,7 @@ FORMS: Final = ("td", "ros2-control", "aas")
     help="Folder for the files.",
 )
 @pass_app
-def describe(app: App, uuids: tuple[str, ...], form: str, output: Path) -> None:
+def describe(app: App, uuids: tuple[str, ...], forms: tuple[str, ...], output: Path) -> None:
     """Export datasheets for other tools: one file per node and format.
 
     Only authentic datasheets are exported. If the format requires a field that the datasheet lacks, nothing is written
@@ -57,7 +58,8 @@ def describe(app: App, uuids: tuple[str, ...], form: str, output: Path) -> None:
     made: dict[Path, str] = {}
     for text in uuids:
         node = formats.described_node.described_node(station, station.nodes.resolve(text))
-        made |= {output / name: content for name, content in _MAKERS[form](station, node).items()}
+        for form in forms:
+            made |= {output / name: content for name, content in _MAKERS[form](station, node).items()}
     for path, content in made.items():
         write_file(path, content)
     app.emit({"files": [str(path) for path in made]}, "\n".join(str(path) for path in made))

@@ -221,6 +221,8 @@ def set_value(
 ) -> None:
     """Drive an actuator, hold the value, then return it to its safe state.
 
+    Name the actuator, or the quantity that it sets: opening for opening set point.
+
     Limits come from the signed datasheet and cannot be exceeded (exit 6). This is not a safety function: see
     docs/actuators.md.
     """

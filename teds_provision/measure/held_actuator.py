@@ -62,13 +62,25 @@ def _actuators_of(trusted: VerifiedSession) -> str:
     return f"Its actuators: {found}." if found else "It has no actuator."
 
 
+def _set_point_of(trusted: VerifiedSession, chosen: int | str) -> Channel | None:
+    """Return the actuator that sets a quantity by the quantity's name: "opening set point" for ``opening``.
+
+    None for a number, and for a name that is itself an actuator's.
+    """
+    if isinstance(chosen, int):
+        return None
+    actuators = {one.name.casefold(): one for one in trusted.sheet.channels if one.actuator}
+    name = chosen.casefold()
+    return None if name in actuators else actuators.get(f"{name} set point")
+
+
 class HeldActuator:
     """One claimed actuator: ``with HeldActuator(…) as hand: hand.apply(value)`` again and again; let go at the end."""
 
     def __init__(
         self, trusted: VerifiedSession, chosen: int | str, *, unit: str | None = None, dead_man: int = DEAD_MAN
     ) -> None:
-        channel = trusted.channel(chosen)
+        channel = _set_point_of(trusted, chosen) or trusted.channel(chosen)
         if not channel.actuator:
             raise BadDataError(
                 f"Channel {channel.label} of node {trusted.uuid} is a sensor, not an actuator.",

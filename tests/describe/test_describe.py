@@ -147,9 +147,21 @@ def test_a_missing_field_is_named_with_its_profile_key_and_nothing_is_written(
     done = call(station.home, "--json", "describe", board.uuid.hex(), "--as", "aas", "--output", str(out))
     assert (done.code, list(out.iterdir())) == (8, [])
     assert done.json["error"]["code"] == "missing-field"
-    done = call(station.home, "--json", "describe", board.uuid.hex(), "--as", "td", "--output", str(out))
+    done = call(
+        station.home,
+        "--json",
+        "describe",
+        board.uuid.hex(),
+        *("--as", "td", "--as", "ros2-control"),
+        "--output",
+        str(out),
+    )
     assert done.code == 0, done.err
-    assert [Path(name).name for name in done.json["files"]] == [f"{board.uuid.hex()}.td.json"]
+    assert [Path(name).name for name in done.json["files"]] == [
+        f"{board.uuid.hex()}.td.json",
+        "hand.ros2_control.xacro",
+        "hand.controllers.yaml",
+    ]
     assert (out / f"{board.uuid.hex()}.td.json").is_file()
 
 

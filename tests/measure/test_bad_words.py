@@ -36,6 +36,8 @@ def test_what_is_wrong_is_said_and_what_to_do(hall: Hall, tmp_path: Path) -> Non
         (("measure", g, "--to", tmp_path / "no" / "run.csv", "--duration", "1"), 3, "its folder is not there"),
         (("measure", g, "--require", nothing), 8, "asks for nothing"),
         (("set", g, "x", "1"), 8, "3 (grip force)"),
+        (("set", g, "opening", "0.05", "--hold", "0.1"), 0, '"safe": true'),  # for channel 1, the opening set point
+        (("set", g, "grip force", "1", "--hold", "0.1"), 8, "is a sensor, not an actuator"),
         (("set", g, "1", "-0.5"), 6, "exceeds the limits"),  # a value, and no option
         (("set", g, "1", "0.05", "--hodl", "3"), 2, "--hodl"),
         (("set", g, "2", "1", "--hold", "0.1"), 8, "is a sensor, not an actuator"),

@@ -14,7 +14,7 @@ export function virtualView(main) {
   const name = h("input", { type: "text", maxlength: "120", autocomplete: "off" });
   const source = h("select", {}, h("option", { value: "sine:5" }, "Sine, 5 s"), h("option", { value: "ramp:5" }, "Ramp, 5 s"), h("option", { value: "noise" }, "Noise"), h("option", { value: "simulation" }, "Simulation: a program, or values set here"));
   const make = button("Create", { class: "main", onclick: () => make.busy(() => create()) }, "plus");
-  const error = h("div", {});
+  const error = h("div", { class: "stack" });
   main.append(
     h("h2", { class: "view-title" }, "Virtual transducers"),
     h("p", { class: "hint intro" }, "Nodes in software with a key and a UUID of their own. They behave like real nodes: same commands, same checks."),
@@ -64,11 +64,17 @@ export function virtualView(main) {
       const made = await post("virtual", body);
       file.value = name.value = "";
       say(`Virtual transducer ${made.name ?? ""} created.`);
-      fill(error, h("p", { class: "done" }, chip("good", "good", "Created"), " ", h("a", { href: `#/nodes/${made.uuid}` }, nameOf(made))));
+      const link = h("a", { href: `#/nodes/${made.uuid}` }, nameOf(made));
+      fill(error, h("p", { class: "done" }, chip("good", "good", "Created"), " ", link));
+      if (newUuid) link.focus(); // the button that was pressed is gone
       await refresh("virtual", "nodes");
     } catch (refusal) {
-      fill(error, trouble(refusal));
-      if (refusal.code === "uuid-known") error.append(h("button", { type: "button", onclick: () => create(true) }, "Create it with a new UUID"));
+      if (refusal.code !== "uuid-known") {
+        fill(error, trouble(refusal));
+        return;
+      }
+      const offer = h("button", { type: "button", onclick: () => make.busy(() => create(true)) }, "Create it with a new UUID");
+      fill(error, trouble({ message: refusal.message, hint: "Two nodes with one UUID cannot be told apart." }), h("div", { class: "row" }, offer));
     }
   }
 
