@@ -100,6 +100,13 @@ def with_source(place: str, source: int) -> str:
     return f"{place}{'&' if '?' in place else '?'}source=0x{source:02X}"
 
 
+def without_source(place: str) -> str:
+    """Return the place without a source address: another process chooses its own."""
+    where, _, query = place.partition("?")
+    rest = "&".join(part for part in query.split("&") if part and not part.startswith("source="))
+    return f"{where}?{rest}" if rest else where
+
+
 def _spec_of(place: str) -> LinkSpec | None:
     name, _, where = place.partition(":")
     kind = LINKS.get(name)

@@ -19,6 +19,7 @@ from teds_provision.errors import (
     NotAuthenticError,
     PolicyError,
 )
+from teds_provision.links.opening import without_source
 from teds_provision.protocol.datasheet import signature_good, station_signature_good
 from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.keys import CHALLENGE_OCTETS, fingerprint, reset_message, verify
@@ -80,7 +81,7 @@ def _take_up(station: Station, node: Conversation, held: NodeKey) -> NodeKey:
     Epoch and sequence of a bundle are hearsay until here: the node's own words in this session replace them.
     """
     uuid, record = node.uuid, held.record
-    station.nodes.met_at(uuid, node.contact.bus)
+    station.nodes.met_at(uuid, without_source(node.contact.bus))
     told = read_identity(node) if record.state == "pending" and record.source == "import" else None
     if _is_taken_up(station, record):
         return held
@@ -467,7 +468,7 @@ def _agree_anew(
             f"The node offered key epoch {agreed.epoch} but reports {identity.epoch} in its session.",
             hint="Its firmware counts epochs incorrectly; node check shows the rule.",
         )
-    place = node.contact.bus
+    place = without_source(node.contact.bus)
 
     def record() -> None:
         with station.durable("agree", more_follows=True):

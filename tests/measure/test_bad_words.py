@@ -54,6 +54,18 @@ def test_what_is_wrong_is_said_and_what_to_do(hall: Hall, tmp_path: Path) -> Non
     assert wrong == []
 
 
+def test_a_command_without_a_link_takes_no_address_of_the_service_that_met_the_node(hall: Hall) -> None:
+    """The last place had the source address of the service: 7, "in use", beside it."""
+    g = hall.nodes["g"].uuid
+    service = hall.station.start("--json", "ncap", "run", "--measure", "all", "--can", hall.can)
+    try:
+        service.wait_for('"running"')
+        driven = hall.station.start("--json", "set", g, "1", "0.05", "--hold", "0.1").end()
+        assert (driven.code, events(driven.out)[-1]) == (0, {"event": "end", "safe": True}), driven.out
+    finally:
+        service.close()
+
+
 @pytest.mark.parametrize(
     "words", [("measure", "recover"), ("measure", "recover", "."), ("measure", "recover", "none.mcap")]
 )
