@@ -207,7 +207,7 @@ class _Update:
 
     def plan(self) -> UpdatePlan:
         """Return what :meth:`run` would do."""
-        with self._met(self._timeout) as node:
+        with self._station.node_lock(self._uuid), self._met(self._timeout) as node:
             report, stage = self._look(node)
             octets = len(self._order.image.octets) if stage == "upload" else 0
             holder = self._station.measurements.holder(self._uuid)
@@ -256,6 +256,8 @@ class _Update:
                     raise WrongImageError(self._mismatch(report), hint="If it is right all the same: --other-board")
                 self._require_free_actuators(node)
             before = self._note(node, as_kept=stage == "prove")
+            if stage != "prove" and before.identity.state == NodeState.PROVISIONED:
+                self._keep_as_signed(report)
             manager = ImageManager(node)
             if stage == "prove":
                 return self._proven(node, manager, before)
@@ -402,6 +404,16 @@ class _Update:
         """Record the firmware that was reported in the session."""
         with self._station.durable("update"):
             keep_firmware(self._station, self._uuid, FirmwareReading(report, sealed=True))
+
+    def _keep_as_signed(self, report: FirmwareReport) -> None:
+        """Record the firmware that an update replaces, unless it is known under which one the datasheet was signed.
+
+        An older store, or another station, signed it: without this, no change since the calibration would show.
+        """
+        known = self._station.firmware_reports.get(self._uuid)
+        if known is None or known.signed is None:
+            with self._station.durable("update"):
+                keep_firmware(self._station, self._uuid, FirmwareReading(report, sealed=True), signed=True)
 
     # -- there and back --------------------------------------------------------------------------------------------
 

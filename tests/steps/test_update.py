@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -19,10 +21,14 @@ from teds_provision.errors import (
     RevertedError,
     WrongImageError,
 )
+from teds_provision.links import LinkSettings
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import Function, Reason, refusal, security_command
 from teds_provision.protocol.messages.smp import UPLOAD, SmpPacket, decode_packet
+from teds_provision.station.firmware import firmware_of
 from teds_provision.station.station import Station
+from teds_provision.steps.update import UpdateOrder, plan_update
+from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import SECURITY
 from tests.bench import PASSPHRASE
 
@@ -52,6 +58,37 @@ def test_a_new_image_is_proven_kept_and_nothing_else_changes(bench: UpdateBench,
     assert (again.result, again.octets) == ("already", 0)
     assert bench.exchanges - exchanges < 12
     assert [entry.outcome for entry in bench.station.audit_log.entries() if entry.act == "update"] == ["updated"]
+
+
+def test_a_node_that_an_older_store_signed_shows_the_change_too(bench: UpdateBench, owner: Owner) -> None:
+    bench.station.firmware_reports.forget(bench.uuid)
+    assert bench.update(owner.new).result == "updated"
+    known = firmware_of(bench.station, bench.uuid)
+    assert known is not None
+    assert known.changed
+    bench.update(owner.old, allow_downgrade=True)
+    known = firmware_of(bench.station, bench.uuid)
+    assert known is not None
+    assert not known.changed, "the image under which it was signed runs again"
+
+
+def test_a_plan_waits_for_the_command_that_is_using_the_board(bench: UpdateBench, owner: Owner) -> None:
+    waits = threading.Event()
+    bench.station.notice = lambda _text: waits.set()
+    bench.station.unlock()
+    with bench.patched(), ThreadPoolExecutor(1) as pool:
+        with bench.station.node_lock(bench.uuid):
+            plan = pool.submit(
+                plan_update,
+                bench.station,
+                LinkSettings("can", via_chosen=True),
+                bench.uuid,
+                UpdateOrder(owner.new),
+                SilentReporter(),
+            )
+            assert waits.wait(60)
+            assert bench.exchanges == 0, "it leaves the session of the other command alone"
+        assert plan.result(60).stage == "upload"
 
 
 @pytest.mark.parametrize(
