@@ -544,6 +544,8 @@ class NodeSupervisor:
         if self._driven is not None:
             self._driven.close()
             self._driven = None
+        with self.turn:  # a command of a request ends first, and no other begins in this session
+            self.verified = None
         self._buses.presence.let_announce(self.uuid)
         self.streams.stop(bus, trusted if answers else None, address)
         if not self._comes_back:
@@ -554,7 +556,6 @@ class NodeSupervisor:
                 trusted.node.request(idle(0), "to let go")
         else:
             trusted.node.forget()
-        self.verified = None
 
     # -- telling ---------------------------------------------------------------------------------------------------
 

@@ -233,17 +233,18 @@ class Measurement:
         self.watcher.note(news.words)
 
     @contextmanager
-    def session(self, uuid: bytes) -> Iterator[VerifiedSession | None]:
+    def session(self, uuid: bytes, *, streaming: bool = False) -> Iterator[VerifiedSession | None]:
         """Give the session in which a node is measured now, for one more command; None if there is none.
 
-        The node's other exchanges wait meanwhile: be brief. Raises no error by itself.
+        The node's other exchanges wait meanwhile: be brief. ``streaming``: only once its streams run. Raises no error
+        by itself.
         """
         keeper = self._keeper(uuid)
         if keeper is None:
             yield None
             return
         with keeper.turn:
-            yield keeper.verified
+            yield keeper.verified if keeper.state == "running" or not streaming else None
 
     @property
     def _open(self) -> bool:

@@ -40,7 +40,7 @@ from teds_provision.ncap.settings import Detection, Settings, own_source
 from teds_provision.ncap.sinks import DaemonSinks
 from teds_provision.ncap.web.tokens import Tokens
 from teds_provision.station.station import Station
-from teds_provision.steps.commands import locate_here
+from teds_provision.steps.commands import locate_here, locate_measured
 from teds_provision.talk.conversation import Conversation
 
 _log = logging.getLogger(__name__)
@@ -354,8 +354,15 @@ class Daemon:
         return self.directory.nodes()
 
     def locate(self, uuid: str, seconds: int) -> None:
-        """Make a node blink for so many seconds, 0: stop; raises FrozenError while it is measured."""
+        """Make a node blink for so many seconds, 0: stop; one that is measured does so in its measurement's session.
+
+        Raises FrozenError if it is measured, but no values come of it now.
+        """
         station = self.station
+        with self.measurements.session(uuid, streaming=True) as trusted:
+            if trusted is not None and trusted.node.sealed:
+                locate_measured(trusted.node, seconds)
+                return
         self.node_jobs.with_node(uuid, "locate", lambda node: locate_here(station, node, seconds))
 
     def known(self, text: str) -> str:

@@ -391,14 +391,17 @@ class MeasurementSupervisor:
             return next((running.job for running in self._running.values() if uuid in running.uuids), None)
 
     @contextmanager
-    def session(self, uuid: str) -> Iterator[VerifiedSession | None]:
-        """Give the session in which a node is measured, for one more command; None if there is none now."""
+    def session(self, uuid: str, *, streaming: bool = False) -> Iterator[VerifiedSession | None]:
+        """Give the session in which a node is measured, for one more command; None if there is none now.
+
+        ``streaming``: only once its streams run.
+        """
         job = self._job_of(uuid)
         measurement = job.measurement if job is not None else None
         if measurement is None:
             yield None
             return
-        with measurement.session(bytes.fromhex(uuid)) as trusted:
+        with measurement.session(bytes.fromhex(uuid), streaming=streaming) as trusted:
             yield trusted
 
     # -- nodes that a command of this home writes to -----------------------------------------------------------------

@@ -513,6 +513,17 @@ def locate_here(station: Station, node: Conversation, seconds: int) -> None:
         raise lost.cause from lost
 
 
+def locate_measured(node: Conversation, seconds: int) -> None:
+    """Make a node blink in the session in which it is measured; raises NodeRefusedError, LinkError.
+
+    No session is opened if that one is lost: its measurement opens the next one, and subscribes in it.
+    """
+    try:
+        locate(node, seconds)
+    except SessionLostError as lost:
+        raise lost.cause from lost
+
+
 @dataclass(frozen=True)
 class WriteReport:
     """Result of ``write``; for a dry run ``written`` is None and ``image`` what would be written."""

@@ -106,6 +106,36 @@ def test_write_and_address_have_the_node_let_go_too(lab: Lab) -> None:
     lab.service.end()
 
 
+def test_a_measured_node_blinks_and_stays_measured(lab: Lab) -> None:
+    """Asked of the daemon it blinks in the measurement's session, asked by a command in a session of its own."""
+    lab.service.start()
+    lab.measure()
+    node = lab.node
+
+    def blinks() -> list[Any]:
+        assert node.process is not None
+        node.process.read(0)
+        lines = [json.loads(line) for line in node.process.out[: node.process.out.rfind("\n") + 1].splitlines()]
+        return [line["seconds"] for line in lines if line.get("event") == "locate"]
+
+    with lab.service.client() as asked:
+
+        def counts() -> dict[str, Any]:
+            return dict(asked.request("GET", "/measurements")["measurements"][0]["nodes"][0])
+
+        before = counts()
+        asked.locate(node.uuid, 5)
+        asked.locate(node.uuid, 0)
+        until(lambda: blinks() == [5, 0])
+        done = lab.service.station.ask("locate", node.uuid, "--for", "7s", *lab.desk.links.over("can"))
+        assert [board["uuid"] for board in done["located"]] == [node.uuid]
+        until(lambda: blinks() == [5, 0, 7])
+        until(lambda: counts()["samples"] > before["samples"] + 100, "its values do not go on")
+        assert counts()["bad"] == before["bad"]
+        assert states(lab) == ["joined"], "it was measured all the time, in one session"
+    lab.service.end()
+
+
 def test_a_writer_that_is_killed_gives_the_node_back(lab: Lab) -> None:
     lab.service.start()
     lab.measure()
