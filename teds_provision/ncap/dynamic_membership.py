@@ -284,8 +284,11 @@ class DynamicMembership:
     def _join(self, uuid: str, measurement: Measurement) -> None:
         member, octets = self._members[uuid], bytes.fromhex(uuid)
         sighting = self._buses.presence.seen_at(octets)
-        if sighting is None or self._why_not(uuid):
+        unselected = self._why_not(uuid)
+        if sighting is None or unselected:
             self._release(uuid)
+            if unselected:  # since it arrived: it was signed, renamed or banned
+                self._is_past(uuid)
             if sighting is None and uuid in self._places:  # a session failed there: a node that answers there joins
                 self._askers.submit(self._ask, self._places[uuid])
             return

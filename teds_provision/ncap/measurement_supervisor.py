@@ -674,6 +674,8 @@ class MeasurementSupervisor:
         def joined(uuid: str) -> None:
             with self._guard:
                 running.uuids = (*running.uuids, uuid)
+                for other in self._running.values():  # it is measured here: what another one reported is over
+                    other.past.add(uuid)
                 running.past.discard(uuid)
             self._directory.note(uuid, measurement=running.kept.id)
             if unverified:  # signed later, it is measured on by the other of the two that unverified() begins

@@ -23,6 +23,7 @@ OF_A_BUS = {
     "can-flow-control", "can-busy", "can-form", "keyed-untapped", "confirm-other-link", "confirm-beside",
     "two-sessions", "stranger-ends-nothing", "repetition-everyone", "repetition-two", "staging-shared", "session-bound",
     "can-other-address", "can-functional", "can-lengths", "can-sequence", "can-flow-obeyed", "can-announce",
+    "can-pressed",
     "stream-messages", "drive-replay", "trigger-token",
 }  # fmt: skip
 """What a tag alone cannot show: no second station can ask, and there are no frames of CAN."""

@@ -90,7 +90,7 @@ def test_an_ncap_that_is_locked_out_says_so_and_returns_to_work_when_unlocked(ru
         measured_in_a_new_session(asked, hand)
     finally:
         call(home, "lock")
-    assert [line["state"] for line in told(running, "vault")] == ["locked", "open"]
+    until(lambda: [line["state"] for line in told(running, "vault")] == ["locked", "open"])
 
 
 def test_nodes_of_a_locked_ncap_wait_quietly_and_are_measured_again_when_it_is_unlocked(running: Service) -> None:
@@ -119,7 +119,7 @@ def test_nodes_of_a_locked_ncap_wait_quietly_and_are_measured_again_when_it_is_u
     finally:
         call(home, "lock")
     assert "its last session" not in call(home, "ncap", "status").out
-    assert [line["state"] for line in told(running, "vault")] == ["locked", "open"]
+    until(lambda: [line["state"] for line in told(running, "vault")] == ["locked", "open"])
 
 
 def test_no_one_without_a_key_of_this_store_changes_the_master_keys(running: Service) -> None:

@@ -33,6 +33,7 @@ from teds_provision.steps.batch_sheet import (
 from teds_provision.steps.build import BuildOrder
 from teds_provision.talk.progress import SilentReporter
 from tests.bench import Board, contact
+from tests.pace import PATIENCE
 
 
 def read(station: Station, folder: Path, text: str | bytes) -> BatchSheet:
@@ -294,14 +295,15 @@ def test_boards_that_are_finished_when_the_vault_is_locked_are_counted(
     """Another process changed the passphrase while nodes of a bus were worked on: finished ones are reported."""
     boards = BatchRun(station, LinkSettings("can"), ProvisionRequest(everyone=True), SilentReporter())
     contacts = [on_reader_number(number) for number in range(4)]
-    locked = threading.Event()
+    locked, begun = threading.Event(), threading.Barrier(4)
 
     def board(contact: Contact, place: str, _questions: Questions) -> BoardResult:
         uuid = contact.identity.uuid
+        begun.wait(PATIENCE)  # what has not begun when the vault is locked does not begin any more
         if uuid == contacts[0].identity.uuid:
             locked.set()
             raise VaultLockedError("The vault is locked.")
-        locked.wait(5.0)
+        locked.wait(PATIENCE)
         time.sleep(0.05)  # the error is there first
         return BoardResult(uuid, 0.1, None, PolicyError("refused"), None, place)
 
