@@ -77,8 +77,10 @@ def test_a_channel_is_chosen_by_name_wherever_it_is_by_number(hall: Hall, tmp_pa
     driven = hall.station.run("set", "g", "Opening set point", 0, "--hold", 0, *bus)
     assert driven.code == 0, driven
     assert driven.out.startswith("Channel 1 (opening set point): 0 m\n")
-    said = hall.station.refuses("set", "g", "opening", 0.05, "--hold", 0, *bus, code=8)
-    assert "Channel 2 (opening)" in said["message"]
+    driven = hall.station.run("set", "g", "opening", 0.05, "--hold", 0, *bus)  # by what it sets
+    assert driven.out.startswith("Channel 1 (opening set point): "), driven
+    said = hall.station.refuses("set", "g", "grip force", 5, "--hold", 0, *bus, code=8)
+    assert "Channel 3 (grip force)" in said["message"]
     assert said["hint"] == "Its actuators: 1 (opening set point)."
     said = hall.station.refuses("sample", "g", "openning", *bus, code=8)
     assert "2 (opening), 3 (grip force)" in said["message"]
