@@ -56,6 +56,8 @@ def test_an_empty_home_says_what_to_do_next_and_a_tap_opens_the_node(browser: Br
         page.goto(f"{fresh.url}/#/nodes")
         page.get_by_role("heading", name="No nodes yet").wait_for()
         page.get_by_role("link", name="Create a virtual transducer").wait_for()
+        page.goto(f"{fresh.url}/#/nodes/{'ab' * 10}")  # a bookmark of a node that is no more
+        page.get_by_role("heading", name="No nodes yet").wait_for(state="detached")
         page.goto(f"{fresh.url}/#/station")
         page.get_by_role("heading", name="Links").wait_for()
         fresh.power("oven", nfc=True)  # laid on the reader while the person looks at something else: the view stays

@@ -59,7 +59,8 @@ export function nodesView(main, rest) {
       fill(none, state.loaded ? firstSteps() : h("p", { class: "empty" }, "Loading …"));
     }
     if (!any && state.loaded) {
-      none.querySelector("[data-linkless]").hidden = !lacking;
+      const unlinked = none.querySelector("[data-linkless]"); // absent while the page of one node is open
+      if (unlinked) unlinked.hidden = !lacking;
       const hidden = none.querySelector("[data-strangers]");
       if (hidden) hidden.hidden = !strangers;
       if (hidden && strangers) text(hidden, strangersWords(strangers));
