@@ -1,6 +1,6 @@
 """Which kind of file a person gave to a command that takes another kind: one line more in its error.
 
-A file is recognized by its first octets alone, and only kinds that somebody could mix up are known. A recognized kind
+A file is recognized by its first octets alone, and only kinds that are easily confused are known. A recognized kind
 decides nothing: the command has failed already.
 """
 

@@ -234,7 +234,7 @@ class VirtualNode:
         threading.Thread(target=self.restart, name="restart", daemon=True).start()
 
     def restart(self) -> None:
-        """Restart the board: sessions and all that lay in RAM are gone; its links are told.
+        """Restart the board: end sessions, clear what is in RAM, notify its links.
 
         A board whose only image does not verify stays silent.
         """

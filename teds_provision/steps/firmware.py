@@ -80,7 +80,7 @@ _REFUSED: Final[dict[FirmwareState, str]] = {
 def require_firmware(uuid: bytes, demand: FirmwareDemand | None, reading: FirmwareReading | None) -> None:
     """Refuse a board whose firmware its type does not accept, before it is keyed or signed; raises FirmwareError.
 
-    An answer outside a session may refuse, never permit; None, where it could not be asked, refuses in no case.
+    An answer outside a session may refuse, never permit; None (it could not be asked) never refuses.
     """
     if demand is None or reading is None:
         return

@@ -76,7 +76,7 @@ class UpdateOrder:
 
 @dataclass(frozen=True)
 class UpdatePlan:
-    """What an update would do with one board: ``stage`` is where it begins. ``question``: asked before, "" for none.
+    """The plan of an update for one board: ``stage`` is where it begins. ``question``: asked before, "" for none.
 
     ``interrupts`` names the measurements that pause; ``octets`` go over the link in about ``seconds``.
     """

@@ -1,4 +1,4 @@
-"""Which firmware a node reports: what is read when, what a type demands of it, and what stands beside the verdict."""
+"""The firmware that a node reports: when it is read, what a type demands, and what is shown beside the verdict."""
 
 from __future__ import annotations
 

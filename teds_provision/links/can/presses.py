@@ -1,4 +1,4 @@
-"""Which board of a bus says that its button was pressed: a hint for the person who stands beside it.
+"""Find the board of a bus whose button was pressed: a hint for the person who stands beside it.
 
 Two boards within a second, or two CRCs from one address, and neither is marked: anyone can send an Announce.
 """

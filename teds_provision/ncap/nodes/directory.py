@@ -233,7 +233,7 @@ class NodeDirectory:
         return [(channel["number"], channel["name"]) for channel in self._sheet(uuid)]
 
     def raw_only(self, uuid: str) -> list[int]:
-        """Return the sensors whose raw numbers cannot become values: nobody has calibrated them."""
+        """Return the sensors without a calibration: only their raw numbers are known."""
         return [channel["number"] for channel in self._sheet(uuid) if channel["problem"]]
 
     def known(self, uuid: str) -> bool:
