@@ -136,6 +136,27 @@ def test_a_measured_node_blinks_and_stays_measured(lab: Lab) -> None:
     lab.service.end()
 
 
+@pytest.mark.realtime
+def test_blinking_costs_no_value(lab: Lab) -> None:
+    """Ten requests in two seconds through the session that carries the stream."""
+    lab.service.start()
+    lab.measure()
+    with lab.service.client() as asked:
+
+        def counts() -> dict[str, int]:
+            return dict(asked.request("GET", "/measurements")["measurements"][0]["nodes"][0])
+
+        until(lambda: counts()["samples"] > 0)
+        before = counts()
+        for _ in range(10):
+            asked.locate(lab.node.uuid, 1)
+            time.sleep(0.2)
+        until(lambda: counts()["samples"] > before["samples"] + 50, "its values do not go on")
+        after = counts()
+    assert [after[name] - before[name] for name in ("lost", "late", "bad")] == [0, 0, 0]
+    lab.service.end()
+
+
 def test_a_writer_that_is_killed_gives_the_node_back(lab: Lab) -> None:
     lab.service.start()
     lab.measure()
