@@ -88,6 +88,10 @@ class KeyStolenError(LinkError):
     """A session ended because a thief has its key; the next one begins with a new key."""
 
 
+class LinkClosedError(LinkError):
+    """The command closed the bus itself, as after Ctrl-C: nothing is tried again."""
+
+
 class NoReaderError(LinkError):
     """The reader or the CAN adapter cannot be opened."""
 

@@ -7,7 +7,6 @@ import os
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -54,6 +53,7 @@ from teds_provision.steps.build import (
     propose,
 )
 from teds_provision.steps.identify import IdentifiedNode, examine
+from teds_provision.steps.parallel import ParallelWork
 from teds_provision.steps.provision import Accept, ProductionLine, ProvisionResult, provision, verify_only
 from teds_provision.steps.readings import verdict_of
 from teds_provision.steps.teds_read import take_snapshot
@@ -73,6 +73,8 @@ from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import default_folders, load_profile
 
+_LEAVING_SECONDS: Final = 10.0
+"""Seconds in which boards that are worked on end their durable steps, once their bus is closed."""
 _TOKEN_WORKERS: Final = 1
 _SHOWN: Final = 5
 """A token takes one command at a time."""
@@ -363,17 +365,15 @@ class BatchRun:
         """
         token = self._station.identity.keystore.startswith("pkcs11:")
         workers = max(1, min(_TOKEN_WORKERS if token else port.capabilities.max_parallel, len(contacts)))
-        pool = ThreadPoolExecutor(workers, thread_name_prefix="node")
         self.expected = len(contacts)
-        running = [pool.submit(self._board, contact, port.place, questions) for contact in contacts]
+        work = ParallelWork(
+            contacts, lambda contact: self._board(contact, port.place, questions), at_once=workers, name="node"
+        )
         locked: VaultLockedError | None = None
         try:
-            for done in as_completed(running):
-                if done.cancelled():
-                    continue
-                failure = done.exception()
-                if isinstance(failure, VaultLockedError):  # ends the command, after the boards that are finished
-                    locked = failure
+            for done in work.results():
+                if isinstance(done.error, VaultLockedError):  # ends the command, after the boards that are finished
+                    locked = done.error
                 else:
                     board = done.result()
                     if board is None:
@@ -381,15 +381,14 @@ class BatchRun:
                     else:
                         yield board
                 if self.stop.is_asked or locked is not None:
-                    for waiting in running:
-                        waiting.cancel()
+                    work.drop_waiting()
             if locked is not None:
                 raise locked
         except BaseException:  # Ctrl-C: a mute node would be waited for, a minute long
+            work.drop_waiting()
             port.close()
+            work.wait(_LEAVING_SECONDS)
             raise
-        finally:
-            pool.shutdown(cancel_futures=True)
 
     def _require_known(self, found: list[Contact]) -> None:
         """Raise NotWhitelistedError if none of the nodes that answered is one of ours: nothing done is not all done."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,6 +45,7 @@ from teds_provision.steps.board_type import Retype, differences, is_remembered, 
 from teds_provision.steps.build import guard, own_name, require_free_name
 from teds_provision.steps.firmware import keep_firmware, locate, read_firmware
 from teds_provision.steps.identify import IdentifiedNode, describe, identify
+from teds_provision.steps.parallel import ParallelWork
 from teds_provision.steps.provision import Accept, add_to_whitelist, key_board
 from teds_provision.steps.readings import keep
 from teds_provision.steps.sign import SignResult, known_image, known_node_keys, require_not_measured, sign
@@ -219,11 +219,16 @@ def _side_by_side(
     if max_parallel < 2:
         yield from ((node, one(node)) for node in nodes)
         return
-    pool = ThreadPoolExecutor(max_parallel, thread_name_prefix="node")
+    team = ParallelWork(nodes, one, at_once=max_parallel, name="node")
+    ended: dict[int, ProvenNode | TedsProvisionError] = {}
     try:
-        yield from zip(nodes, pool.map(one, nodes), strict=True)
+        for done in team.results():
+            ended[id(done.item)] = done.result()
+            while nodes and id(nodes[0]) in ended:
+                node, nodes = nodes[0], nodes[1:]
+                yield node, ended[id(node)]
     finally:  # after a Ctrl-C there is no wait: the bus is closed next
-        pool.shutdown(wait=False, cancel_futures=True)
+        team.drop_waiting()
 
 
 def _identified(station: Station, node: Conversation, add: bool) -> ProvenNode:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Final, Literal
@@ -17,6 +16,7 @@ from teds_provision.errors import (
     BoardLostError,
     DowngradeError,
     GarbledError,
+    LinkClosedError,
     LinkError,
     NodeRefusedError,
     NotAuthenticError,
@@ -40,6 +40,7 @@ from teds_provision.steps.board_type import require_working_hardware
 from teds_provision.steps.firmware import keep_firmware, read_firmware
 from teds_provision.steps.identify import identify, prove
 from teds_provision.steps.image_manager import ImageManager
+from teds_provision.steps.parallel import ParallelWork
 from teds_provision.steps.sign import require_not_measured
 from teds_provision.steps.teds_read import read_block, read_identity, read_image
 from teds_provision.talk.conversation import Conversation, SessionLostError
@@ -161,12 +162,12 @@ def _at_port(
     if at_once < 2:
         yield from map(one, orders)
         return
-    pool = ThreadPoolExecutor(at_once, thread_name_prefix="update")
+    work = ParallelWork(orders, one, at_once=at_once, name="update")
     try:
-        for done in as_completed([pool.submit(one, ordered) for ordered in orders]):
+        for done in work.results():
             yield done.result()
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+    finally:  # after a Ctrl-C there is no wait: the bus is closed next
+        work.drop_waiting()
 
 
 def read_about(node: Conversation) -> FirmwareReport | None:
@@ -442,6 +443,8 @@ class _Update:
                         )
                     if not restarted:
                         ImageManager(back).restart()
+            except LinkClosedError:  # Ctrl-C
+                raise
             except (LinkError, SessionLostError):
                 time.sleep(_PAUSE)
             except NodeRefusedError:
@@ -467,6 +470,8 @@ class _Update:
                     raise self._lost()
                 try:
                     node = stack.enter_context(self._in_session(left))
+                except LinkClosedError:  # Ctrl-C
+                    raise
                 except LinkError:
                     time.sleep(_PAUSE)
                     continue

@@ -126,7 +126,10 @@ class Running:
         end = time.monotonic() + seconds
         while self._selector.get_map() and time.monotonic() < end:
             self.read(0.1)
-        code = self.process.wait(max(0.1, end - time.monotonic()))
+        try:
+            code = self.process.wait(max(0.1, end - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"it runs on after {seconds} s: {self.out!r} {self.err!r}") from None
         return Outcome(code, self.out, self.err)
 
     @property

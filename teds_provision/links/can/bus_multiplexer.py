@@ -20,7 +20,7 @@ from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Final, TypeVar
 
-from teds_provision.errors import LinkError
+from teds_provision.errors import LinkClosedError, LinkError
 from teds_provision.links.can.bus import Bus
 from teds_provision.links.can.isotp import (
     CONTINUE,
@@ -471,7 +471,7 @@ class BusMultiplexer:
         if self._thread is not threading.current_thread():
             self._thread.join(timeout=2)
         self._bus.close()
-        self._fail(LinkError(f"The bus {self.spec.text} was closed."))
+        self._fail(LinkClosedError(f"The bus {self.spec.text} was closed."))
         self._wake.close()
         self._woken.close()
 

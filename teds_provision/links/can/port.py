@@ -12,7 +12,7 @@ from functools import partial
 from shlex import quote
 from typing import Final
 
-from teds_provision.errors import AddressConflictError, LinkError, NoNodeError
+from teds_provision.errors import AddressConflictError, LinkClosedError, LinkError, NoNodeError
 from teds_provision.links.can.airtime import CanAirtime
 from teds_provision.links.can.arrivals import Arrivals
 from teds_provision.links.can.bus import Bus
@@ -74,6 +74,7 @@ class CanPort(MeasuringLink):
         self.place = f"can:{spec_text}"
         self.trace = trace
         self._bus: BusMultiplexer | None = BusMultiplexer(Bus(self.spec, trace))
+        self._closed = False
         self._transaction = secrets.randbelow(256)
         self._lock = threading.Lock()
         self._rival_told = False
@@ -85,8 +86,13 @@ class CanPort(MeasuringLink):
         return CAN
 
     def bus(self) -> BusMultiplexer:
-        """Return the open bus with its receiving loop; opens it again after it was lost."""
+        """Return the open bus with its receiving loop; opens it again after it was lost.
+
+        Raises LinkClosedError after :meth:`close`: another thread may still be talking to a node, and must end.
+        """
         with self._lock:
+            if self._closed:
+                raise LinkClosedError(f"The bus {self.spec.text} was closed.")
             if self._bus is None or self._bus.failed:
                 if self._bus is not None:
                     self._bus.close()
@@ -96,7 +102,7 @@ class CanPort(MeasuringLink):
 
     def use_source(self, source: int) -> None:
         """Use another source address from now on; the bus is opened again at its next use."""
-        self.close()
+        self._release()
         self.spec = replace(self.spec, source=source)
 
     def listen_frames(self, wanted: Callable[[Frame], bool]) -> Listener:
@@ -123,7 +129,12 @@ class CanPort(MeasuringLink):
             return self._transaction
 
     def close(self) -> None:
-        """Release the bus; never raises."""
+        """Release the bus for good; never raises. An exchange of another thread ends with LinkClosedError."""
+        with self._lock:
+            self._closed = True
+        self._release()
+
+    def _release(self) -> None:
         with self._lock:
             bus, self._bus = self._bus, None
         if bus is not None:

@@ -13,7 +13,7 @@ import pytest
 
 from teds_provision.doctor import links as doctor
 from teds_provision.doctor.checks import System
-from teds_provision.errors import LinkError, NodeSilentError, UsageError
+from teds_provision.errors import LinkClosedError, LinkError, NodeSilentError, UsageError
 from teds_provision.links import LINKS, LinkSettings, Notice, open_place, open_port
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.port import CanPort
@@ -232,3 +232,36 @@ def test_the_doctor_names_another_station_of_our_address_with_its_cure(hub: Hub,
         thread.join()
     assert (found.result, "source=0xF2" in found.fix) == ("warning", True)
     assert other.result == "ok"
+
+
+def test_what_another_thread_still_asks_does_not_open_a_closed_port_again(hub: Hub, nodes: Start) -> None:
+    """After Ctrl-C a thread that was between two questions opened the bus again and waited out a mute node."""
+    nodes(hub.spec, 0x21)
+    port = CanPort(hub.spec)
+    link = port.link(0x21)
+    body = os.urandom(20)
+    assert link.exchange(write(body))
+    port.close()
+
+    for ask in (lambda: link.exchange(write(body)), lambda: port.link(0x21).exchange(write(body)), port.bus):
+        with pytest.raises(LinkClosedError, match="was closed"):
+            ask()
+
+
+def test_closing_a_port_ends_the_exchange_of_another_thread_with_what_it_was(hub: Hub) -> None:
+    port = CanPort(hub.spec)
+    ended: list[Exception] = []
+
+    def ask_a_mute_node() -> None:
+        try:
+            port.link(0x21).exchange(write(b"nothing"))
+        except LinkError as error:
+            ended.append(error)
+
+    asking = threading.Thread(target=ask_a_mute_node)
+    asking.start()
+    time.sleep(0.2)
+    port.close()
+    asking.join(PATIENCE)
+
+    assert [type(error) for error in ended] == [LinkClosedError]
