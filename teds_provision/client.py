@@ -24,7 +24,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote, urlencode, urlsplit
 
-from teds_provision.errors import LinkError, PolicyError, TedsProvisionError, UsageError
+from teds_provision.errors import EXIT_CODES, LinkError, PolicyError, TedsProvisionError, UsageError
 from teds_provision.files import short_path
 
 if TYPE_CHECKING:
@@ -56,16 +56,9 @@ class ApiError(TedsProvisionError):
         super().__init__(message, hint=hint)
         self.status = status
         self.code = code  # type: ignore[misc]
-        self.exit_code = _EXIT.get(code, _EXIT_BY_STATUS.get(status, 1))  # type: ignore[misc]
+        self.exit_code = EXIT_CODES.get(code, _EXIT_BY_STATUS.get(status, 1))  # type: ignore[misc]
 
 
-_EXIT: Final = {
-    "usage": 2, "not-found": 3, "not-authentic": 4, "link": 5, "no-reader": 5, "no-node": 5, "node-silent": 5,
-    "garbled": 5, "address-conflict": 5, "unproven": 5, "store": 7, "store-changed": 7, "store-locked": 7,
-    "vault-changed": 7, "vault-locked": 7, "node-busy": 7, "vault": 7, "no-keyring": 7, "no-passphrase": 7,
-    "wrong-passphrase": 7, "bad-data": 8, "bug": 1,
-    "bad-request": 2,
-}  # fmt: skip
 _EXIT_BY_STATUS: Final = {
     401: 6,
     403: 6,

@@ -1,9 +1,9 @@
 """The one exception tree of the tool.
 
-Every error that a user can meet is a :class:`TedsProvisionError`. Its class fixes the exit code of the command line
-(table "exit" of the command-line contract) and the stable word that ``--json`` reports as ``code``; the instance
-carries a one-sentence message (what happened and why) and a hint (what to do next). A foreign exception that escapes is
-a bug and ends with exit 1.
+Every error that a user can meet is a :class:`TedsProvisionError`. Its class fixes the stable word that ``--json``
+reports as ``code``, from which the exit code of the command line follows (:data:`EXIT_CODES`; table "exit" of the
+command-line contract); the instance carries a one-sentence message (what happened and why) and a hint (what to do
+next). A foreign exception that escapes is a bug and ends with exit 1.
 
 This module is below every room and imports nothing.
 """
@@ -11,7 +11,27 @@ This module is below every room and imports nothing.
 from __future__ import annotations
 
 import re
-from typing import ClassVar, Final
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar, Final
+
+_CODES: Final = {
+    1: "failed bug incomplete-installation",
+    2: "usage unclear-item bad-request",  # bad-request is of the API alone
+    3: "not-found",
+    4: "not-authentic fork",
+    5: "link no-reader no-node node-silent garbled address-conflict registry lost unproven no-answer",
+    6: "refused not-whitelisted other-key uuid-known frozen changed calibration-misfit no-room not-member"
+    " roster-expired wrong-image no-update downgrade reverted node-refused conflict declined firmware not-adopted"
+    " not-named office-refused wrong-board",
+    7: "store store-changed newer-store store-locked node-busy vault no-keyring vault-changed vault-locked"
+    " no-passphrase wrong-passphrase",
+    8: "bad-data missing-field newer-format not-canonical",
+}
+EXIT_CODES: Final[Mapping[str, int]] = MappingProxyType(
+    {code: exit_code for exit_code, codes in _CODES.items() for code in codes.split()}
+)
+"""Exit code of the command line for each error's code, here alone: the classes and ``client`` take theirs from it."""
 
 _LONG_WORD: Final = r"\S{513,}"
 """Longest word that is shown whole: longer than any path or key that a person reads."""
@@ -25,8 +45,13 @@ def _shortened(text: str) -> str:
 class TedsProvisionError(Exception):
     """Root of the tree; raised itself only for failures that fit nothing below (exit 1)."""
 
-    exit_code: ClassVar[int] = 1
     code: ClassVar[str] = "failed"
+    exit_code: ClassVar[int] = EXIT_CODES[code]
+
+    def __init_subclass__(cls, **settings: Any) -> None:
+        """Give a class the exit code of its ``code``."""
+        super().__init_subclass__(**settings)
+        cls.exit_code = EXIT_CODES[cls.code]
 
     def __init__(self, message: str, *, hint: str = "") -> None:
         self.message = _shortened(message)
@@ -49,21 +74,18 @@ class IncompleteInstallationError(TedsProvisionError):
 class UsageError(TedsProvisionError):
     """The command line itself is wrong (exit 2)."""
 
-    exit_code = 2
     code = "usage"
 
 
 class NotFoundError(TedsProvisionError):
     """No such UUID, profile, station or file (exit 3)."""
 
-    exit_code = 3
     code = "not-found"
 
 
 class NotAuthenticError(TedsProvisionError):
     """A signature, tag, digest or sender is not what it claims to be (exit 4)."""
 
-    exit_code = 4
     code = "not-authentic"
 
 
@@ -80,7 +102,6 @@ class BadDatasheetError(NotAuthenticError):
 class LinkError(TedsProvisionError):
     """The way to the node failed: no reader, no node, unplugged, garbled, bus-off (exit 5)."""
 
-    exit_code = 5
     code = "link"
 
 
@@ -147,7 +168,6 @@ class UnprovenError(LinkError):
 class PolicyError(TedsProvisionError):
     """Refused by policy: not whitelisted, other key, weak algorithm, stale, expired, replayed (exit 6)."""
 
-    exit_code = 6
     code = "refused"
 
 
@@ -242,7 +262,6 @@ class NodeRefusedError(PolicyError):
 class StoreError(TedsProvisionError):
     """Store or vault: locked, corrupt, missing (exit 7)."""
 
-    exit_code = 7
     code = "store"
 
 
@@ -313,5 +332,4 @@ class WrongPassphraseError(VaultError):
 class BadDataError(TedsProvisionError):
     """TEDS, profile, calibration, image or bundle that does not parse or does not add up (exit 8)."""
 
-    exit_code = 8
     code = "bad-data"

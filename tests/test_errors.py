@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from teds_provision.errors import NotFoundError
+import ast
+from pathlib import Path
+
+import pytest
+
+import teds_provision
+from teds_provision.client import ApiError
+from teds_provision.errors import EXIT_CODES, LinkError, NotFoundError
 
 
 def test_a_word_that_nobody_can_read_is_cut_in_the_middle() -> None:
@@ -11,3 +18,24 @@ def test_a_word_that_nobody_can_read_is_cut_in_the_middle() -> None:
     assert error.message.startswith("No node is known as 'xxx")
     assert error.message.endswith(", and no file.")
     assert NotFoundError("y" * 512).message == "y" * 512, "paths and keys stay whole"
+
+
+def test_each_code_of_the_tree_has_an_exit_code_which_the_client_has_too() -> None:
+    """Read from the sources: most rooms name errors of their own, and load much."""
+    files = Path(teds_provision.__file__).parent.rglob("*.py")
+    codes = {
+        part.value.value
+        for file in files
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef) and node.name.endswith("Error")
+        for part in node.body
+        if isinstance(part, ast.Assign | ast.AnnAssign) and ast.unparse(part).startswith("code")
+        if isinstance(part.value, ast.Constant) and isinstance(part.value.value, str)
+    }
+    assert codes == EXIT_CODES.keys() - {"bad-request"}
+    assert {code: ApiError(418, code, "").exit_code for code in EXIT_CODES} == EXIT_CODES
+
+
+def test_an_error_whose_code_has_no_exit_code_cannot_be_defined() -> None:
+    with pytest.raises(KeyError):
+        type("OvenError", (LinkError,), {"code": "too-hot"})
