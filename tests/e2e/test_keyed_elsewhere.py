@@ -84,8 +84,9 @@ def test_another_owners_node_comes_by_backup_by_ca_file_by_handover_or_by_a_rese
     third = Station(desk, desk.folder / "third")
     no_step_is_shown_as_done(third, node)
     node.press()
-    assert node.process is not None
-    node.process.wait_for('"event": "reset"')
+    if desk.nodes != "c":  # the virtual node prints what happened to it
+        assert node.process is not None
+        node.process.wait_for('"event": "reset"')
     assert third.provision("nfc", "-p", ANGLE)["verdict"] == "authentic"
 
 
