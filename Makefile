@@ -38,11 +38,12 @@ types: $(VENV)/.dev
 # What holds a rule about time then runs two at a time: it waits for five sixths of its time.
 WORKERS ?= 6
 USUAL := not soak and not machine and not rclpy
+# Of what fails, up to three tests that run other processes get a second try, alone (tests/second_try.py).
 unit: $(VENV)/.dev
-	@mkdir -p build && rm -f build/not-tested
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -rs --hypothesis-profile gate -m '$(USUAL) and not realtime'
-	$(BIN)/python -m pytest -n 2 --dist worksteal -rsR -m '$(USUAL) and realtime'
-	@cat build/not-tested 2>/dev/null || true
+	@mkdir -p build && rm -f build/not-tested build/second-tries
+	$(BIN)/python -m tests.second_try -n $(WORKERS) --dist worksteal -rs --hypothesis-profile=gate -m '$(USUAL) and not realtime'
+	$(BIN)/python -m tests.second_try -n 2 --dist worksteal -rsR -m '$(USUAL) and realtime'
+	@cat build/not-tested build/second-tries 2>/dev/null || true
 
 # Every test module compiled once, its asserts rewritten, beside mypy: the workers begin together, and each would do it for
 # itself.

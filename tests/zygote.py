@@ -188,6 +188,7 @@ class Zygote:
         cwd: Path = ROOT,
     ) -> Forked:
         """Run ``python -m module words`` with its output to two files; ``given`` become descriptors 3, 4 … there."""
+        sys.audit("tests.zygote.run", module)  # tests/second_try.py counts the processes of a test
         nothing = os.open(os.devnull, os.O_RDONLY)
         status, told = os.pipe()
         facts = {"module": module, "words": words, "environment": environment, "cwd": str(cwd), "umask": _umask()}

@@ -1,0 +1,152 @@
+"""Hold what a second try may clear and what it must never clear, by suites with planted failures."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.second_try import NOTES, Failure, Outcomes, refusal
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parent.parent
+ONCE = """
+import os, socket, subprocess, sys
+import pytest
+
+
+def fails_once(name="seen"):
+    try:
+        os.close(os.open(name, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+    except FileExistsError:
+        return
+    raise AssertionError("the machine was busy")
+"""
+
+
+class Suite:
+    """A temporary suite of one file, and how its run ended."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.code = -1
+        self.printed = ""
+
+    def run(self, text: str, *words: str) -> None:
+        (self.folder / "pytest.ini").write_text("[pytest]\nmarkers = link\n")
+        (self.folder / "test_it.py").write_text(ONCE + text)
+        ended = subprocess.run(
+            [sys.executable, "-m", "tests.second_try", "-q", *words],
+            cwd=self.folder,
+            env=os.environ | {"PYTHONPATH": str(ROOT), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_ADDOPTS": ""},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        self.code, self.printed = ended.returncode, ended.stdout + ended.stderr
+
+    def note(self) -> str:
+        file = self.folder / NOTES
+        return file.read_text() if file.exists() else ""
+
+
+@pytest.fixture
+def suite(tmp_path: Path) -> Suite:
+    return Suite(tmp_path)
+
+
+def test_a_failure_in_the_first_run_only_is_cleared_and_printed(suite: Suite) -> None:
+    """In a worker, as at the gate: the mark and the failure come through."""
+    suite.run("@pytest.mark.link\ndef test_it(): fails_once()\ndef test_other(): pass", "-p", "xdist", "-n", "2")
+    assert suite.code == 0, suite.printed
+    assert "NEEDED A SECOND TRY: test_it.py::test_it" in suite.note()
+    assert "AssertionError: the machine was busy" in suite.note()
+    assert suite.note() in suite.printed
+
+
+def test_a_failure_that_stays_keeps_the_run_red(suite: Suite) -> None:
+    suite.run("@pytest.mark.link\ndef test_it(): assert 1 == 2")
+    assert suite.code == 1
+    assert "failed alone as well" in suite.printed
+    assert not suite.note()
+
+
+def test_both_runs_alone_must_pass(suite: Suite) -> None:
+    suite.run(
+        "@pytest.mark.link\ndef test_it():\n"
+        "    runs = len(open('runs', 'a+').read() or open('runs').read())\n"
+        "    open('runs', 'a').write('x')\n"
+        "    assert runs == 1"
+    )
+    assert suite.code == 1
+    assert "alone, run 2 of 2" in suite.printed
+    assert not suite.note()
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "def test_it(): subprocess.run(['true']); fails_once()",
+        "def test_it(): socket.socket().bind(('127.0.0.1', 0)); fails_once()",
+        "@pytest.fixture(scope='module')\ndef ran(): subprocess.run(['true'])\n"
+        "def test_first(ran): pass\ndef test_it(ran): fails_once()",
+    ],
+    ids=["process", "port", "process of the module"],
+)
+def test_a_process_or_port_of_the_test_is_noticed(suite: Suite, body: str) -> None:
+    suite.run(body)
+    assert suite.code == 0, suite.printed
+    assert "NEEDED A SECOND TRY: test_it.py::test_it" in suite.note()
+
+
+def test_a_pure_test_is_never_tried_again(suite: Suite) -> None:
+    """Not even beside one that starts a process."""
+    suite.run("def test_other(): subprocess.run(['true'])\ndef test_it(): fails_once()")
+    assert suite.code == 1
+    assert "No second try: no other process or network port takes part in test_it.py::test_it." in suite.printed
+    assert not suite.note()
+
+
+def test_a_test_skipped_alone_does_not_pass(suite: Suite) -> None:
+    suite.run("@pytest.mark.link\ndef test_it():\n    if os.path.exists('seen'): pytest.skip()\n    fails_once()")
+    assert suite.code == 1
+    assert not suite.note()
+
+
+@pytest.mark.parametrize(
+    ("body", "why"),
+    [
+        ("@pytest.mark.link\ndef test_it(): os._exit(3)", "more than the body of a test failed: "),
+        ("raise ValueError('no suite')", "pytest ended with 2"),
+        (
+            "@pytest.fixture\ndef made(): fails_once()\n@pytest.mark.link\ndef test_it(made): pass",
+            "more than the body of a test failed: setup of test_it.py::test_it",
+        ),
+    ],
+    ids=["worker", "collection", "setup"],
+)
+def test_what_is_no_failed_body_keeps_the_run_red(suite: Suite, body: str, why: str) -> None:
+    suite.run(body, *(["-p", "xdist", "-n", "1"] if "_exit" in body else []))
+    assert suite.code != 0
+    assert f"No second try: {why}" in suite.printed
+    assert not suite.note()
+
+
+def test_four_failures_are_no_accident(suite: Suite) -> None:
+    suite.run(
+        "@pytest.mark.link\n@pytest.mark.parametrize('number', range(4))\ndef test_it(number): fails_once(str(number))"
+    )
+    assert suite.code == 1
+    assert "No second try: 4 tests failed, more than 3." in suite.printed
+    assert not suite.note()
+
+
+def test_a_run_that_recorded_nothing_is_no_failed_test() -> None:
+    assert refusal(1, None)
+    assert refusal(1, Outcomes())
+    assert refusal(3, Outcomes(failures=[Failure("test_it", "busy", "marked link")]))
+    assert not refusal(1, Outcomes(failures=[Failure("test_it", "busy", "marked link")]))
