@@ -124,7 +124,7 @@ test-rclpy: $(VENV)/.dev .venv-rclpy/.made
 # Coverage-guided fuzzing of every parser of octets: RUNS inputs each (a million take about an hour and a half on one
 # core), or one of them: make fuzz TARGET=nfc RUNS=100000. atheris gets an environment of its own.
 RUNS ?= 1000000
-FUZZ_TARGETS := teds sheet security frames operation nfc can smp firmware bundle receipt backup whitelist calibration certificate profile image evidence plant line units
+FUZZ_TARGETS := teds sheet security frames operation nfc can smp update about firmware bundle receipt backup whitelist calibration certificate profile image evidence plant line units
 fuzz: .venv-fuzz/.ready
 	@mkdir -p build/fuzz
 	@set -e; for target in $(or $(TARGET),$(FUZZ_TARGETS)); do \

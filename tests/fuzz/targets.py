@@ -17,9 +17,10 @@ from functools import cache, partial
 from io import BytesIO
 from pathlib import Path
 
-from teds_provision.errors import TedsProvisionError
+from teds_provision.errors import NodeSilentError, TedsProvisionError
 from teds_provision.links.nfc.pieces import Piece, Requester, Responder
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.protocol.messages.frames import Command
 
 CORPUS = Path(__file__).parent / "corpus"
 NOW = datetime(2026, 11, 21, tzinfo=UTC)
@@ -302,6 +303,105 @@ def smp_seeds() -> list[bytes]:
     bodies = ("a0", "a16764", "a167636f6e6669726df5", "a4636f66660063646174614178636c656e0963736861410a")
     heads = ("0800000100000706", "0a00000100000700", "0a00000b00010700", "0a00001800010701")
     return [bytes.fromhex(head + body) for head, body in zip(heads, bodies, strict=True)]
+
+
+def check_update(data: bytes) -> None:
+    """A board that answers the station's update: ``request u8`` (which call; bits 6, 7: how a header is bent), then
+    replies ``length u8 ‖ body``, the last one again and again. The upload ends, whatever comes."""
+    from teds_provision.links.ports import Contact
+    from teds_provision.protocol.messages.identity import Identity, NodeState
+    from teds_provision.steps.image_manager import ImageManager
+    from teds_provision.talk.conversation import Conversation
+
+    if not data:
+        return
+    board = _AnsweringBoard(data)
+    identity = Identity(bytes(10), NodeState.KEYED, 1, 2, 1024, 33)
+    node = Conversation(Contact(identity, board), notice=lambda notice: None)
+    node.request = board.reply  # type: ignore[method-assign, assignment]
+    images = ImageManager(node)
+    calls = (
+        images.images,
+        images.confirm,
+        lambda: images.start_next(bytes(32)),
+        lambda: images.upload(bytes(3000), lambda done, whole: None),
+    )
+    reads(calls[data[0] & 3])
+    assert board.requests < 3000
+
+
+class _AnsweringBoard:
+    """A board behind an open session; also the link to it, which carries nothing else."""
+
+    def __init__(self, data: bytes) -> None:
+        from teds_provision.links.ports import CAN
+
+        self.via, self.capabilities = "can", CAN
+        self.requests, self._bent, self._bodies, at = 0, data[0] >> 6, list[bytes](), 1
+        while at < len(data):
+            self._bodies.append(data[at + 1 : at + 1 + data[at]])
+            at += 1 + data[at]
+
+    def reply(self, command: Command, doing: str) -> bytes:
+        """Answer a packet with the next body, under the header that it is due."""
+        from teds_provision.protocol.messages.smp import decode_packet
+
+        del doing
+        self.requests += 1
+        body = self._bodies.pop(0) if len(self._bodies) > 1 else (self._bodies or [b""])[0]
+        if self._bent == 1:
+            return body
+        packet = decode_packet(command.payload)
+        due = packet.reply(body)._replace(sequence=packet.sequence ^ (self._bent == 2)).encode()
+        return due + b"\0" if self._bent == 3 else due
+
+    def exchange(self, frame: bytes) -> bytes:
+        """Carry nothing: the link is lost."""
+        raise NodeSilentError(f"No reply to {len(frame)} octets.")
+
+    def close(self) -> None:
+        """Nothing is left behind."""
+
+
+def update_seeds() -> list[bytes]:
+    """Replies of an image manager: buffer size and upload; images; an error of either form."""
+    from teds_provision.protocol.messages.smp import encode_map
+
+    image = {"slot": 0, "version": "1.0.0", "hash": bytes(32), "bootable": True, "active": True, "confirmed": True}
+    size, state = {"buf_size": 600, "buf_count": 1}, {"images": [image], "splitStatus": 0}
+    uploaded = [{"off": off} for off in (547, 1094, 1641, 2188, 2735)]
+    good = (
+        (3, size, *uploaded, {"off": 3000, "match": True}),
+        (3, size, {"off": 0}),
+        (0, state),
+        (1, state),
+        (2, state),
+    )
+    bad = ((0, {"rc": 3}), (2, {"err": {"group": 1, "rc": 8}}), (3, size, {"rc": 0, "off": 9}))
+    return [
+        bytes([call]) + b"".join(bytes([len(body)]) + body for body in map(encode_map, bodies))
+        for call, *bodies in (*good, *bad)
+    ]
+
+
+def check_about(data: bytes) -> None:
+    """Replies to About and Locate, and what the station keeps and shows of one."""
+    from teds_provision.protocol.messages.firmware import FirmwareReport
+    from teds_provision.steps.update import version_of
+
+    with suppress(TedsProvisionError):
+        report = FirmwareReport.decode(data)
+        assert FirmwareReport.decode(report.encode()) == report
+        assert len(report.text) <= 48
+        version_of(report)
+
+
+def about_seeds() -> list[bytes]:
+    """Two reports: with an image and without."""
+    from teds_provision.protocol.messages.firmware import FirmwareFlag, FirmwareReport
+
+    full = FirmwareReport("nrf52840dk/nrf52840/loadcell", (3, 2, 1), 7, bytes(range(32)), FirmwareFlag.LOCATE)
+    return [full.encode(), FirmwareReport().encode()]
 
 
 def check_firmware(data: bytes) -> None:
@@ -710,6 +810,8 @@ TARGETS = {
         Target("nfc", check_nfc, nfc_seeds, ("Tp", "Ts", "Te", "urn:nfc:sn:")),
         Target("can", check_can, can_seeds, longest=1024),
         Target("smp", check_smp, smp_seeds, longest=1024),
+        Target("update", check_update, update_seeds, ("off", "rc", "err", "images", "buf_size", "match"), longest=1024),
+        Target("about", check_about, about_seeds, longest=128),
         Target("firmware", check_firmware, firmware_seeds, longest=512),
         Target("bundle", check_bundle, bundle_seeds, (*_JSON, "protected", "recipients", "nodes", "alg", "kid")),
         Target("receipt", check_receipt, receipt_seeds, (*_JSON, "imported", "refused", "format", ".")),

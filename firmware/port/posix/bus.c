@@ -108,3 +108,11 @@ uint32_t host_bus_dropped(const host_bus *bus)
     socklen_t length = sizeof counts;
     return getsockopt(bus->in, SOL_SOCKET, SO_MEMINFO, counts, &length) == 0 ? counts[8] : 0;
 }
+
+void host_bus_accept(host_bus *bus, uint8_t address)
+{
+    if (bus->pace != NULL && !bus->is_socketcand && bus->accepted != address) {
+        bus->accepted = address;
+        multicast_accept(bus, address);
+    }
+}

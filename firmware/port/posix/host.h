@@ -104,6 +104,7 @@ typedef struct host_bus {
     char line[2048];
     uint32_t bitrate, data_bitrate;
     host_pace *pace; /* NULL: frames leave at once */
+    uint8_t accepted; /* of the acceptance filter; 0: there is none */
 } host_bus;
 
 /* Open the bus that `spec` names as --can does; 0, or -1 after words on stderr. With `paces`, or pace=1 in `spec`, frames
@@ -114,10 +115,13 @@ int host_bus_receive(host_bus *bus, teds_can_frame *frame);
 int host_bus_send(host_bus *bus, const teds_can_frame *frame);
 /* Datagrams that found no room in the socket (Linux: SO_MEMINFO). */
 uint32_t host_bus_dropped(const host_bus *bus);
+/* On a paced bus: take no frames that a station sends to other addresses, as a controller's acceptance filter does. */
+void host_bus_accept(host_bus *bus, uint8_t address);
 
 int multicast_open(host_bus *bus, const char *group, uint16_t port, int hop_limit);
 int multicast_receive(host_bus *bus, teds_can_frame *frame);
 int multicast_send(host_bus *bus, const teds_can_frame *frame);
+void multicast_accept(const host_bus *bus, uint8_t address);
 /* The datagram of a frame as python-can packs it; gives its length. */
 size_t multicast_pack(const teds_can_frame *frame, uint8_t out[320]);
 bool multicast_unpack(const uint8_t *datagram, size_t length, bool fd, teds_can_frame *frame);

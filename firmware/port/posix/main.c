@@ -10,6 +10,7 @@
 
 #include <errno.h>
 #include <poll.h>
+#include <sched.h>
 #include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -354,6 +355,7 @@ static void wait_for(const board *own, uint64_t until)
         if (poll(ready, 2, 0) > 0) {
             return;
         }
+        (void)sched_yield(); /* several nodes on one machine do the same */
         now = port_now((void *)(uintptr_t)own);
     }
     (void)ppoll(ready, 2, &time, NULL);
@@ -402,6 +404,9 @@ static int run(board *own, teds_node *node)
         }
         if (busy) {
             due = teds_node_poll(node, port_now(own));
+        }
+        if (own->has_bus) {
+            host_bus_accept(&own->bus, node->can.address);
         }
         wait_for(own, due);
     }

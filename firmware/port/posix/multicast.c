@@ -6,6 +6,9 @@
 #include <arpa/inet.h>
 #include <errno.h>
 #include <fcntl.h>
+#ifdef __linux__
+#include <linux/filter.h>
+#endif
 #include <netinet/in.h>
 #include <string.h>
 #include <sys/socket.h>
@@ -239,4 +242,31 @@ int multicast_send(host_bus *bus, const teds_can_frame *frame)
     uint8_t datagram[320];
     size_t length = multicast_pack(frame, datagram);
     return send(bus->out, datagram, length, 0) == (ssize_t)length ? 0 : -1;
+}
+
+/* The kernel drops what a station sends to another node, before it wakes this one: twenty nodes on a bus would each look at
+ * every frame. The octets stand where multicast_pack and python-can put them, behind the UDP header. */
+void multicast_accept(const host_bus *bus, uint8_t address)
+{
+#ifdef __linux__
+    enum { PAYLOAD = 8, END_OF_KEY = PAYLOAD + 32, IDENTIFIER = PAYLOAD + 36, ALL = 0x1000 };
+    struct sock_filter steps[] = {
+        BPF_STMT(BPF_LD | BPF_W | BPF_ABS, END_OF_KEY),
+        BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, 0x5F6964CE, 0, 8), /* "_id", and a number of 32 bits follows */
+        BPF_STMT(BPF_LD | BPF_W | BPF_ABS, IDENTIFIER),
+        BPF_STMT(BPF_ALU | BPF_AND | BPF_K, 0x1FFF00F0),
+        BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, 0x18DA00F0, 0, 5), /* from a station to one node */
+        BPF_STMT(BPF_LD | BPF_W | BPF_ABS, IDENTIFIER),
+        BPF_STMT(BPF_ALU | BPF_RSH | BPF_K, 8),
+        BPF_STMT(BPF_ALU | BPF_AND | BPF_K, 0xFF),
+        BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, address, 1, 0),
+        BPF_STMT(BPF_RET | BPF_K, 0),
+        BPF_STMT(BPF_RET | BPF_K, ALL),
+    };
+    const struct sock_fprog program = {sizeof steps / sizeof steps[0], steps};
+    (void)setsockopt(bus->in, SOL_SOCKET, SO_ATTACH_FILTER, &program, sizeof program);
+#else
+    (void)bus;
+    (void)address;
+#endif
 }

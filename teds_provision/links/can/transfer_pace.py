@@ -1,7 +1,8 @@
 """How much of a bus its streams take, and when the next message of a long transfer may leave beside them.
 
 Commands go before data on CAN (their identifiers are lower), so a transfer that sends as fast as it can would hold up
-every stream. All transfers of a process over one bus share what the streams leave of nine tenths of it.
+every stream. All transfers of a process over one bus share what the streams leave of nine tenths of it. A bus without
+streams is theirs alone.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.spec import CanSpec
 from teds_provision.protocol.announce import is_announce
 from teds_provision.protocol.operation.budget import classic_bits, fd_seconds
-from teds_provision.protocol.operation.can_frames import DATA, FD_OCTETS, fd_length
+from teds_provision.protocol.operation.can_frames import DATA, DRIVE, FD_OCTETS, fd_length
 
 _MOST: Final = 0.9
 """Share of a bus that streams and transfers take together."""
@@ -47,10 +48,11 @@ class TransferPace:
         self._free_at, self._counted, self._left = 0.0, 0.0, self._began
 
     def count(self, frame: Frame) -> None:
-        """Count a frame that was heard or sent: of a stream, or of a command or reply."""
+        """Count a frame that was heard or sent: of a stream (also of Drive messages), or of a command or reply."""
         octets = len(frame.data)
         seconds = self._fd[octets] if frame.fd else self._classic[min(octets, _CLASSIC_OCTETS)]
-        if frame.identifier & 0x1FFF0000 == DATA and not is_announce(frame.identifier):
+        kind = frame.identifier & 0x1FFF0000
+        if kind == DRIVE or (kind == DATA and not is_announce(frame.identifier)):
             self._streams += seconds
         else:
             self._others += seconds
@@ -70,15 +72,17 @@ class TransferPace:
     def wait(self) -> bool:
         """Wait until commands and replies since the last call have had the time that streams leave them.
 
-        Returns True if streams run.
+        Returns True if streams run; without them there is no wait.
         """
         load = self.stream_load
         with self._lock:
             now = self._clock()
             used, self._counted = self._others - self._counted, self._others
-            # what was used since the last call began then; time that was left over before it is not saved up
-            self._free_at = max(self._free_at, self._left) + used / max(_LEAST, _MOST - load)
-            left = max(0.0, self._free_at - now)
+            left = 0.0
+            if load > 0:
+                # what was used since the last call began then; time that was left over before it is not saved up
+                self._free_at = max(self._free_at, self._left) + used / max(_LEAST, _MOST - load)
+                left = max(0.0, self._free_at - now)
             self._left = now + left
         if left > 0:
             self._sleep(left)

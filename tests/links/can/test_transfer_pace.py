@@ -1,4 +1,4 @@
-"""A long transfer on a bus: it leaves streams their share, takes at most nine tenths, and comes to its end."""
+"""A long transfer on a bus: alone it takes all of it, beside streams what they leave of nine tenths, and it ends."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from teds_provision.links.can.transfer_pace import TransferPace
 BITRATE = 500_000
 COMMAND = Frame(0x18DA21F1, bytes.fromhex("2112345678901234"))
 DATA = Frame(0x1CFF2021, bytes.fromhex("0112345678901234"))
+DRIVE = Frame(0x18EF22F2, bytes.fromhex("0112345678901234"))
 SECONDS = classic_bits(COMMAND.identifier, COMMAND.data) / BITRATE
 
 
@@ -23,6 +24,7 @@ class Bus:
 
     now: float = 100.0
     streams: float = 0.0
+    frame: Frame = DATA
     command_seconds: float = 0.0
     stream_seconds: float = 0.0
     due: float = 100.0
@@ -35,7 +37,7 @@ class Bus:
         end = self.now + seconds
         if self.streams:
             while self.due < end:
-                self.pace.count(DATA)
+                self.pace.count(self.frame)
                 self.stream_seconds += SECONDS
                 self.due += SECONDS / self.streams
         self.now = end
@@ -51,16 +53,28 @@ class Bus:
         return seen
 
 
-@pytest.mark.parametrize(("streams", "most"), [(0.0, 0.92), (0.3, 0.95), (0.6, 0.95)])
-def test_transfers_and_streams_take_nine_tenths_together(streams: float, most: float) -> None:
-    bus = Bus(streams=streams)
+@pytest.mark.parametrize("frame", [DATA, DRIVE], ids=["measured values", "orders to actuators"])
+@pytest.mark.parametrize("streams", [0.3, 0.6])
+def test_transfers_and_streams_take_nine_tenths_together(streams: float, frame: Frame) -> None:
+    bus = Bus(streams=streams, frame=frame)
     bus.sleep(1.0)
     began, before = bus.now, bus.stream_seconds
     seen = [bus.packet(40) for _ in range(200)]
     passed = bus.now - began
     share = (bus.command_seconds + bus.stream_seconds - before) / passed
-    assert 0.8 < share < most
-    assert all(seen) == any(seen) == (streams > 0)
+    assert 0.8 < share < 0.95
+    assert all(seen)
+
+
+def test_without_streams_a_transfer_does_not_wait_and_with_the_first_it_does() -> None:
+    bus = Bus()
+    bus.sleep(1.0)
+    began = bus.now
+    assert not any(bus.packet(40) for _ in range(200))
+    assert bus.now - began == pytest.approx(200 * 40 * SECONDS)
+    bus.streams, bus.due = 0.5, bus.now
+    bus.packet(40)
+    assert bus.packet(40)
 
 
 def test_a_full_bus_still_lets_a_transfer_come_to_its_end() -> None:
@@ -73,7 +87,8 @@ def test_a_full_bus_still_lets_a_transfer_come_to_its_end() -> None:
 
 
 def test_a_slow_board_is_not_made_slower_and_saves_up_no_time() -> None:
-    bus = Bus()
+    bus = Bus(streams=0.1)
+    bus.sleep(1.0)
     bus.packet(40)
     began = bus.now
     for _ in range(20):
