@@ -127,7 +127,8 @@ def commands(folder: Path, count: int) -> Iterator[Row]:
     yield Row("whitelist add", ("whitelist", "add", "ee" * 10))
     yield Row("whitelist export", ("whitelist", "export", listed))
     yield Row("whitelist import", ("whitelist", "import", listed), None, None)  # whole or not at all: no list
-    yield Row("doctor", ("doctor",), 3.0, None)
+    yield Row("doctor", ("doctor",), 1.0, None)
+    yield Row("doctor --full", ("doctor", "--full"), None, None)
     bundle, sealed = str(folder / f"bundle{count}"), str(folder / f"backup{count}")
     words = ("export-keys", "--to", RECEIVER, "--all", "--mode", "copy", "--output", bundle, "--yes")
     yield Row("export-keys", words, None, None, once=True)

@@ -36,6 +36,7 @@ _STYLES = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": 
 @click.option("--nfc", metavar="PATH", help="Also open this reader: usb, tty:USB0:pn532, udp:localhost:54321.")
 @click.option("--can", metavar="INTERFACE:CHANNEL", help="Also open this bus: socketcan:can0, …")
 @click.option("--ble", metavar="ADAPTER", help="Also require this Bluetooth adapter: auto, hci0.")
+@click.option("--full", is_flag=True, help="Check every row and log entry of a large store, not only a sample.")
 @click.option(
     "--report",
     type=click.Path(dir_okay=False, allow_dash=True, path_type=Path),
@@ -44,12 +45,17 @@ _STYLES = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": 
 )
 @click.option("--with-uuids", is_flag=True, help="With --report: keep the UUIDs of nodes.")
 @pass_app
-def doctor(app: App, nfc: str | None, can: str | None, ble: str | None, report: Path | None, with_uuids: bool) -> None:
+def doctor(
+    app: App, nfc: str | None, can: str | None, ble: str | None, full: bool, report: Path | None, with_uuids: bool
+) -> None:
     """Check Python, libraries, readers, buses, clock, keyring, vault and store; explain each problem and how to fix it.
 
     Opens only the readers and buses you name, and never asks for a passphrase; with --passphrase-fd it also checks the
     seals of pins and trust. Exits 0 unless a check failed (warnings do not count): 7 for the store, the keyring or the
     vault, 5 for a named reader or bus, 1 for the rest.
+
+    In a store of more than 5,000 nodes, or a log of more than 10,000 entries, the newest and a random sample are
+    checked ("sampled" with --json); --full checks everything.
 
     --report writes one document to paste into a bug report. It contains no keys, passphrases, fingerprints, paths of
     this user or names of this machine; UUIDs only with --with-uuids.
@@ -60,15 +66,22 @@ def doctor(app: App, nfc: str | None, can: str | None, ble: str | None, report: 
         require_new(report)
     root = click.get_current_context().find_root()
     group = root.command
-    settings = known_settings(group) if isinstance(group, click.Group) else None
+    settings = partial(known_settings, group) if isinstance(group, click.Group) else None
     ask = app.ask_secret if app.has_passphrase else None
     system = doctor_room.checks.System(
-        app.home, nfc, can, ble, settings=settings, ask=ask, bad_value=partial(_bad_value, app, root)
+        app.home, nfc, can, ble, full, settings=settings, ask=ask, bad_value=partial(_bad_value, app, root)
     )
     found = list(doctor_room.checks.examine(system))
     findings = [finding for _, finding in found]
     checks = [
-        {"name": finding.name, "result": finding.result, "why": finding.why, "fix": finding.fix} for finding in findings
+        {
+            "name": finding.name,
+            "result": finding.result,
+            "why": finding.why,
+            "fix": finding.fix,
+            "sampled": finding.sampled,
+        }
+        for finding in findings
     ]
     code = doctor_room.checks.exit_code(found)
     counts = {word: sum(finding.result == word for finding in findings) for word in _STYLES}

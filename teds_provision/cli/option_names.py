@@ -18,7 +18,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "trust ca sign": frozenset({"output", "yes", "dry-run"}),
     "trust remove": frozenset({"yes", "dry-run"}),
     "profile new": frozenset({"extends", "from", "message", "map", "output", "dry-run"}),
-    "doctor": frozenset({"nfc", "can", "ble", "report", "with-uuids"}),
+    "doctor": frozenset({"nfc", "can", "ble", "full", "report", "with-uuids"}),
     "identify": frozenset({"watch", "add", "locate", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "whitelist add": frozenset({"fingerprint", "name", "dry-run"}),
     "whitelist export": frozenset({"format", "dry-run"}),

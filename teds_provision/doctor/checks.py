@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from teds_provision.errors import TedsProvisionError
+from teds_provision.station.store.row_sample import RowSample
 
 Result = Literal["ok", "warning", "failed", "skipped"]
 Room = Literal["machine", "link", "store"]
@@ -28,6 +29,8 @@ class Finding:
     result: Result
     why: str
     fix: str = ""
+    sampled: bool = False
+    """True if a large table or log was checked in part only: the newest, and some at random."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +41,13 @@ class System:
     nfc: str | None = None
     can: str | None = None
     ble: str | None = None
+    full: bool = False
+    """True if every row and every entry of the log is checked, however many there are."""
     workspace: Path = field(default_factory=Path.cwd)
     root: Path = Path("/")
     environment: Mapping[str, str] = field(default_factory=lambda: os.environ)
-    settings: Mapping[str, frozenset[str]] | None = None
-    """Valid names of config.toml, by table ("" outside of one); None if they are unknown."""
+    settings: Callable[[], Mapping[str, frozenset[str]]] | None = None
+    """Returns the valid names of config.toml, by table ("" outside of one); None if they are unknown."""
     bad_value: Callable[[Mapping[str, Any]], str] = lambda _: ""
     """Returns which value of config.toml no command takes, and why; "" if all are good."""
     ask: Callable[[str, bool], str] | None = None
@@ -83,6 +88,13 @@ def examine(system: System) -> Iterator[tuple[Room, Finding]]:
                 room,
                 Finding(name, "failed", f"the check itself failed: {type(error).__name__}: {error}.", "Report this."),
             )
+
+
+def intact(name: str, whole: str, part: str, sample: RowSample) -> Finding:
+    """Return that a check found nothing: in the whole of what it looks at, or in the ``part`` that was sampled."""
+    if sample.sampled:
+        return Finding(name, "ok", f"{part} (doctor --full checks all).", sampled=True)
+    return Finding(name, "ok", f"{whole}.")
 
 
 def exit_code(found: list[tuple[Room, Finding]]) -> int:

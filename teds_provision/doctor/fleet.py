@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, Final
 
 from teds_provision import teds
-from teds_provision.doctor.checks import Finding, System, check
+from teds_provision.doctor.checks import Finding, System, check, intact
 from teds_provision.errors import BadDataError, NotFoundError, StoreChangedError, StoreError, VaultError
 from teds_provision.files import read_text
 from teds_provision.limits import LIMITS, load_toml
@@ -18,6 +18,7 @@ from teds_provision.station.node_keys import deferred_until
 from teds_provision.station.station import Station
 from teds_provision.station.store import chunks, utc_now
 from teds_provision.station.store.database import has_store
+from teds_provision.station.store.row_sample import SAMPLED, RowSample
 
 _SHOWN: Final = 5
 
@@ -49,13 +50,14 @@ def config(system: System) -> Iterator[Finding]:
 def _unknown(values: dict[str, Any], system: System) -> Iterator[str]:
     if system.settings is None:
         return
-    known = {table: {name.replace("-", "_") for name in names} for table, names in system.settings.items()}
+    settings = system.settings()
+    known = {table: {name.replace("-", "_") for name in names} for table, names in settings.items()}
     for key, value in values.items():
         name = key.replace("-", "_")
         if not isinstance(value, dict):
             if name not in known[""]:
                 yield key
-        elif key.replace("_", "-") not in system.settings:
+        elif key.replace("_", "-") not in settings:
             yield f"[{key}]"
         else:
             allowed = known[key.replace("_", "-")]
@@ -146,6 +148,7 @@ def seals(system: System) -> Iterator[Finding]:
     """Check the MACs of the rows that decide whom the station trusts; only if no prompt is needed for that."""
     if not has_store(system.home):
         return
+    sample = RowSample(full=system.full)
     station = Station.open(system.home, ask=system.ask or _nobody)
     try:
         if system.ask is None and station.identity.keystore != "keyring":  # which opens by itself, or not at all
@@ -153,7 +156,7 @@ def seals(system: System) -> Iterator[Finding]:
             yield Finding("seals", "skipped", why, "teds-provision --passphrase-fd 3 doctor 3<FILE")
             return
         station.unlock()
-        broken = list(station.row_macs.all_broken())
+        broken = list(station.row_macs.all_broken(sample))
     except StoreChangedError as error:
         yield Finding("seals", "failed", error.message, error.hint)
         return
@@ -167,7 +170,9 @@ def seals(system: System) -> Iterator[Finding]:
         fix = "Remove them (whitelist remove, trust remove), find out who changed the file, and add them again."
         yield Finding("seals", "failed", f"Changed by another program and not trusted: {some}.", fix)
     else:
-        yield Finding("seals", "ok", "Pins, trust and the station's own CA are unchanged.")
+        whole = "Pins, trust and the station's own CA are unchanged"
+        part = f"{whole}, of each large table the newest and {SAMPLED:,} random rows"
+        yield intact("seals", whole, part, sample)
 
 
 def _nobody(_prompt: str, _confirm: bool = False) -> str:

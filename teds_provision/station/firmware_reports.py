@@ -8,6 +8,7 @@ from typing import Any
 from teds_provision.station.row_macs import MacRow, RowMacs, Values
 from teds_provision.station.store.database import places
 from teds_provision.station.store.records import FirmwareRecord, utc_now
+from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 
 
@@ -61,9 +62,10 @@ class FirmwareReports:
         """Return True if a report counts: its MAC is right, or the vault is closed, or it is a hint anyway."""
         return not record.in_session or self._row_macs.counts(record.mac, "firmware", _bound(record))
 
-    def mac_rows(self) -> Iterator[MacRow]:
-        """Yield every report of a session, for a check of its MAC."""
-        for record in self._store.read(_record, "SELECT * FROM firmware ORDER BY uuid"):
+    def mac_rows(self, sample: RowSample) -> Iterator[MacRow]:
+        """Yield the reports of sessions, for a check of their MACs."""
+        rows = sample.rows(self._store, "firmware")
+        for record in self._store.read(_record, f"SELECT * FROM firmware WHERE {rows} ORDER BY uuid"):
             if record.in_session:
                 yield f"the firmware report of {record.uuid.hex()}", record.mac, "firmware", _bound(record)
 

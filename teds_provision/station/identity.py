@@ -13,6 +13,7 @@ from teds_provision.protocol import keys
 from teds_provision.station.row_macs import KEY_OCTETS, MacRow, RowMacs, Values, changed
 from teds_provision.station.store.database import places
 from teds_provision.station.store.records import StationRecord
+from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
@@ -191,7 +192,7 @@ class StationIdentity:
     def _context(self) -> bytes:
         return b"TEDS1 seal key\0" + self._store.id.encode()
 
-    def mac_rows(self) -> Iterator[MacRow]:
+    def mac_rows(self, _sample: RowSample) -> Iterator[MacRow]:
         """Yield the station's own row, for a check of its MAC."""
         record = self.record()
         if record is not None:

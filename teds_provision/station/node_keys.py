@@ -22,6 +22,7 @@ from teds_provision.station.plant.plant import Plant
 from teds_provision.station.row_macs import MacRow, RowMacs, changed
 from teds_provision.station.store.database import chunks, places
 from teds_provision.station.store.records import Holder, KeyFlags, KeyRecord, KeySource, utc_now
+from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 from teds_provision.vault.base import node_key_context
 
@@ -394,9 +395,9 @@ class NodeKeys:
         statement = f"SELECT uuid, {_FLAGS} FROM marks WHERE uuid IN ({places(uuids)})"
         return dict(self._store.read(_flagged, statement, uuids))
 
-    def all_flags(self) -> dict[bytes, KeyFlags]:
-        """Return the flags of every node that has one."""
-        return dict(self._store.read(_flagged, f"SELECT uuid, {_FLAGS} FROM marks"))
+    def all_flags(self, rows: str = "1") -> dict[bytes, KeyFlags]:
+        """Return the flags of every node that has one; ``rows`` is a condition in SQL for the nodes that are meant."""
+        return dict(self._store.read(_flagged, f"SELECT uuid, {_FLAGS} FROM marks WHERE {rows}"))
 
     def put_flags(self, flags: Mapping[bytes, KeyFlags]) -> None:
         """Keep the flags of nodes, with the MACs that they have, in place of those that are there.
@@ -411,9 +412,9 @@ class NodeKeys:
             statement = f"INSERT OR REPLACE INTO marks(uuid, {_FLAGS}) VALUES({places(columns)})"
             self._store.execute_many(statement, rows)
 
-    def mac_rows(self) -> Iterator[MacRow]:
-        """Yield the CA of every node that keeps another one than the owner's, for a check of its MAC."""
-        for uuid, flags in self.all_flags().items():
+    def mac_rows(self, sample: RowSample) -> Iterator[MacRow]:
+        """Yield the CAs of nodes that keep another one than the owner's, for a check of their MACs."""
+        for uuid, flags in self.all_flags(sample.rows(self._store, "marks")).items():
             if flags.ca is not None:
                 yield f"the CA of node {uuid.hex()}", flags.ca_mac, "ca", (uuid, flags.ca)
 

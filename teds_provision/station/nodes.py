@@ -18,6 +18,7 @@ from teds_provision.station.plant.plant import Plant
 from teds_provision.station.row_macs import MacRow, RowMacs, changed
 from teds_provision.station.store.database import PAGE, chunks, places
 from teds_provision.station.store.records import UUID_OCTETS, ExportedNode, ExportEligibility, NodeRecord
+from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
@@ -172,9 +173,10 @@ class Nodes:
             remove = f"teds-provision whitelist remove {node.uuid.hex()}, then tap the node."
             raise changed([f"the key of node {node.uuid.hex()}"], remove)
 
-    def mac_rows(self) -> Iterator[MacRow]:
-        """Yield every identity key with a MAC, for a check of them."""
-        for node in self.all():
+    def mac_rows(self, sample: RowSample) -> Iterator[MacRow]:
+        """Yield the identity keys with a MAC, for a check of them."""
+        rows = sample.rows(self._store, "nodes")
+        for node in self._store.read(NodeRecord, f"SELECT {_NODE_COLUMNS} FROM nodes WHERE {rows} ORDER BY uuid"):
             if node.point is not None and node.point_mac is not None:
                 yield f"the key of node {node.uuid.hex()}", node.point_mac, "node", (node.uuid, node.point)
 

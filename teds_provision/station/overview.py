@@ -89,7 +89,6 @@ class Overview:
         def some(statement: str, *values: Any) -> tuple[bytes, ...]:
             return tuple(bytes(uuid) for (uuid,) in self._store.execute(statement, values))
 
-        gone = "(SELECT uuid FROM tombstones UNION SELECT uuid FROM revocations)"
         return WaitingNodes(
             some("SELECT uuid FROM nodes WHERE due < ? ORDER BY due, uuid", today),
             some(
@@ -98,10 +97,9 @@ class Overview:
             ),
             some("SELECT uuid FROM drafts ORDER BY uuid"),
             some(
-                "SELECT DISTINCT k.uuid FROM keys k WHERE k.state = 'active' AND k.uuid NOT IN"
-                " (SELECT uuid FROM readings WHERE c IS NOT NULL"
-                " UNION SELECT uuid FROM nodes WHERE retired IS NOT NULL)"
-                f" AND k.uuid NOT IN {gone} ORDER BY k.uuid"
+                "SELECT uuid FROM keys WHERE state = 'active' EXCEPT SELECT uuid FROM readings WHERE c IS NOT NULL"
+                " EXCEPT SELECT uuid FROM nodes WHERE retired IS NOT NULL EXCEPT SELECT uuid FROM tombstones"
+                " EXCEPT SELECT uuid FROM revocations ORDER BY uuid"  # tables in the order of their key: one merge
             ),
             some("SELECT uuid FROM marks WHERE rotation IS NOT NULL ORDER BY uuid"),
         )

@@ -18,6 +18,7 @@ from teds_provision.station.plant.plant import Plant
 from teds_provision.station.row_macs import MacRow, RowMacs, Values, changed
 from teds_provision.station.store.database import PAGE, places
 from teds_provision.station.store.records import ExportEligibility, NodeRecord, WhitelistEntry
+from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
@@ -181,9 +182,10 @@ class Pins:
                 self._plant.record_event("unpinned", uuid)
             return self._store.change("DELETE FROM whitelist WHERE uuid = ?", (uuid,)) > 0
 
-    def mac_rows(self) -> Iterator[MacRow]:
-        """Yield every entry, for a check of its MAC."""
-        for entry in self._store.read(WhitelistEntry, "SELECT * FROM whitelist ORDER BY uuid"):
+    def mac_rows(self, sample: RowSample) -> Iterator[MacRow]:
+        """Yield the entries, for a check of their MACs."""
+        rows = sample.rows(self._store, "whitelist")
+        for entry in self._store.read(WhitelistEntry, f"SELECT * FROM whitelist WHERE {rows} ORDER BY uuid"):
             yield f"the whitelist entry of {entry.uuid.hex()}", entry.mac, "whitelist", _bound(entry)
 
     # -- a board that was replaced under its UUID ------------------------------------------------------------------

@@ -29,6 +29,7 @@ from teds_provision.station.store.records import (
     WhitelistEntry,
     utc_now,
 )
+from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
@@ -352,12 +353,12 @@ class Policy:
         if strange:
             self._tell(f"Another program added {', '.join(strange[:_SHOWN])}, which does not count.")
 
-    def mac_rows(self) -> Iterator[MacRow]:
+    def mac_rows(self, _sample: RowSample | None = None) -> Iterator[MacRow]:
         """Yield every trusted key, for a check of its MAC."""
         for record in self.trust_rows():
             yield f"trust in {record.name}", record.mac, "trust", _bound(record)
 
-    def decision_rows(self) -> Iterator[MacRow]:
+    def decision_rows(self, _sample: RowSample | None = None) -> Iterator[MacRow]:
         """Yield the bans that a person lifted and the CAs whose trust one ended, for a check of their MACs."""
         for statement, mac in self.lifted().items():
             yield f"the lifting of ban {statement[:_DIGITS]}", mac, "lifted", (statement,)

@@ -3,7 +3,7 @@
 A program that can write the store's file can change rows in it, but cannot make their MAC: HMAC-SHA-256 (RFC 2104), cut
 to 16 octets, under a key of 32 octets that the vault wraps. A MAC binds a row's kind and values to this store. When the
 vault opens, the station's own facts and the trusted keys are checked; a pin, or the CA of a node, when it is used;
-everything by ``doctor``. A row with a wrong MAC is reported and ignored.
+everything by ``doctor --full``. A row with a wrong MAC is reported and ignored.
 
 Not promised: a row that this station once made and removed since can be put back, and a row can be removed.
 """
@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Final
 
 from teds_provision.errors import StoreChangedError
+from teds_provision.station.store.row_sample import RowSample
 
 if TYPE_CHECKING:
     from teds_provision.vault import Vault
@@ -36,8 +37,8 @@ class RowMacs:
     def __init__(self, vault: Callable[[], Vault]) -> None:
         self._vault = vault
         self._keyed: hmac.HMAC | None = None
-        self.sources: tuple[Callable[[], Iterator[MacRow]], ...] = ()
-        """Of each topic, its rows with a MAC: what doctor checks."""
+        self.sources: tuple[Callable[[RowSample], Iterator[MacRow]], ...] = ()
+        """Of each topic, those of its rows with a MAC that are in a sample: what doctor checks."""
 
     @property
     def active(self) -> bool:
@@ -88,10 +89,11 @@ class RowMacs:
         """Return True if a decision counts, as :meth:`counts`."""
         return self.counts(mac, kind, (name,))
 
-    def all_broken(self) -> Iterator[str]:
-        """Name every row with a MAC that does not hold (the vault is open), for doctor."""
+    def all_broken(self, sample: RowSample | None = None) -> Iterator[str]:
+        """Name every row with a MAC that does not hold (the vault is open), for doctor; with ``sample`` among those."""
+        chosen = sample or RowSample(full=True)
         for rows in self.sources:
-            for name, mac, kind, values in rows():
+            for name, mac, kind, values in rows(chosen):
                 if not self.holds(mac, kind, values):
                     yield name
 

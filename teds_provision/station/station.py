@@ -60,6 +60,7 @@ from teds_provision.station.store import AuditLog, KeyRecord, NodeLock, Store, S
 from teds_provision.station.store.background_writer import BackgroundWriter
 from teds_provision.station.store.database import has_store
 from teds_provision.station.store.dump import RowSource, dump, load
+from teds_provision.station.store.row_sample import RowSample
 from teds_provision.vault.base import node_key_context
 
 if TYPE_CHECKING:
@@ -306,9 +307,9 @@ class Station:
         """Return the credentials for node ``uuid`` under the CA that this node keeps, else the station's own."""
         return self.identity.credentials(None if uuid is None else self.keys.ca_of(uuid))
 
-    def damage(self) -> str | None:
-        """Return what is wrong with the store's file, None if nothing (for doctor)."""
-        return self._store.damage()
+    def damage(self, sample: RowSample | None = None) -> str | None:
+        """Return what is wrong with the store's file, None if nothing; with ``sample`` of large tables those rows."""
+        return self._store.damage(sample)
 
     def version(self) -> int:
         """Return a number that changes exactly when another process has changed the store: earlier plans are stale."""

@@ -13,7 +13,7 @@ def test_every_check_has_name_result_cause_and_cure(home: Path) -> None:
     told = spawn("--home", home, "--json", "doctor")
     assert told.code == 0, told.out
     checks = told.json["checks"]
-    assert all(set(check) == {"name", "result", "why", "fix"} for check in checks)
+    assert all(set(check) == {"name", "result", "why", "fix", "sampled"} for check in checks)
     assert {check["result"] for check in checks} <= {"ok", "warning", "skipped"}
     assert {"python", "libraries", "clock", "store", "keyring", "can loopback"} <= {check["name"] for check in checks}
     assert "Traceback" not in told.err

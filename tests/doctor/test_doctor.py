@@ -35,6 +35,7 @@ from teds_provision.station.store import (
     Store,
     StoreLock,
     WhitelistEntry,
+    row_sample,
 )
 from teds_provision.teds.image import Image
 from teds_provision.vault import forget_vaults
@@ -438,7 +439,7 @@ def test_a_broken_config_is_told_and_the_rest_is_still_looked_at(stationed: Syst
 
 def test_keys_that_no_command_knows_are_named(stationed: System) -> None:
     known = {"": frozenset({"via", "no-input"}), "provision": frozenset({"profile", "yes"})}
-    system = replace(stationed, settings=known)
+    system = replace(stationed, settings=lambda: known)
     (stationed.home / "config.toml").write_text("via = 'nfc'\nno_input = true\n[provision]\nprofile = 'x'\n")
     assert by_name(system)["config"].result == "ok"
     (stationed.home / "config.toml").write_text("vai = 'nfc'\n[provision]\nprofle = 'x'\n[provisoin]\n")
@@ -484,3 +485,77 @@ def test_seals_are_checked_where_the_passphrase_is_given(stationed: System) -> N
         store.pins.restore([WhitelistEntry(bytes(10), "ab" * 32)])
     found = look(system, "seals")[0]
     assert (found.result, bytes(10).hex() in found.why) == ("failed", True)
+
+
+@pytest.fixture
+def crowded(stationed: System, monkeypatch: pytest.MonkeyPatch) -> System:
+    """A station with more nodes and entries of its log than a check reads of each table by default."""
+    monkeypatch.setattr(row_sample, "SAMPLED", 20)
+    monkeypatch.setattr(row_sample, "_NEWEST", 3)
+    monkeypatch.setattr(row_sample, "_RUN", 5)
+    forget_vaults()
+    with Station.open(stationed.home, ask=lambda prompt, confirm: PASSPHRASE) as station, station.transaction():
+        station.unlock()
+        for number in range(60):
+            station.pins.put(WhitelistEntry(bytes([number]) * 10, f"{number:064x}"))
+            station.keys.add(KeyRecord(bytes([number]) * 10, 1, "ab" * 8, "active", 1, b"wrapped"))
+            station.audit("verify", bytes([number]) * 10, "authentic")
+    return replace(stationed, ask=lambda prompt, confirm: PASSPHRASE)
+
+
+def changed_in(home: Path, *statements: str) -> None:
+    """Change the store as another program would."""
+    with closing(sqlite3.connect(home / "store.sqlite3")) as connection, connection:
+        connection.execute("DROP TRIGGER IF EXISTS audit_is_never_changed")
+        connection.execute("DROP TRIGGER IF EXISTS audit_is_never_shortened")
+        connection.execute("PRAGMA ignore_check_constraints = ON")
+        for statement in statements:
+            connection.execute(statement)
+
+
+def verdicts(system: System) -> dict[str, tuple[str, bool]]:
+    """Result of each check of the store that may be a sample, and whether it was one."""
+    found = [*look(system, "store"), *look(system, "seals")]
+    return {
+        finding.name: (finding.result, finding.sampled)
+        for finding in found
+        if finding.name in ("store", "audit log", "seals")
+    }
+
+
+def test_of_a_large_store_a_sample_is_checked_and_said_to_be_one(crowded: System) -> None:
+    assert verdicts(crowded) == dict.fromkeys(("store", "audit log", "seals"), ("ok", True))
+    assert all("--full" in finding.why for finding in look(crowded, "seals"))
+    whole = replace(crowded, full=True)
+    assert verdicts(whole) == dict.fromkeys(("store", "audit log", "seals"), ("ok", False))
+
+
+def test_what_another_program_did_to_the_newest_is_always_found(crowded: System) -> None:
+    changed_in(crowded.home, "UPDATE whitelist SET fingerprint = 'ff' WHERE uuid = (SELECT max(uuid) FROM whitelist)")
+    changed_in(crowded.home, "UPDATE audit SET outcome = 'x' WHERE seq = (SELECT max(seq) - 1 FROM audit)")
+    found = verdicts(crowded)
+    assert (found["seals"][0], found["audit log"][0]) == ("failed", "failed")
+
+
+def test_one_changed_row_among_many_is_found_by_a_full_check(crowded: System) -> None:
+    changed_in(crowded.home, f"UPDATE whitelist SET fingerprint = 'ff' WHERE uuid = x'{'07' * 10}'")
+    changed_in(crowded.home, f"UPDATE audit SET outcome = 'x' WHERE uuid = x'{'07' * 10}'")
+    found = verdicts(replace(crowded, full=True))
+    assert (found["seals"][0], found["audit log"][0]) == ("failed", "failed")
+
+
+def test_a_sample_finds_a_change_of_many_old_rows(crowded: System) -> None:
+    changed_in(crowded.home, f"UPDATE whitelist SET fingerprint = 'ff' WHERE uuid < x'{'30' * 10}'")
+    assert verdicts(crowded)["seals"] == ("failed", False)  # a third of 48 rows; none of them once in 10^8 runs
+
+
+def test_an_entry_that_was_taken_out_of_a_long_log_is_found(crowded: System) -> None:
+    changed_in(crowded.home, "DELETE FROM audit WHERE seq = 7")
+    (log,) = (finding for finding in look(crowded, "store") if finding.name == "audit log")
+    assert (log.result, "entry 7 is missing" in log.why) == ("failed", True)
+
+
+def test_a_small_table_beside_large_ones_is_checked_whole(crowded: System) -> None:
+    changed_in(crowded.home, "INSERT INTO trust VALUES('x', 'ca', x'00', 'y', 'z', NULL)")
+    (store,) = look(crowded, "store")
+    assert (store.result, "trust" in store.why) == ("failed", True)

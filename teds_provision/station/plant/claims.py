@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from teds_provision.station.plant.pages import Chain
 from teds_provision.station.row_macs import MacRow, RowMacs
 from teds_provision.station.store.database import PAGE, places
+from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 
 _DIGITS = 16
@@ -188,9 +189,12 @@ class Claims:
 
     # -- for doctor --------------------------------------------------------------------------------------------------
 
-    def mac_rows(self) -> Iterator[MacRow]:
-        """Yield every digest and lifting, for a check of their MACs."""
-        rows = self._store.execute("SELECT digest, station, n, vouched, mac FROM digests JOIN chains USING(chain)")
+    def mac_rows(self, sample: RowSample) -> Iterator[MacRow]:
+        """Yield digests and liftings, for a check of their MACs."""
+        chosen = sample.rows(self._store, "digests", "digest")
+        rows = self._store.execute(
+            f"SELECT digest, station, n, vouched, mac FROM digests JOIN chains USING(chain) WHERE {chosen}"
+        )
         for digest, station, n, vouched, mac in rows:
             kind, value = _digest(digest, station, n, bool(vouched))
             yield f"the digest {digest.hex()[:_DIGITS]} of a page", mac, kind, (value,)

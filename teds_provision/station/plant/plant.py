@@ -25,6 +25,7 @@ from teds_provision.station.plant.parcels import Parcels
 from teds_provision.station.row_macs import MacRow, RowMacs
 from teds_provision.station.store.database import places
 from teds_provision.station.store.records import utc_now
+from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
@@ -385,7 +386,7 @@ class Plant:
 
     # -- for doctor --------------------------------------------------------------------------------------------------
 
-    def mac_rows(self) -> Iterator[MacRow]:
+    def mac_rows(self, sample: RowSample) -> Iterator[MacRow]:
         """Yield the rows that this station believes without verifying their signer again, for a check of their MACs."""
         record, row = self.record(), self.held_roster()
         if record is not None:
@@ -394,7 +395,7 @@ class Plant:
                 yield "the note of a restored home", record.restored_mac, "restored", (record.restored,)
         if row is not None:
             yield f"roster {row.version}", row.mac, "roster", (row.hash,)
-        yield from self.claims.mac_rows()
+        yield from self.claims.mac_rows(sample)
 
 
 def _roster(version: int, hash: str, octets: bytes, held: int, at: str, mac: bytes | None) -> RosterRow:

@@ -23,6 +23,7 @@ from typing import Any
 from teds_provision.portable import HAS_OWNERS, name_of_machine
 from teds_provision.station.store.database import Database
 from teds_provision.station.store.records import utc_now
+from teds_provision.station.store.row_sample import RowSample
 
 ACTOR: ContextVar[str | None] = ContextVar("ACTOR", default=None)
 """The actor of acts done here, if it is not the user who runs this process: ``page``, ``token NAME``."""
@@ -31,6 +32,7 @@ _encode = json.JSONEncoder(sort_keys=True, separators=(",", ":")).encode
 _NOTED = "(SELECT value FROM meta WHERE name = 'audit-head')"
 _END = f"SELECT seq, hash, {_NOTED} FROM audit ORDER BY seq DESC LIMIT 1"
 _PAGE_OF_ENTRIES = "SELECT * FROM audit WHERE seq > ? ORDER BY seq LIMIT ?"
+_RUN_OF_ENTRIES = "SELECT * FROM audit WHERE seq BETWEEN ? AND ? ORDER BY seq"
 
 
 _TOKEN = "token "
@@ -190,6 +192,31 @@ class AuditLog:
         if self._remembered() != (expected, previous):
             return self._broken(expected + 1, expected, previous, "the end of the log was cut off or replaced")
         return AuditVerdict(True, None, expected, previous.hex())
+
+    def spot_check(self, sample: RowSample) -> AuditVerdict:
+        """Recompute the hashes of the entries in ``sample``, each from the entry before, and compare count and end.
+
+        The whole log is checked if anything is wrong, so the verdict on a broken chain is that of :meth:`check`.
+        """
+        count, head = self.newest()
+        counted = self._database.one("SELECT count(*) FROM audit")
+        whole = counted == (count,) and self._remembered() == (count, bytes.fromhex(head))
+        if whole and all(self._run_holds(*run) for run in sample.runs(count)):
+            lost = self._database.one("SELECT value FROM meta WHERE name = 'audit-lost'")
+            if lost is None:
+                return AuditVerdict(True, None, count, head)
+        return self.check()
+
+    def _run_holds(self, first: int, last: int) -> bool:
+        """Return True if the entries of these numbers are there and each hash follows from the one before."""
+        rows = self._database.read(_linked, _RUN_OF_ENTRIES, (first, last))
+        before = self._database.one("SELECT hash FROM audit WHERE seq = ?", (first - 1,))
+        previous = self._root if before is None else before[0]
+        for seq, (number, good, digest) in zip(range(first, last + 1), rows, strict=False):
+            if number != seq or good(previous) != digest:
+                return False
+            previous = digest
+        return len(rows) == last - first + 1
 
     def _remembered(self) -> tuple[int, bytes] | None:
         """Return the number of entries and the last hash, None if that note is damaged."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, Self
 from teds_provision.errors import BadDataError, StoreError
 from teds_provision.station.store.audit import AuditLog
 from teds_provision.station.store.database import FILE_NAME, Database
+from teds_provision.station.store.row_sample import ALL_ROWS, RowSample
 
 if TYPE_CHECKING:
     import sqlite3
@@ -72,19 +73,39 @@ class Store(Database):
         row = self.one(f"SELECT count(*) FROM {table}")
         return int(row[0]) if row is not None else 0
 
-    def damage(self) -> str | None:
-        """Return what is wrong with the file: a cut last page, or what SQLite finds; None if nothing (for doctor)."""
+    def damage(self, sample: RowSample | None = None) -> str | None:
+        """Return what is wrong with the file: a cut last page, or what SQLite finds; None if nothing (for doctor).
+
+        With ``sample`` keys, datasheets and log are read in part if they are long.
+        """
         try:
             page = int(self.execute("PRAGMA page_size")[0][0])
             file = str(self.execute("PRAGMA database_list")[0][2])  # "" for the private one of a backup
             if file and Path(file).stat().st_size % page:  # SQLite reads zeros for the octets that are missing
                 return "The file ends within a page."
-            found = str(self.execute("PRAGMA quick_check(1)")[0][0])
+            found = self._checked("1") if sample is None else self._spot_check(sample)
         except StoreError as failure:
             return failure.message
         except OSError as error:
             return f"The file cannot be read: {error.strerror}."
         return None if found == "ok" else found
+
+    def _spot_check(self, sample: RowSample) -> str:
+        """Return what SQLite finds, "ok" if nothing; of a large table with numbered rows, only read the sample.
+
+        Choosing rows at random in a table whose rows have no numbers takes as long as checking it.
+        """
+        tables = self.execute("SELECT name, wr FROM pragma_table_list WHERE schema = 'main' AND type = 'table'")
+        for table, without_numbers in tables:
+            rows = ALL_ROWS if without_numbers else sample.numbered_rows(self, table)
+            if rows != ALL_ROWS:
+                self.execute(f"SELECT * FROM {table} WHERE {rows}")
+            elif (found := self._checked(f"'{table}'")) != "ok":
+                return found
+        return "ok"
+
+    def _checked(self, what: str) -> str:
+        return str(self.execute(f"PRAGMA quick_check({what})")[0][0])
 
     def _identify(self, *, create: bool) -> None:
         """Read the identifier, which wrapped keys and the audit log are bound to; make it in a new store."""
