@@ -42,10 +42,11 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Run:
-    """One run of the checker. ``broken`` names the rule that is put out of force; ``whole``: every state is visited.
+    """One run of the checker. ``whole``: every state is visited.
 
-    ``parts`` are those of the model that cost many states: sessions, and the node's two slots of flash. ``small``: a
-    million states or so, for which an optimised checker takes longer to compile than to run.
+    ``broken`` names the rule that is put out of force, or two with ``+`` between them. ``parts`` are those of the model
+    that cost many states: sessions, and the node's two slots of flash. ``small``: a million states or so, for which an
+    optimised checker takes longer to compile than to run.
     """
 
     bounds: Bounds
@@ -64,16 +65,20 @@ SMALL = Bounds(2, 2)
 RESTORED = Bounds(2, 2, restores=1)
 RESET = Bounds(2, 1, commits=2, resets=1)
 BROKEN = {
-    SMALL: "M1 M2 M3 PENDING REFUSAL LATE HELD_BACK STALE_EPOCH MOVE_ORDER COPY_ORDER MOVE_NO_ROTATION UNDO "
-    "EARLY_DELETE ROTATED_EARLY NEVER_FORGETS ANY_CONFIRM BEFORE_OPEN RECEIPT_FIRST RECEIPT_OTHER IMPORT_OLDER "
-    "IMPORT_REPLACES KEEPS_OLD SESSION MEASURED_ON ERASE",
-    RESTORED: "M6 OLD_PENDING",
-    RESET: "EPOCH_BACK SEQUENCE_BACK RESET_REPLAY RESET_UNPROVEN RESET_RAM RESET_FACTORY SESSION_RESET RESET_KEEPS",
+    SMALL: "M1 LIFTED BACK_NO_ROTATION UNSETTLED PENDING REFUSAL LATE+MOVE_DUE HELD_BACK STALE_EPOCH MOVE_ORDER "
+    "COPY_ORDER MOVE_NO_ROTATION UNDO UNDO_CLOSED EARLY_DELETE ROTATED_EARLY ANY_OPEN NEVER_FORGETS ANY_CONFIRM "
+    "CONFIRM_TWICE BEFORE_OPEN RECEIPT_FIRST RECEIPT_OTHER RECEIPT_COPY IMPORT_OLDER IMPORT_REPLACES COPY_DUE "
+    "COPY_UNAWARE COPY_CLOSED CONTINUED GIVEN_REQUEST GIVEN_OPEN GIVEN_COMMIT KEEPS_OLD SESSION MEASURED_ON ERASE",
+    RESTORED: "M6 OLD_PENDING BACKUP_TOMBSTONE",
+    RESET: "EPOCH_BACK SEQUENCE_BACK RESET_REPLAY RESET_UNPROVEN RESET_RAM RESET_FACTORY SESSION_RESET RESET_KEEPS "
+    "COMMIT_UNKEYED",
     Bounds(2, 1, commits=2): "SIGNER",
     Bounds(3, 1): "DROP_PENDING",
 }
-BY_TEST = {"M1", "M2", "M3", "M6", "PENDING", "REFUSAL", "LATE", "HELD_BACK", "OLD_PENDING", "MOVE_ORDER", "EPOCH_BACK"}
-BY_TEST |= {"SESSION", "ERASE"}
+HARMLESS = ("RECEIPT_ALL", "LATE", "MOVE_DUE", "IMPORT_TWICE", "EPOCH_UNCHECKED")
+"""Rules of the code without which nothing goes wrong in the model, as another rule does the same (README)."""
+BY_TEST = {"M1", "LIFTED", "BACK_NO_ROTATION", "UNSETTLED", "M6", "PENDING", "LATE+MOVE_DUE", "HELD_BACK"}
+BY_TEST |= {"MOVE_ORDER", "EPOCH_BACK", "CONTINUED", "GIVEN_COMMIT", "SESSION", "ERASE"}
 FOUND = [Run(bounds, rule) for bounds, rules in BROKEN.items() for rule in rules.split()]
 SMALL_RUNS = [
     Run(SMALL),
@@ -103,7 +108,7 @@ def check(run: Run, folder: Path) -> Outcome:
     began = time.monotonic()
     defines = [
         *run.bounds.defines(),
-        *([f"-DBREAK_{run.broken}"] if run.broken else []),
+        *(f"-DBREAK_{rule}" for rule in run.broken.split("+") if rule),
         *(f"-D{part}" for part in run.parts),
     ]
     _call(["spin", "-a", *defines, str(MODEL)], folder)
@@ -136,7 +141,7 @@ def tried(run: Run) -> Outcome:
 
 def told(run: Run, outcome: Outcome) -> bool:
     """Print the outcome of a run; whether it is as it should be."""
-    good = (outcome.errors > 0) == bool(run.broken)
+    good = (outcome.errors > 0) == (run.broken not in ("", *HARMLESS))
     found = "a violation" if outcome.errors else "no violation"
     verdict = "as it should be" if good else "WRONG"
     print(f"{run}: {found} in {outcome.states:,} states, {outcome.seconds:.1f} s: {verdict}", flush=True)
@@ -152,7 +157,8 @@ def main(arguments: list[str]) -> int:
     wrong = 0
     quick = "--quick" in arguments
     found = [run for run in FOUND if run.broken in BY_TEST] if quick else FOUND
-    small = [*SMALL_RUNS, *found]
+    harmless = [] if quick else [Run(SMALL, rule) for rule in HARMLESS]
+    small = [*SMALL_RUNS, *found, *harmless]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for run, outcome in zip(small, pool.map(tried, small), strict=True):
             wrong += not told(run, outcome)

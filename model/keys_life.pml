@@ -6,16 +6,18 @@
  * arrives at any later time) and doubled (it may arrive again). model/README.md maps each step to the code and says what
  * is left out.
  *
- * Rules that can be broken to see that the model notices (spin -DBREAK_M2 ...):
+ * Rules that can be broken to see that the model notices (spin -DBREAK_LIFTED ...); model/README.md explains the harmless ones:
  *   BREAK_M1      the sequence of a bundle is taken for true
- *   BREAK_M2      any trusted station lifts a tombstone, and no rotation is due after it
- *   BREAK_M3      a move exports the active key while an agreement is unsettled, and its receipt deletes every key
+ *   BREAK_LIFTED         any trusted station lifts a tombstone
+ *   BREAK_BACK_NO_ROTATION  a node that is handed back is used without a rotation
+ *   BREAK_UNSETTLED      a move exports the active key while an agreement is unsettled
+ *   BREAK_RECEIPT_ALL    a receipt deletes every key, not only the one that was in the bundle: harmless
  *   BREAK_M6      a store brought back from a backup is used as if nothing had happened since
  *   BREAK_PENDING the new key is stored after Confirm left, not before
  *   BREAK_HELD_BACK  an Open under the old key deletes the new one, whose Confirm was held back on the way
  *   BREAK_OLD_PENDING  any pending key that opens ends a due rotation, also one made before the rotation was due
  *   BREAK_REFUSAL a refused Open deletes the key that was tried
- *   BREAK_LATE    a late receipt deletes the key though the node has come back since
+ *   BREAK_LATE    (with MOVE_DUE) a late receipt deletes the key though the node has come back since
  *   BREAK_EPOCH_BACK     a reset puts the node's epoch back
  *   BREAK_SEQUENCE_BACK  a reset puts the node's sequence back
  *   BREAK_SIGNER         the signer does not look at the node's sequence
@@ -44,6 +46,22 @@
  *   BREAK_RESET_KEEPS    a reset leaves the node's key in flash
  *   BREAK_MEASURED_ON    a session goes on although the station has given the node away
  *   BREAK_ERASE          a node that was cut in Confirm does not erase the old key when it starts
+ *   BREAK_GIVEN_REQUEST  a station agrees on a key although it gave the node away
+ *   BREAK_GIVEN_OPEN     a station opens sessions although it gave the node away
+ *   BREAK_GIVEN_COMMIT   a station commits although it gave the node away
+ *   BREAK_COPY_DUE       a key is copied although a rotation is due
+ *   BREAK_MOVE_DUE       a key is moved although a rotation is due: harmless
+ *   BREAK_BACKUP_TOMBSTONE  a backup leaves out that a node was given away
+ *   BREAK_CONTINUED      an interrupted move is carried on to another receiver
+ *   BREAK_UNDO_CLOSED    a move is taken back although its receipt came
+ *   BREAK_COPY_UNAWARE   the receiver of a copy does not note that the sender has the key
+ *   BREAK_RECEIPT_COPY   the receipt of a copy deletes the key
+ *   BREAK_COPY_CLOSED    the receipt of a copy ends the note that its receiver has the key
+ *   BREAK_ANY_OPEN       an Open under any key ends a due rotation
+ *   BREAK_CONFIRM_TWICE  a Confirm does not use the agreement up
+ *   BREAK_COMMIT_UNKEYED a node takes a datasheet outside a session
+ *   BREAK_IMPORT_TWICE   a bundle that was taken in is taken in again: harmless
+ *   BREAK_EPOCH_UNCHECKED  a station takes an offered epoch that is not newer than its own: harmless
  */
 
 #ifndef AGREEMENTS
@@ -68,6 +86,73 @@
 #define BIT(k) (1 << (k))
 #define STEP 4			/* stands for the 65,536 that a node lets a sequence grow at once */
 #define LIE 9			/* what a lying bundle says of the sequence */
+
+/* ---- traces: with -DTRACED every step is printed with the state that it leaves (model/replay.py) -------------------- */
+#ifdef TRACED
+c_decl {
+	unsigned char path[64], aims[64];
+	/* A part of the step that SCRIPT ("step.station.aim step.station.aim ...") names for a turn, -1 behind its end. */
+	static int script_of(int turn, int part)
+	{
+		const char *at = getenv("SCRIPT");
+		for (; at != NULL && turn > 0; turn--) {
+			at = strchr(at, ' ');
+			at = at != NULL ? at + 1 : NULL;
+		}
+		for (; at != NULL && part > 0; part--) {
+			at = strchr(at, '.') + 1;
+		}
+		return at != NULL && *at != 0 ? atoi(at) : -1;
+	}
+	static int scripted(int turn) { return script_of(turn, 0) >= 0; }
+	/* Whether this step may come now: the script's own, and any behind its end up to DEPTH. */
+	static int wanted(int turn, int step, int station)
+	{
+		return scripted(turn) ? script_of(turn, 0) == step && script_of(turn, 1) == station : turn < atoi(getenv("DEPTH"));
+	}
+	static int aimed(int turn, int aim) { return !scripted(turn) || script_of(turn, 2) == aim; }
+}
+c_track "path" "64" "UnMatched";
+c_track "aims" "64" "UnMatched";
+byte turn, printed, last, aim;
+bool refused;
+short able;			/* bits 3 n + s: station s may take bundle n in; bits 9 + s: its Open would succeed */
+/* The brackets around a function keep SPIN from taking its call for a side effect. */
+#define MAY(step) (printed == turn && c_expr { (wanted)(now.turn, step, Pstation->s) })
+#define MAY_NODE(step) (printed == turn && c_expr { (wanted)(now.turn, step, 0) })
+#define DID(step, s) last = 4 * step + s; aim = 0; turn++; c_code { if (readtrail) printf("DID %d.%d\n", now.last / 4, now.last % 4); }
+#define AIM(n) aim = n; c_code { if (readtrail) printf("AIM %d\n", now.aim); }
+#define TO(n) c_expr { (aimed)(now.turn - 1, n) }	/* in the step itself; TO_NEXT: in the guard before it */
+#define TO_NEXT(n) c_expr { (aimed)(now.turn, n) }
+#else
+#define MAY(step) true
+#define MAY_NODE(step) true
+#define DID(step, s) skip
+#define AIM(n) skip
+#define TO(n) true
+#define TO_NEXT(n) true
+#endif
+/* Steps, as a trace numbers them. */
+#define CUT 0
+#define REQUEST 1
+#define STORE 2
+#define SEND_CONFIRM 3
+#define END_CONFIRM 4
+#define OPEN 5
+#define FORGET 6
+#define MOVE 7
+#define FILE 8
+#define FILE_AGAIN 9
+#define UNDO 10
+#define COPY 11
+#define IMPORT 12
+#define RECEIPT 13
+#define BACKUP 14
+#define RESTORE 15
+#define RESET 16
+#define PROOF 17
+#define CONFIRM 18
+#define LOST_RAM 19
 
 /* ---- the node ------------------------------------------------------------------------------------------------- */
 byte node_key, node_epoch, node_sequence;
@@ -113,7 +198,7 @@ byte backed_up = NOBODY;
 /* ---- stations: what a cut takes -------------------------------------------------------------------------------- */
 mtype = { idle, replied, stored, confirming, signed_, given };
 mtype at[STATIONS];
-#if defined(BREAK_SESSION) || defined(BREAK_SESSION_RESET) || defined(BREAK_MEASURED_ON)
+#if defined(BREAK_SESSION) || defined(BREAK_SESSION_RESET) || defined(BREAK_MEASURED_ON) || defined(BREAK_GIVEN_OPEN)
 #define SESSIONS_TOO
 #endif
 #ifdef SESSIONS_TOO
@@ -126,12 +211,16 @@ byte fresh[STATIONS];		/* the key of the agreement under way */
 byte number[STATIONS];		/* the sequence being written, or the bundle being made */
 
 /* ---- bundles ---------------------------------------------------------------------------------------------------- */
-typedef Bundle { byte sender; byte receiver; byte key; bool move; bool made; bool receipt }
+typedef Bundle {
+	byte sender; byte receiver; byte key; bool move; bool made; bool receipt;
+	bool due		/* for the properties: its sender was to rotate the key that left */
+}
 Bundle bundle[BUNDLES];
 byte bundles;
 
 /* ---- for the properties alone ----------------------------------------------------------------------------------- */
 byte given_to[STATIONS];	/* to whom it gave the node, until it is handed back, undone or rotated away */
+byte given_in_backup = NOBODY;	/* the same, as the backup knows it */
 bool restored;			/* a store was lost and came back older: keys may be gone (docs/profile.md, "What a cut leaves behind") */
 byte commits, restores, resets;
 byte wiped;			/* the key that the last reset took from the node */
@@ -144,6 +233,27 @@ byte wiped;			/* the key that the last reset took from the node */
 #endif
 #define USABLE(s) (UP && st[s].tombstone == NOBODY && KNOWN(s))
 #define FREE(s) (USABLE(s) && !st[s].due)
+#define OWNS(s) (given_to[s] == NOBODY)	/* it did not give the node away, or has it back */
+#ifdef BREAK_GIVEN_OPEN
+#define OPENS(s) (UP && KNOWN(s))
+#else
+#define OPENS(s) USABLE(s)
+#endif
+#ifdef BREAK_GIVEN_REQUEST
+#define AGREES(s) true
+#else
+#define AGREES(s) (st[s].tombstone == NOBODY)
+#endif
+#ifdef BREAK_GIVEN_COMMIT
+#define COMMITS_AS(s) (UP && KNOWN(s) && !st[s].due)
+#else
+#define COMMITS_AS(s) FREE(s)
+#endif
+#ifdef BREAK_EPOCH_UNCHECKED
+#define NEWER(s, k) true
+#else
+#define NEWER(s, k) (epoch_of[k] > epoch_of[st[s].present_key])
+#endif
 
 #ifdef SESSIONS_TOO
 inline cut(s) { at[s] = idle; fresh[s] = 0; number[s] = 0; session[s] = 0 }
@@ -154,18 +264,29 @@ inline done(s) { at[s] = idle; fresh[s] = 0; number[s] = 0 }
 
 inline demand_rotation(s) { st[s].due = true; st[s].due_since = keys }
 
-#ifdef BREAK_M3
+#ifdef BREAK_UNSETTLED
 #define SETTLED(s) true
 #else
 #define SETTLED(s) (st[s].held == BIT(st[s].present_key))
 #endif
+#ifdef BREAK_MOVE_DUE
+#define MOVES(s) true
+#else
+#define MOVES(s) !st[s].due
+#endif
+#ifdef BREAK_COPY_DUE
+#define COPIES(s) true
+#else
+#define COPIES(s) !st[s].due
+#endif
 
 inline select_receiver(s) {
 	if
-	:: s != 0 -> b = 0
-	:: s != 1 -> b = 1
-	:: s != 2 -> b = 2
-	fi
+	:: s != 0 && TO(0) -> b = 0
+	:: s != 1 && TO(1) -> b = 1
+	:: s != 2 && TO(2) -> b = 2
+	fi;
+	AIM(b)
 }
 
 /* No epoch goes back; and after a move only the station that the node went to may hand it back. */
@@ -175,13 +296,18 @@ inline select_receiver(s) {
 #define NOT_OLDER(s, n) (st[s].present_key == 0 || epoch_of[bundle[n].key] >= epoch_of[st[s].present_key])
 #endif
 #define HANDED_BACK(s, n) (bundle[n].move && bundle[n].sender == bundle[st[s].tombstone].receiver)
-#ifdef BREAK_M2
+#ifdef BREAK_LIFTED
 #define MAY_COME(s, n) true
 #else
 #define MAY_COME(s, n) (st[s].tombstone == NOBODY || HANDED_BACK(s, n))
 #endif
+#ifdef BREAK_IMPORT_TWICE
+#define NEW_HERE(s, n) true
+#else
+#define NEW_HERE(s, n) !(st[s].imported & BIT(n))
+#endif
 #define IMPORTABLE(s, n) (at[s] == idle && n < bundles && bundle[n].made && bundle[n].receiver == s && \
-	!(st[s].imported & BIT(n)) && NOT_OLDER(s, n) && MAY_COME(s, n))
+	NEW_HERE(s, n) && NOT_OLDER(s, n) && MAY_COME(s, n))
 
 inline take_in(s, n) {
 	if
@@ -190,19 +316,30 @@ inline take_in(s, n) {
 		:: HANDED_BACK(s, n) -> given_to[s] = NOBODY
 		:: else
 		fi;
-#ifndef BREAK_M2
-		demand_rotation(s);
+		st[s].tombstone = NOBODY;
+#ifdef BREAK_BACK_NO_ROTATION
+		back = true
 #endif
-		st[s].tombstone = NOBODY
 	:: else
 	fi;
 	if
 #ifdef BREAK_MOVE_NO_ROTATION
 	:: bundle[n].move
+#elif defined(BREAK_BACK_NO_ROTATION)
+	:: bundle[n].move ->
+		if
+		:: !back -> demand_rotation(s)
+		:: else
+		fi;
+		back = false
 #else
-	:: bundle[n].move -> demand_rotation(s)
+	:: bundle[n].move -> demand_rotation(s)		/* also where it is handed back */
 #endif
+#ifdef BREAK_COPY_UNAWARE
+	:: else
+#else
 	:: else -> st[s].shared = true
+#endif
 	fi;
 #ifdef BREAK_M1
 	st[s].sequence = LIE;
@@ -213,7 +350,7 @@ inline take_in(s, n) {
 	st[s].held = st[s].held | BIT(bundle[n].key);
 #endif
 	st[s].imported = st[s].imported | BIT(n);
-	bundle[n].receipt = true
+	bundle[n].receipt = true; bundle[n].due = bundle[n].due && !bundle[n].move	/* who takes a move in rotates it */
 }
 
 #ifdef BREAK_RECEIPT_FIRST
@@ -227,16 +364,21 @@ inline take_in(s, n) {
 inline close_handover(s, n) {
 	st[s].closed = st[s].closed | BIT(n);
 	if
+#ifdef BREAK_COPY_CLOSED
+	:: !bundle[n].move -> st[s].shared = false
+#endif
 #ifdef BREAK_LATE
 	:: bundle[n].move && !(st[s].undone & BIT(n)) ->
 #elif defined(BREAK_RECEIPT_OTHER)
 	:: st[s].tombstone != NOBODY ->		/* whichever stands */
 		st[s].closed = st[s].closed | BIT(st[s].tombstone);
 		st[s].held = st[s].held & ~BIT(bundle[st[s].tombstone].key);
+#elif defined(BREAK_RECEIPT_COPY)
+	:: !bundle[n].move || st[s].tombstone == n ->
 #else
 	:: bundle[n].move && st[s].tombstone == n ->	/* only while this very move stands */
 #endif
-#ifdef BREAK_M3
+#ifdef BREAK_RECEIPT_ALL
 		st[s].held = 0; st[s].present_key = 0
 #else
 		st[s].held = st[s].held & ~BIT(bundle[n].key);	/* the key that was in the bundle, no other */
@@ -249,8 +391,14 @@ inline close_handover(s, n) {
 	fi
 }
 
+#ifdef BREAK_BACKUP_TOMBSTONE
+#define COPY_TOMBSTONE(to, from) to.tombstone = NOBODY
+#else
+#define COPY_TOMBSTONE(to, from) to.tombstone = from.tombstone
+#endif
+
 inline copy(to, from) {
-	to.present_key = from.present_key; to.held = from.held; to.sequence = from.sequence; to.tombstone = from.tombstone;
+	to.present_key = from.present_key; to.held = from.held; to.sequence = from.sequence; COPY_TOMBSTONE(to, from);
 	to.due = from.due; to.due_since = from.due_since; to.shared = from.shared; to.imported = from.imported;
 	to.closed = from.closed; to.undone = from.undone
 }
@@ -285,25 +433,31 @@ inline keep_newer(s) {
 proctype station(byte s)
 {
 	byte b;
+#ifdef BREAK_BACK_NO_ROTATION
+	bool back;
+#endif
 end:
 	do
 	/* -- power goes ------------------------------------------------------------------------------------------- */
-	:: atomic { at[s] != idle -> cut(s) }
+	:: atomic { MAY(CUT) && at[s] != idle -> DID(CUT, s); cut(s) }
 
 	/* -- agreement, first or rotation: Request and its reply (128.1), by tap or in a session -------------------- */
-	:: atomic { UP && at[s] == idle && st[s].tombstone == NOBODY && keys < KEYS &&
+	:: atomic { MAY(REQUEST) && UP && at[s] == idle && AGREES(s) && keys < KEYS &&
 		(keys > 1 || s == 0) ->	/* who begins makes no difference: stations are alike */
+		DID(REQUEST, s);
+		assert(OWNS(s));		/* who gave a node away does not agree with it */
 		ram = keys; epoch_of[keys] = node_epoch + 1; maker[keys] = s;
 		if
-		:: epoch_of[keys] > epoch_of[st[s].present_key] -> fresh[s] = keys; at[s] = replied
-		:: skip			/* the reply is lost, or its epoch is not newer */
+		:: NEWER(s, keys) && TO(1) -> AIM(1); fresh[s] = keys; at[s] = replied
+		:: TO(0) -> AIM(0)	/* the reply is lost, or its epoch is not newer */
 		fi;
 		keys++ }
 #ifdef BREAK_PENDING
-	:: atomic { at[s] == replied -> confirm_sent[fresh[s]] = true; at[s] = stored }
-	:: atomic { at[s] == stored -> st[s].held = st[s].held | BIT(fresh[s]); at[s] = confirming }
+	:: atomic { MAY(SEND_CONFIRM) && at[s] == replied -> DID(SEND_CONFIRM, s); confirm_sent[fresh[s]] = true; at[s] = stored }
+	:: atomic { MAY(STORE) && at[s] == stored -> DID(STORE, s); st[s].held = st[s].held | BIT(fresh[s]); at[s] = confirming }
 #else
-	:: atomic { at[s] == replied ->
+	:: atomic { MAY(STORE) && at[s] == replied ->
+		DID(STORE, s);
 #ifdef BREAK_EARLY_DELETE
 		st[s].held = 0; st[s].present_key = fresh[s];
 #endif
@@ -314,29 +468,38 @@ end:
 		st[s].due = false; st[s].shared = false; given_to[s] = NOBODY;
 #endif
 		st[s].held = st[s].held | BIT(fresh[s]); at[s] = stored }
-	:: atomic { at[s] == stored -> confirm_sent[fresh[s]] = true; at[s] = confirming }
+	:: atomic { MAY(SEND_CONFIRM) && at[s] == stored -> DID(SEND_CONFIRM, s); confirm_sent[fresh[s]] = true; at[s] = confirming }
 #endif
 #ifdef BREAK_BEFORE_OPEN
-	:: atomic { at[s] == confirming -> st[s].held = BIT(fresh[s]); st[s].present_key = fresh[s]; cut(s) }
+	:: atomic { MAY(END_CONFIRM) && at[s] == confirming -> DID(END_CONFIRM, s); st[s].held = BIT(fresh[s]); st[s].present_key = fresh[s]; cut(s) }
 #endif
-	:: atomic { at[s] == confirming -> cut(s) }	/* the reply came or not: an Open tells */
+	:: atomic { MAY(END_CONFIRM) && at[s] == confirming -> DID(END_CONFIRM, s); cut(s) }	/* the reply came or not: an Open tells */
 
 	/* -- Open under each key held, newest pending first: one succeeds --------------------------------------------- */
-	:: atomic { at[s] == idle && USABLE(s) && (st[s].present_key != node_key || OLDER_HELD(s)) ->
+	:: atomic { MAY(OPEN) && at[s] == idle && OPENS(s) && (st[s].present_key != node_key || OLDER_HELD(s)) ->
+		DID(OPEN, s);
+		assert(OWNS(s));			/* who gave a node away does not open a session with it */
 		assert(epoch_of[node_key] >= epoch_of[st[s].present_key]);	/* no epoch goes back at a station either */
 		st[s].present_key = node_key;
 		keep_newer(s);			/* now, and only now, others are deleted */
 		if
+#ifdef BREAK_ANY_OPEN
+		:: true ->
+#else
 		:: maker[node_key] == s && MADE_SINCE(s) ->
+#endif
 			st[s].due = false; st[s].shared = false; given_to[s] = NOBODY
+#ifndef BREAK_ANY_OPEN
 		:: else
+#endif
 		fi;
 		if
 		:: node_sequence > st[s].sequence -> st[s].sequence = node_sequence
 		:: else
 		fi }
 	/* 60 seconds after its Request the node has forgotten it: a newer key that did not open goes after all */
-	:: atomic { at[s] == idle && USABLE(s) && st[s].present_key == node_key && st[s].held != BIT(node_key) ->
+	:: atomic { MAY(FORGET) && at[s] == idle && USABLE(s) && st[s].present_key == node_key && st[s].held != BIT(node_key) ->
+		DID(FORGET, s);
 #ifndef BREAK_NEVER_FORGETS
 		if
 		:: ram != 0 && HOLDS(s, ram) -> ram = 0
@@ -346,7 +509,8 @@ end:
 		st[s].held = BIT(node_key) }
 #ifdef SESSIONS_TOO
 	/* -- a session, under the key that the node has now ----------------------------------------------------------- */
-	:: atomic { at[s] == idle && FREE(s) && st[s].present_key == node_key && session[s] == 0 -> session[s] = node_key }
+	:: atomic { at[s] == idle && OPENS(s) && !st[s].due && st[s].present_key == node_key && session[s] == 0 ->
+		session[s] = node_key }
 	:: atomic { session[s] != 0 && at[s] == idle -> session[s] = 0 }
 #endif
 #ifdef BREAK_REFUSAL
@@ -355,7 +519,7 @@ end:
 #endif
 
 	/* -- sign and commit, in a session ---------------------------------------------------------------------------- */
-	:: atomic { at[s] == idle && FREE(s) && st[s].present_key == node_key && commits < COMMITS ->
+	:: atomic { at[s] == idle && COMMITS_AS(s) && st[s].present_key == node_key && commits < COMMITS ->
 		commits++;
 #ifdef BREAK_SIGNER
 		st[s].sequence = st[s].sequence + 1;
@@ -364,7 +528,13 @@ end:
 #endif
 		assert(st[s].sequence > node_sequence);	/* signed in a session, it is newer than what the node has */
 		number[s] = st[s].sequence; fresh[s] = node_key; at[s] = signed_ }
+#if defined(BREAK_COMMIT_UNKEYED)
+	:: atomic { at[s] == signed_ && UP ->
+#elif defined(BREAK_GIVEN_COMMIT)
+	:: atomic { at[s] == signed_ && UP && KNOWN(s) ->
+#else
 	:: atomic { at[s] == signed_ && USABLE(s) ->
+#endif
 		assert(number[s] <= node_sequence + STEP);	/* else the node refuses for ever (7) */
 		if
 #ifdef BREAK_STALE_EPOCH
@@ -374,16 +544,19 @@ end:
 #endif
 			assert(epoch_of[fresh[s]] == node_epoch);	/* a datasheet is of the epoch that it names */
 			assert(number[s] > top_sequence);	/* no sequence goes back */
+			assert(HOLDS(s, node_key) && OWNS(s));	/* nobody commits but who has the node */
 			node_sequence = number[s]; top_sequence = number[s]
 		:: else					/* stale: somebody else was faster; sign again */
 		fi;
 		done(s) }
 
 	/* -- move: the tombstone before the file ------------------------------------------------------------------------ */
-	:: atomic { at[s] == idle && st[s].tombstone == NOBODY && st[s].present_key != 0 && bundles < BUNDLES && SETTLED(s) ->
+	:: atomic { MAY(MOVE) && at[s] == idle && st[s].tombstone == NOBODY && st[s].present_key != 0 && bundles < BUNDLES &&
+		SETTLED(s) && MOVES(s) ->
+		DID(MOVE, s);
 		select_receiver(s);
 		bundle[bundles].sender = s; bundle[bundles].receiver = b; bundle[bundles].key = st[s].present_key;
-		bundle[bundles].move = true; given_to[s] = b;
+		bundle[bundles].move = true; bundle[bundles].due = st[s].due; given_to[s] = b;
 #ifdef BREAK_MOVE_ORDER
 		bundle[bundles].made = true;
 #else
@@ -394,63 +567,82 @@ end:
 #endif
 		number[s] = bundles; at[s] = given; bundles++ }
 #ifdef BREAK_MOVE_ORDER
-	:: atomic { at[s] == given -> st[s].tombstone = number[s]; done(s) }
+	:: atomic { MAY(FILE) && at[s] == given -> DID(FILE, s); st[s].tombstone = number[s]; done(s) }
 #else
-	:: atomic { at[s] == given -> bundle[number[s]].made = true; done(s) }
+	:: atomic { MAY(FILE) && at[s] == given -> DID(FILE, s); bundle[number[s]].made = true; done(s) }
 #endif
 	/* cut between the two: the same move again makes the file */
-	:: atomic { at[s] == idle && st[s].tombstone != NOBODY && !bundle[st[s].tombstone].made ->
+	:: atomic { MAY(FILE_AGAIN) && at[s] == idle && st[s].tombstone != NOBODY && !bundle[st[s].tombstone].made ->
+		DID(FILE_AGAIN, s);
+#ifdef BREAK_CONTINUED
+		select_receiver(s);
+		bundle[st[s].tombstone].receiver = b;
+#endif
 		bundle[st[s].tombstone].made = true }
 	/* undo, before the receipt */
-	:: atomic { at[s] == idle && st[s].tombstone != NOBODY && !(st[s].closed & BIT(st[s].tombstone)) ->
+#ifdef BREAK_UNDO_CLOSED
+	:: atomic { MAY(UNDO) && at[s] == idle && st[s].tombstone != NOBODY ->
+#else
+	:: atomic { MAY(UNDO) && at[s] == idle && st[s].tombstone != NOBODY && !(st[s].closed & BIT(st[s].tombstone)) ->
+#endif
+		DID(UNDO, s);
 		st[s].undone = st[s].undone | BIT(st[s].tombstone);
+		if
+		:: !(st[s].closed & BIT(st[s].tombstone)) -> given_to[s] = NOBODY
+		:: else
+		fi;
 #ifndef BREAK_UNDO
 		demand_rotation(s);
 #endif
-		st[s].tombstone = NOBODY; given_to[s] = NOBODY }
+		st[s].tombstone = NOBODY }
 
 	/* -- copy: noted before the file ----------------------------------------------------------------------------------- */
-	:: atomic { at[s] == idle && st[s].tombstone == NOBODY && st[s].present_key != 0 && !st[s].due && bundles < BUNDLES &&
-		st[s].held == BIT(st[s].present_key) ->
+	:: atomic { MAY(COPY) && at[s] == idle && st[s].tombstone == NOBODY && st[s].present_key != 0 && COPIES(s) &&
+		bundles < BUNDLES ->
+		DID(COPY, s);
 		select_receiver(s);
 		bundle[bundles].sender = s; bundle[bundles].receiver = b; bundle[bundles].key = st[s].present_key;
+		bundle[bundles].due = st[s].due;
 #ifdef BREAK_COPY_ORDER
 		bundle[bundles].made = true; number[s] = bundles; at[s] = given; bundles++ }
-	:: atomic { at[s] == given && !bundle[number[s]].move -> st[s].shared = true; done(s) }
+	:: atomic { MAY(FILE) && at[s] == given && !bundle[number[s]].move -> DID(FILE, s); st[s].shared = true; done(s) }
 #else
 		bundle[bundles].made = true; st[s].shared = true; bundles++ }
 #endif
 
 	/* -- import, at any time, once: the file may come late, and again after that ------------------------------------- */
-	:: atomic { IMPORTABLE(s, 0) -> take_in(s, 0) }
+	:: atomic { MAY(IMPORT) && TO_NEXT(0) && IMPORTABLE(s, 0) -> DID(IMPORT, s); AIM(0); take_in(s, 0) }
 #if BUNDLES > 1
-	:: atomic { IMPORTABLE(s, 1) -> take_in(s, 1) }
+	:: atomic { MAY(IMPORT) && TO_NEXT(1) && IMPORTABLE(s, 1) -> DID(IMPORT, s); AIM(1); take_in(s, 1) }
 #endif
 #if BUNDLES > 2
-	:: atomic { IMPORTABLE(s, 2) -> take_in(s, 2) }
+	:: atomic { MAY(IMPORT) && TO_NEXT(2) && IMPORTABLE(s, 2) -> DID(IMPORT, s); AIM(2); take_in(s, 2) }
 #endif
 
 	/* -- the receipt, at any time --------------------------------------------------------------------------------------- */
-	:: atomic { RECEIVABLE(s, 0) -> close_handover(s, 0) }
+	:: atomic { MAY(RECEIPT) && TO_NEXT(0) && RECEIVABLE(s, 0) -> DID(RECEIPT, s); AIM(0); close_handover(s, 0) }
 #if BUNDLES > 1
-	:: atomic { RECEIVABLE(s, 1) -> close_handover(s, 1) }
+	:: atomic { MAY(RECEIPT) && TO_NEXT(1) && RECEIVABLE(s, 1) -> DID(RECEIPT, s); AIM(1); close_handover(s, 1) }
 #endif
 #if BUNDLES > 2
-	:: atomic { RECEIVABLE(s, 2) -> close_handover(s, 2) }
+	:: atomic { MAY(RECEIPT) && TO_NEXT(2) && RECEIVABLE(s, 2) -> DID(RECEIPT, s); AIM(2); close_handover(s, 2) }
 #endif
 
 	/* -- a backup is made; later the store is lost and the backup is all that is left --------------------------------------- */
-	:: atomic { at[s] == idle && backed_up == NOBODY && RESTORES && st[s].present_key != 0 ->
-		backed_up = s; copy(snapshot, st[s]) }
-	:: atomic { backed_up == s && restores < RESTORES ->
-		restores++; restored = true; cut(s); copy(st[s], snapshot);
+	:: atomic { MAY(BACKUP) && at[s] == idle && backed_up == NOBODY && RESTORES && st[s].present_key != 0 ->
+		DID(BACKUP, s);
+		backed_up = s; given_in_backup = given_to[s]; copy(snapshot, st[s]) }
+	:: atomic { MAY(RESTORE) && backed_up == s && restores < RESTORES ->
+		DID(RESTORE, s);
+		restores++; restored = true; cut(s); copy(st[s], snapshot); given_to[s] = given_in_backup;
 #ifndef BREAK_M6
 		demand_rotation(s)
 #endif
 		}
 
 	/* -- reset, by hand or in a session: the node forgets its key, never epoch and sequence ------------------------------------ */
-	:: atomic { UP && resets < RESETS && node_key != 0 ->
+	:: atomic { MAY(RESET) && UP && resets < RESETS && node_key != 0 ->
+		DID(RESET, s);
 		resets++; wiped = node_key; overtaken = ram;
 #ifndef BREAK_RESET_KEEPS
 		node_key = 0;
@@ -476,7 +668,8 @@ end:
 #else
 #define SHOWS_RESET (UP && resets > 0 && node_key == 0)
 #endif
-	:: atomic { SHOWS_RESET && at[s] == idle && st[s].present_key != 0 && st[s].tombstone == NOBODY ->
+	:: atomic { MAY(PROOF) && SHOWS_RESET && at[s] == idle && st[s].present_key != 0 && st[s].tombstone == NOBODY ->
+		DID(PROOF, s);
 #if !defined(BREAK_RESET_FACTORY) && !defined(BREAK_RESET_REPLAY) && !defined(BREAK_RESET_UNPROVEN)
 		ram = 0;		/* the Reset that brings the proof ends an agreement under way, in factory state too */
 #endif
@@ -491,10 +684,11 @@ end:
 	do
 	/* Confirm (128.2): one flash transaction; a doubled or late one finds nothing pending */
 #ifdef BREAK_ANY_CONFIRM
-	:: atomic { UP && ram != 0 && (confirm_sent[ram] || confirm_sent[ram - 1]) ->
+	:: atomic { MAY_NODE(CONFIRM) && UP && ram != 0 && (confirm_sent[ram] || confirm_sent[ram - 1]) ->
 #else
-	:: atomic { UP && ram != 0 && confirm_sent[ram] ->
+	:: atomic { MAY_NODE(CONFIRM) && UP && ram != 0 && confirm_sent[ram] ->
 #endif
+		DID(CONFIRM, 0);
 		assert(epoch_of[ram] > top_epoch);	/* no epoch goes back, and none is given twice */
 		assert(ram != overtaken);		/* a reset ends what was begun before it */
 #ifdef BREAK_KEEPS_OLD
@@ -509,7 +703,11 @@ end:
 #ifndef BREAK_SESSION
 		END_SESSIONS;
 #endif
-		node_key = ram; node_epoch = epoch_of[ram]; top_epoch = node_epoch; ram = 0 }
+		node_key = ram; node_epoch = epoch_of[ram]; top_epoch = node_epoch;
+#ifndef BREAK_CONFIRM_TWICE
+		ram = 0
+#endif
+		}
 #ifdef SLOTS
 	:: atomic { booting ->
 #ifndef BREAK_ERASE
@@ -518,7 +716,7 @@ end:
 		booting = false }
 #endif
 	/* a cut, a lost link, 60 seconds: what lay in RAM is gone */
-	:: atomic { ram != 0 -> ram = 0 }
+	:: atomic { MAY_NODE(LOST_RAM) && ram != 0 -> DID(LOST_RAM, 0); ram = 0 }
 	od
 }
 
@@ -538,12 +736,64 @@ end:
 #ifdef SESSIONS_TOO
 #define OUTLIVED(s) (session[s] != 0 && (session[s] != node_key || given_to[s] != NOBODY))
 #endif
+/* Whoever uses a key was not given it by a station that is to rotate it, nor was it carried to two stations by a move. */
+#define WAS_DUE(s, n) (n < bundles && bundle[n].due && bundle[n].receiver == s && (st[s].imported & BIT(n)) && \
+	bundle[n].key == node_key)
+#define ASTRAY(n) (n < bundles && bundle[n].made && bundle[n].move && st[bundle[n].sender].tombstone == n && \
+	given_to[bundle[n].sender] != bundle[n].receiver)
+#if BUNDLES > 2
+#define HAD_DUE(s) (WAS_DUE(s, 0) || WAS_DUE(s, 1) || WAS_DUE(s, 2))
+#define ANY_ASTRAY (ASTRAY(0) || ASTRAY(1) || ASTRAY(2))
+#elif BUNDLES > 1
+#define HAD_DUE(s) (WAS_DUE(s, 0) || WAS_DUE(s, 1))
+#define ANY_ASTRAY (ASTRAY(0) || ASTRAY(1))
+#else
+#define HAD_DUE(s) WAS_DUE(s, 0)
+#define ANY_ASTRAY ASTRAY(0)
+#endif
 #define TWO_OWNERS(x, y) (FREE(x) && FREE(y) && !(st[x].shared && st[y].shared))
+
+#ifdef TRACED
+#define TAKES(s, n) if \
+	:: IMPORTABLE(s, n) -> able = able | (1 << (3 * n + s)) \
+	:: else \
+	fi
+#define ENTERS(s) if \
+	:: at[s] == idle && USABLE(s) -> able = able | (1 << (9 + s)) \
+	:: else \
+	fi
+#define PRINT(s) printf(" %d:%d:%d:%d:%d:%d:%d:%d", now.st[s].present_key, now.st[s].held, now.st[s].tombstone, \
+	now.st[s].due, now.st[s].shared, now.st[s].imported, now.st[s].closed, now.at[s])
+#endif
 
 active proctype watch()
 {
 end:
 	do
+#ifdef TRACED
+	:: atomic { timeout && c_expr { (scripted)(now.turn) } -> refused = true; turn++ }
+	:: atomic { printed != turn ->
+		TAKES(0, 0); TAKES(1, 0); TAKES(2, 0);
+#if BUNDLES > 1
+		TAKES(0, 1); TAKES(1, 1); TAKES(2, 1);
+#endif
+#if BUNDLES > 2
+		TAKES(0, 2); TAKES(1, 2); TAKES(2, 2);
+#endif
+		ENTERS(0); ENTERS(1); ENTERS(2);
+		c_code {
+			path[now.turn - 1] = now.refused ? 255 : now.last;
+			aims[now.turn - 1] = now.aim;
+			printf("STATE");
+			for (int i = 0; i < now.turn; i++) {
+				printf(" %d.%d.%d", path[i] / 4, path[i] % 4, aims[i]);
+			}
+			printf(" | %d:%d:%d:%d", now.node_key, now.node_epoch, now.ram, now.able);
+			PRINT(0); PRINT(1); PRINT(2);
+			printf("\n");
+		};
+		able = 0; refused = false; printed = turn }
+#endif
 	:: atomic { TWO_OWNERS(0, 1) || TWO_OWNERS(0, 2) || TWO_OWNERS(1, 2) -> assert(false) }	/* never two owners without a rotation due */
 	:: atomic { (given_to[0] != NOBODY && FREE(0)) || (given_to[1] != NOBODY && FREE(1)) ||
 		(given_to[2] != NOBODY && FREE(2)) -> assert(false) }	/* who gave a node away does not use it */
@@ -551,6 +801,8 @@ end:
 #ifdef SESSIONS_TOO
 	:: atomic { OUTLIVED(0) || OUTLIVED(1) || OUTLIVED(2) -> assert(false) }	/* no session outlives its key, or a move */
 #endif
+	:: atomic { (FREE(0) && HAD_DUE(0)) || (FREE(1) && HAD_DUE(1)) || (FREE(2) && HAD_DUE(2)) -> assert(false) }	/* no key is given to others that its station is to rotate */
+	:: atomic { ANY_ASTRAY -> assert(false) }	/* a move's file is for the station that its tombstone names */
 	:: atomic { wiped != 0 && node_key == wiped -> assert(false) }	/* what a reset took is no key any more */
 #ifdef SLOTS
 	:: atomic { !booting && residue -> assert(false) }	/* a node that answers has one key in its flash */
