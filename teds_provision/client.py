@@ -17,11 +17,11 @@ import os
 import selectors
 import socket
 import ssl
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Unpack
 from urllib.parse import quote, urlencode, urlsplit
 
 from teds_provision.errors import EXIT_CODES, LinkError, PolicyError, TedsProvisionError, UsageError
@@ -41,7 +41,8 @@ if TYPE_CHECKING:
         SheetPlan,
         Status,
     )
-    from teds_provision.api.bodies import Kind, Mode
+    from teds_provision.api.bodies import Mode
+    from teds_provision.shapes.measurement import MeasurementMembers
 
 API: Final = "/api/v1"
 SOCKET: Final = "ncap.sock"
@@ -326,40 +327,12 @@ class Client:
         """Return the measurements."""
         return list(self.request("GET", "/measurements")["measurements"])
 
-    def measure(
-        self,
-        *uuids: str,
-        group: str | None = None,
-        match: str | None = None,
-        frozen: bool = False,
-        channels: Sequence[int] = (),
-        rate: float | None = None,
-        kind: Kind | None = None,
-        trigger: bool = False,
-        sinks: Sequence[str] = (),
-        actuators: bool = True,
-        dead_man: int | None = None,
-        scalar_rate: float | None = None,
-    ) -> Measurement:
+    def measure(self, *uuids: str, **settings: Unpack[MeasurementMembers]) -> Measurement:
         """Measure nodes, a ``group``, or nodes that ``match`` selects as they come, from now on.
 
         ``rate`` and ``scalar_rate`` in Hz, ``dead_man`` in ms. ``frozen``: the members are fixed at the start.
         """
-        body = {
-            "uuids": uuids,
-            "group": group,
-            "match": match,
-            "frozen": frozen,
-            "channels": channels,
-            "rate": rate,
-            "kind": kind,
-            "trigger": trigger,
-            "sinks": sinks,
-            "actuators": actuators,
-            "dead_man": dead_man,
-            "scalar_rate": scalar_rate,
-        }
-        found: Measurement = self.request("POST", "/measurements", body)
+        found: Measurement = self.request("POST", "/measurements", {"uuids": uuids} | settings)
         return found
 
     def end_measurement(self, measurement_id: str) -> None:

@@ -19,9 +19,10 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # Room: the rooms that it may import. All may import errors, lazy, limits, sanitize, itself, and all but protocol also
 # files and portable.
 WITHOUT_FILES = {"errors", "sanitize", "lazy", "limits", "portable", "protocol"}
-_BELOW_TALK = {"station", "links", "vault", "protocol", "teds"}
+_BELOW_TALK = {"station", "links", "vault", "protocol", "teds", "shapes"}
 ARROWS = {
-    "api": set(),
+    "shapes": set(),
+    "api": {"shapes"},
     "errors": set(),
     "files": set(),
     "portable": set(),
@@ -33,7 +34,7 @@ ARROWS = {
     "protocol": {"teds"},
     "links": {"protocol", "teds"},
     "vault": {"protocol", "teds"},
-    "station": {"vault", "protocol", "teds"},
+    "station": {"vault", "protocol", "teds", "shapes"},
     "node": {"links", "protocol", "teds", "firmware_image"},
     "trace": {"links", "protocol", "teds"},
     "talk": _BELOW_TALK,
@@ -41,7 +42,7 @@ ARROWS = {
     "handover": _BELOW_TALK | {"talk", "steps"},
     "plant": _BELOW_TALK | {"talk", "steps", "handover"},
     "measure": _BELOW_TALK | {"talk", "steps", "handover"},
-    "client": {"api"},
+    "client": {"api", "shapes"},
     "describe": _BELOW_TALK | {"talk", "steps", "handover", "measure", "api"},
     "ncap": _BELOW_TALK | {"talk", "steps", "handover", "plant", "measure", "node", "client", "api", "describe"},
     "check": _BELOW_TALK | {"talk", "steps"},

@@ -8,7 +8,8 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 from teds_provision.api.bodies import Mode
-from teds_provision.api.schema import Meta
+from teds_provision.shapes.measurement import MeasurementSettings
+from teds_provision.shapes.metadata import Meta
 
 Uuid = Annotated[str, Meta(pattern="^[0-9a-f]{20}$", description="20 hex digits")]
 Time = Annotated[float, Meta(description="unix seconds")]
@@ -224,23 +225,12 @@ class Process(TypedDict):
     started: Annotated[int, Meta(description="unix seconds")]
 
 
-class Measurement(TypedDict):
+class Measurement(MeasurementSettings):
     """A measurement, kept until it is deleted."""
 
     id: str
-    group: str | None
-    match: Annotated[str | None, Meta(description="expression of the nodes to measure; uuids are those that match now")]
-    frozen: bool
     uuids: list[Uuid]
-    channels: NotRequired[list[int]]
-    rate: float | None
-    kind: str | None
-    trigger: bool
-    sinks: list[str]
-    actuators: Annotated[bool, Meta(description="whether set points arrive by topics")]
-    dead_man: NotRequired[Annotated[int, Meta(description="ms after which an actuator without set points is safe")]]
     created: NotRequired[str]
-    scalar_rate: Annotated[float, Meta(description="messages/s on a topic of one value")]
     owner: Annotated[str, Meta(description="ncap, page, api:TOKEN, or command: a measure command of this home")]
     process: Annotated[Process | None, Meta(description="of a command; it ends with its process")]
     state: Literal["starting", "waiting", "running", "failed", "ended"]

@@ -6,18 +6,17 @@ this name be taken) are not here: they have separate error codes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Final, Literal
+from dataclasses import dataclass, field, make_dataclass
+from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 
-from teds_provision.api.schema import Meta
+from teds_provision.shapes.measurement import HINTS, PUBLISHED
+from teds_provision.shapes.metadata import Meta
 
 LONGEST_HOLD: Final = 60.0
 """Seconds for which one request holds an actuator, at most."""
 _LARGEST: Final = 1e300
 
 Mode = Literal["transparent", "whitelist"]
-Kind = Literal["periodic", "event", "free"]
-Number = Annotated[int, Meta(minimum=1, maximum=255)]
 ProfileName = Annotated[
     str,
     Meta(
@@ -113,41 +112,33 @@ class GroupMembers:
     uuids: list[str]
 
 
-@dataclass(frozen=True)
-class NewMeasurement:
-    """POST /measurements."""
+def _body_member(name: str) -> tuple[str, Any, Any]:
+    """Return a setting of a measurement as a member of its body: what may be left out may be null, but for a list."""
+    hint = HINTS[name]
+    if name == "uuids":
+        return name, hint, field(default_factory=list)
+    whole = get_args(hint)[0]
+    return name, hint if type(None) in get_args(whole) else hint | None, field(default=None)
 
-    group: str | None = None
-    uuids: list[str] = field(default_factory=list)
-    match: (
-        Annotated[
-            str,
-            Meta(
-                minLength=1,
-                maxLength=1000,
-                description="measure each node that comes: all, type:P, name:GLOB, group:G, …",
-            ),
-        ]
-        | None
-    ) = None
-    frozen: Annotated[bool, Meta(description="no node joins later, and no writer has one released")] | None = None
-    channels: list[Number] | None = None
-    rate: Annotated[float, Meta(minimum=0.001, maximum=1e6, description="Hz, else the datasheet's")] | None = None
-    kind: Kind | None = None
-    trigger: bool | None = None
-    sinks: list[Annotated[str, Meta(description="ros1, ros2, the name of a broker, or of a file")]] | None = None
-    actuators: Annotated[bool, Meta(description="may set points arrive by ROS topics; true by default")] | None = None
-    dead_man: Annotated[int, Meta(minimum=20, maximum=10_000, description="ms, else the station's")] | None = None
-    scalar_rate: Annotated[float, Meta(minimum=0, maximum=1000, description="Hz, 10 by default")] | None = None
 
-    RULE: ClassVar = Meta(
-        oneOf=[
-            {"required": ["group"], "properties": {"group": {"type": "string"}}},
-            {"required": ["uuids"], "properties": {"uuids": {"type": "array", "minItems": 1}}},
-            {"required": ["match"], "properties": {"match": {"type": "string"}}},
-        ],
-        description='A measurement needs one of "group", "uuids" and "match".',
-    )
+NewMeasurement: Final[Any] = make_dataclass(
+    "NewMeasurement",
+    [_body_member(name) for name in PUBLISHED],
+    frozen=True,
+    namespace={
+        "__doc__": "POST /measurements.",
+        "__module__": __name__,
+        "RULE": Meta(
+            oneOf=[
+                {"required": ["group"], "properties": {"group": {"type": "string"}}},
+                {"required": ["uuids"], "properties": {"uuids": {"type": "array", "minItems": 1}}},
+                {"required": ["match"], "properties": {"match": {"type": "string"}}},
+            ],
+            description='A measurement needs one of "group", "uuids" and "match".',
+        ),
+    },
+)
+"""POST /measurements: the settings of a measurement (shapes/measurement.py)."""
 
 
 @dataclass(frozen=True)

@@ -26,16 +26,11 @@ from typing import (
     is_typeddict,
 )
 
+from teds_provision.shapes.metadata import Meta
+
 Schema = dict[str, Any]
 Shape = TypeVar("Shape")
 """A dataclass of ``bodies``."""
-
-
-class Meta:
-    """Schema keywords beside the type: ``Annotated[float, Meta(minimum=0)]``."""
-
-    def __init__(self, **facts: Any) -> None:
-        self.facts = facts
 
 
 class BadRequestError(ValueError):
@@ -46,7 +41,15 @@ class BadRequestError(ValueError):
         self.message, self.hint = message, hint
 
 
-_PLAIN: Final = {str: "string", int: "integer", float: "number", bool: "boolean", dict: "object", Any: None}
+_PLAIN: Final = {
+    str: "string",
+    bytes: "string",
+    int: "integer",
+    float: "number",
+    bool: "boolean",
+    dict: "object",
+    Any: None,
+}
 
 
 def schema_of(shape: Any, named: dict[str, Schema]) -> Schema:
@@ -75,8 +78,10 @@ def schema_of(shape: Any, named: dict[str, Schema]) -> Schema:
         return found | ({"required": required} if required else {}) | rule.facts
     origin, inner = get_origin(shape), get_args(shape)
     if origin is Annotated:
-        meta: Meta = inner[1]
-        return schema_of(inner[0], named) | meta.facts
+        facts: Schema = {}
+        for fact in inner[1:]:
+            facts |= fact.facts if isinstance(fact, Meta) else {}
+        return schema_of(inner[0], named) | facts
     if origin is NotRequired:
         return schema_of(inner[0], named)
     if origin is Literal:
@@ -88,7 +93,7 @@ def schema_of(shape: Any, named: dict[str, Schema]) -> Schema:
             return {"anyOf": [found, {"type": "null"}]}
         either: Schema = {**found, "type": [found["type"], "null"]}
         return either | ({"enum": [*found["enum"], None]} if "enum" in found else {})
-    if origin is list:
+    if origin in (list, tuple):
         return {"type": "array", "items": schema_of(inner[0], named)}
     kind = _PLAIN[origin or shape]
     return {} if kind is None else {"type": kind}

@@ -20,19 +20,18 @@ from teds_provision import talk, teds
 from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
-    ChannelName,
-    FileToRead,
     Number,
-    WholeNumber,
     command,
     file_units_option,
     link_options,
 )
 from teds_provision.cli.sample import ending, over_the_bus, where_met
+from teds_provision.cli.shape_options import measurement_options
 from teds_provision.errors import BadDataError, UsageError
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings
 from teds_provision.sanitize import counted
+from teds_provision.shapes.measurement import OPTIONS
 from teds_provision.station.store import KeptMeasurement
 from teds_provision.station.store.records import COMMAND
 
@@ -48,7 +47,8 @@ else:  # loads the sinks and numpy
     measure_view = late("teds_provision.cli.measure_view")
 
 MOST_NAMED = 3
-KINDS = ("periodic", "event", "free")
+_ABOVE = ("rate", "channels", "kind", "trigger", "test_pattern", "unsigned", "actuators", "dead_man", "require")
+"""Settings whose options stand above others in the help; one that is added is the last."""
 
 
 @command(
@@ -59,22 +59,9 @@ KINDS = ("periodic", "event", "free")
     "teds-provision measure recover run.mcap",
 )
 @click.argument("what", nargs=-1, required=True, metavar="NAME|UUID …")
-@click.option("--rate", type=Number(min=0.001), metavar="HZ", help="Samples per second (default: from the datasheet).")
+@measurement_options("rate")
 @click.option("--duration", type=Number(min=0.1), metavar="S", help="Seconds (default: until Ctrl-C).")
-@click.option(
-    "--channel",
-    "channels",
-    type=ChannelName(),
-    multiple=True,
-    metavar="CHANNEL",
-    help="Only this channel, by number or name; repeatable.",
-)
-@click.option("--kind", type=click.Choice(KINDS), help="How the node samples (default: each channel's own kind).")
-@click.option("--trigger", is_flag=True, help="Start all nodes at the same moment, with one frame.")
-@click.option("--test-pattern", is_flag=True, help="Stream and check the test pattern instead of measuring.")
-@click.option(
-    "--unsigned", is_flag=True, help="Also record raw values of nodes with an unsigned datasheet, marked as such."
-)
+@measurement_options("channels", "kind", "trigger", "test_pattern", "unsigned")
 @click.option(
     "--to", "files", multiple=True, metavar="FILE", help="Record to this file: .csv, .txt, .mcap, .jsonl; repeatable."
 )
@@ -91,15 +78,9 @@ KINDS = ("periodic", "event", "free")
 @click.option("--foxglove", is_flag=True, help="Serve live values to Foxglove on 127.0.0.1:8765.")
 @click.option("--foxglove-at", metavar="HOST:PORT", help="Serve them on this address of this machine.")
 @click.option("--no-scalars", is_flag=True, help="Leave out the single-value topics of MCAP and Foxglove.")
-@click.option("--actuators/--no-actuators", default=True, show_default=True, help="Accept set points from ROS topics.")
-@click.option("--dead-man", type=WholeNumber(20, 10_000), default=1000, show_default=True, metavar="MS",
-              help="Time without set points before an actuator goes to its safe state.")  # fmt: skip
-@click.option(
-    "--require", type=FileToRead(), metavar="FILE", help="Requirements of the task, checked against the datasheets."
-)
+@measurement_options("actuators", "dead_man", "require")
 @click.option("--require-firmware", is_flag=True, help="Refuse nodes whose firmware their type does not accept.")
-@click.option("--scalar-rate", type=Number(0, 1000), default=10.0, show_default=True, metavar="HZ",
-              help="Rate of single-value topics.")  # fmt: skip
+@measurement_options(but=_ABOVE)
 @link_options
 @pass_app
 def measure(
@@ -160,7 +141,7 @@ def measure(
     _propose_rate(app, job, uuids)
     ended = _run(app, job, links, uuids, duration)
     again = "" if ended.lower_rate is None else _at_rate(job, uuids, ended.lower_rate)
-    _tell_end(app, ended, job.request.require, file_units, again)
+    _tell_end(app, ended, job.request.requirements, file_units, again)
 
 
 def _numbers(station: Station, uuids: Sequence[bytes], channels: Sequence[int | str]) -> list[int]:
@@ -201,22 +182,17 @@ def _require_streams(links: LinkSettings, *, trigger: bool) -> None:
 
 def _asked(group: str, uuids: Sequence[bytes], sinks: Sequence[str], wished: Mapping[str, Any]) -> KeptMeasurement:
     """Return the request of the command line, as a group keeps it."""
+    settings = {name: wished[name] for name in OPTIONS} | {
+        "channels": tuple(dict.fromkeys(wished["channels"])),
+        "actuators": wished["actuators"] and (wished["ros1"] or wished["ros2"]),
+    }
     return KeptMeasurement(
         "",
         group=group or None,
         uuids=() if group else tuple(uuids),
-        channels=tuple(dict.fromkeys(wished["channels"])),
-        rate=wished["rate"],
-        kind=wished["kind"],
-        trigger=wished["trigger"],
-        actuators=wished["actuators"] and (wished["ros1"] or wished["ros2"]),
-        dead_man=wished["dead_man"],
-        scalar_rate=wished["scalar_rate"],
         sinks=tuple(measure_room.running.measurement_job.whole_path(spec) for spec in sinks),
         owner=COMMAND,
-        test_pattern=wished["test_pattern"],
-        unsigned=wished["unsigned"],
-        require=wished["require"],
+        **settings,
     )
 
 

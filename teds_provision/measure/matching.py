@@ -210,9 +210,8 @@ def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: Bu
         return NodeLoad()
     sensors = [channel for channel in Sheet.from_image(image).channels if channel.sample and not channel.actuator]
     try:
-        plans = plan_node(
-            sensors_of(sensors, (), request.kind), time, rate=request.rate, kind=request.kind, at_most=True
-        )
+        kind = request.stream_kind
+        plans = plan_node(sensors_of(sensors, (), kind), time, rate=request.rate, kind=kind, at_most=True)
     except (BadDataError, PolicyError):  # its session will show it
         return NodeLoad()
     rates = [1 / period for period in plans.periods().values() if period > 0]

@@ -196,8 +196,8 @@ class NodeSupervisor:
             self._set_state("ended", why=self._why)
         finally:
             self._common_start.drop_node(self.uuid)
-            if self._request.require is not None:
-                self._request.require.drop_node(self.uuid)
+            if self._request.requirements is not None:
+                self._request.requirements.drop_node(self.uuid)
             if not self._comes_back:
                 for bus in self._buses.all():
                     bus.share.leave(self.uuid)
@@ -322,8 +322,8 @@ class NodeSupervisor:
                 )
             finally:
                 self._proven = node.sealed
-            if self._request.require is not None:
-                self._request.require.offer(self.uuid, trusted.sheet, self._stop)
+            if self._request.requirements is not None:
+                self._request.requirements.offer(self.uuid, trusted.sheet, self._stop)
             runs = firmware_of(self._station, self.uuid, read_firmware(node))
             if self._request.require_firmware:
                 require_good_firmware(self.uuid, runs)
@@ -386,7 +386,7 @@ class NodeSupervisor:
         nothing_else = all(channel.actuator for channel in every) or (self._request.channels and not asked)
         if actuators and nothing_else:
             return []
-        return sensors_of(every, asked, self._request.kind)
+        return sensors_of(every, asked, self._request.stream_kind)
 
     def _claim(self, trusted: VerifiedSession, channels: list[Channel]) -> None:
         """Claim the sensors one by one, or the whole node at once if every sensor is measured."""
@@ -452,7 +452,7 @@ class NodeSupervisor:
             channels,
             bus,
             rate=self._request.rate,
-            kind=self._request.kind,
+            kind=self._request.stream_kind,
             test_pattern=self._request.test_pattern,
             start=start,
             slower=2**self._halved,

@@ -10,8 +10,9 @@ from typing import Any
 
 from teds_provision.errors import PolicyError
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
-from teds_provision.measure.verified_session import DEAD_MAN, LEASE
+from teds_provision.measure.verified_session import LEASE
 from teds_provision.protocol.operation.stream_commands import StreamKind
+from teds_provision.shapes.measurement import MeasurementSpec
 from teds_provision.teds.fits import Fit, Requirement, judge, met
 from teds_provision.teds.sheet import Sheet
 
@@ -74,27 +75,24 @@ class Requirements:
         return unmet
 
 
-@dataclass(frozen=True)
-class MeasurementRequest:
-    """What to measure of each node; ``channels`` empty: every sensor. ``rate`` in Hz, None: the datasheet's."""
+@dataclass(frozen=True, kw_only=True)
+class MeasurementRequest(MeasurementSpec):
+    """What to measure of each node: the settings of its measurement, and what holds for this run alone."""
 
-    channels: tuple[int, ...] = ()
-    rate: float | None = None
-    kind: StreamKind | None = None
-    trigger: bool = False
-    test_pattern: bool = False
     lease: int = LEASE
     timeout: float = 60.0
-    actuators: bool = False  # whether set points may come for actuators of nodes on the whitelist
-    dead_man: int = DEAD_MAN
     patient: bool = False  # whether a node is waited for, and tried again, for ever: no refusal is final
-    unsigned: bool = False  # raw values are wanted also of a node with an unsigned datasheet
     unverified: bool = False  # only nodes with an unsigned datasheet, calibrated by it and marked so
-    require: Requirements | None = None
+    requirements: Requirements | None = None  # what the text ``require`` says, held against all nodes of the run
     require_firmware: bool = False  # only nodes whose firmware their type accepts
     newcomers: bool = False  # nodes come and go: no room is kept for one that is away, and its first error ends it
     by: str = "measure"  # the command that a reading of the datasheet is put down to
     beside: Mapping[bytes, str] = field(default_factory=dict)  # which process measures a node too, in words
+
+    @property
+    def stream_kind(self) -> StreamKind | None:
+        """How each channel samples, None: as the datasheet says."""
+        return None if self.kind is None else StreamKind[self.kind.upper()]
 
 
 @dataclass

@@ -110,8 +110,8 @@ class Measurement:
                         Path(name).unlink(missing_ok=True)
             raise
         self.buses.expect(self.uuids)
-        if self.request.require is not None:
-            self.request.require.expect(self.uuids)
+        if self.request.requirements is not None:
+            self.request.requirements.expect(self.uuids)
         events = self._events = Events(self._block, self._describe, self._report, self._read)
         self.supervisors = [
             NodeSupervisor(self.station, self.buses, uuid, self.request, self._host, events, self._common_start)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
@@ -43,6 +43,7 @@ from teds_provision.ncap.nodes.inspection import as_problem
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
 from teds_provision.ncap.sinks import DaemonSinks, sink_json
 from teds_provision.protocol.operation.stream_commands import StreamKind
+from teds_provision.shapes.measurement import MeasurementSpec
 from teds_provision.station.station import Station
 from teds_provision.station.store import KeptMeasurement
 from teds_provision.teds.image import Image
@@ -56,8 +57,6 @@ _OF_THIS_PROCESS: Final = frozenset({_RUN, _ADOPTED, UnsignedNodes.text})
 LETTING_GO: Final = 4.0  # seconds for a node's session to end in order; the caller waits 5
 ANSWERING: Final = 1.0  # seconds for a node that has another address now
 LONGEST_LOAN: Final = 900.0  # seconds after which a node is measured again, whatever its writer does
-SCALAR_RATE: Final = 10.0
-"""Values a second on a topic of one value, if a measurement does not set it."""
 
 
 @dataclass
@@ -209,63 +208,39 @@ class MeasurementSupervisor:
 
     # -- what the API asks -------------------------------------------------------------------------------------------
 
-    def add(
-        self,
-        *,
-        group: str | None = None,
-        uuids: Sequence[str] = (),
-        match: str | None = None,
-        frozen: bool = False,
-        channels: Sequence[int] = (),
-        rate: float | None = None,
-        kind: Any = None,
-        trigger: bool = False,
-        sinks: Sequence[str] = (),
-        actuators: bool = True,
-        dead_man: int | None = None,
-        scalar_rate: float = SCALAR_RATE,
-        owner: str = NCAP,
-    ) -> dict[str, Any]:
+    def add(self, members: Mapping[str, Any], owner: str = NCAP) -> dict[str, Any]:
         """Measure from now on, after every restart too, until it is deleted; ``owner`` is who asked for it.
 
-        Raises UsageError (no node, a sink that cannot be named so), NotFoundError (the group), NodeBusyError (one of
-        the nodes is measured already).
+        ``members`` are those of a request body; those that are absent or null are as the daemon has them. Raises
+        UsageError (no node, a sink that cannot be named so), NotFoundError (the group), NodeBusyError (one of the nodes
+        is measured already).
         """
-        if sum((group is not None, bool(uuids), match is not None)) != 1:
+        spec = MeasurementSpec.from_json(members, actuators=True, dead_man=self._dead_man)
+        if sum((spec.group is not None, bool(spec.uuids), spec.match is not None)) != 1:
             raise UsageError(
                 "A measurement needs a group, nodes, or an expression.", hint='Give "group", "uuids" or "match".'
             )
-        if match is not None:
-            NodeMatch.parse(match).require_groups(self._station)
-            if trigger and not frozen:
+        if spec.match is not None:
+            NodeMatch.parse(spec.match).require_groups(self._station)
+            if spec.trigger and not spec.frozen:
                 raise UsageError(
                     "Nodes that join one by one cannot start together.", hint='Omit the trigger, or set "frozen".'
                 )
-        kept = KeptMeasurement(
-            "",
-            group=group,
-            uuids=tuple(bytes.fromhex(uuid) for uuid in dict.fromkeys(uuids)),
-            channels=tuple(dict.fromkeys(channels)),
-            rate=rate,
-            kind=kind,
-            trigger=trigger,
-            sinks=tuple(dict.fromkeys(self._sinks.whole(spec) for spec in sinks)),
-            actuators=actuators and match is None,  # actuators are never claimed for nodes as they come
-            match=match,
-            frozen=frozen,
-            dead_man=self._dead_man if dead_man is None else dead_man,
-            scalar_rate=scalar_rate,
-            owner=owner,
+        whole = replace(
+            spec,
+            sinks=tuple(dict.fromkeys(self._sinks.whole(sink) for sink in spec.sinks)),
+            actuators=spec.actuators and spec.match is None,  # actuators are never claimed for nodes as they come
         )
+        kept = KeptMeasurement("", **whole.settings(), owner=owner)
         # What can never be measured is refused before it is kept: it would be tried for ever, after each restart too.
         nodes = self._station.measurements.nodes_of(kept)
-        if not nodes and match is None:
-            raise UsageError(f"Group {group!r} is empty.", hint="Add a node to it first.")
+        if not nodes and kept.match is None:
+            raise UsageError(f"Group {kept.group!r} is empty.", hint="Add a node to it first.")
         for uuid in nodes:
             self._require_unmeasured(uuid)
             self._require_plan(uuid, kept)
-        for spec in kept.sinks:
-            self._sinks.open(spec)
+        for sink in kept.sinks:
+            self._sinks.open(sink)
         with self._station.lock("measure"):  # of two requests at once for one node, or its group, one is refused
             for uuid in self._station.measurements.nodes_of(kept):
                 self._require_unmeasured(uuid)
@@ -297,7 +272,7 @@ class MeasurementSupervisor:
             bus,
             BUDGET if self._sinks.publish else None,
             rows=self._sinks.publish,
-            scalar_rate=SCALAR_RATE,
+            scalar_rate=MeasurementSpec.scalar_rate,
             values=values,
             busy=busy,
         )
@@ -493,21 +468,11 @@ class MeasurementSupervisor:
             left = (
                 [uuid for uuid in running.reports if uuid not in running.past] if running.membership is not None else []
             )
-        return {
+        return kept.to_json() | {
             "id": kept.id,
-            "group": kept.group,
-            "match": kept.match,
-            "frozen": kept.frozen,
             "uuids": list(running.uuids),
-            "channels": list(kept.channels),
-            "rate": kept.rate,
-            "kind": kept.kind,
-            "trigger": kept.trigger,
-            "sinks": list(kept.sinks),
             "actuators": self._sinks.moves(kept),
-            "dead_man": kept.dead_man,
             "created": kept.created,
-            "scalar_rate": kept.scalar_rate,
             "owner": kept.owner,
             "process": None if kept.pid is None else {"id": kept.pid, "started": kept.started},
             "state": running.state,

@@ -15,10 +15,10 @@ import secrets
 import time
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from shlex import quote
-from typing import Any, cast
+from typing import Any, Final, cast
 
 from teds_provision.errors import BadDataError, FrozenError, NotFoundError, PolicyError, StoreError, UsageError
 from teds_provision.station.groups import Groups
@@ -80,7 +80,7 @@ class Measurements:
 
     def get(self, measurement_id: str) -> KeptMeasurement:
         """One of them; raises NotFoundError."""
-        statement = "SELECT * FROM measurements WHERE id = ?"
+        statement = f"SELECT {_COLUMNS} FROM measurements WHERE id = ?"
         found = self._store.read_one(_measurement, statement, (measurement_id,))
         if found is None:
             raise NotFoundError(
@@ -150,37 +150,15 @@ class Measurements:
 
     def _rows(self) -> list[KeptMeasurement]:
         """Return what the station measures, oldest first."""
-        return self._store.read(_measurement, "SELECT * FROM measurements ORDER BY created, id")
+        return self._store.read(_measurement, f"SELECT {_COLUMNS} FROM measurements ORDER BY created, id")
 
     def _put(self, measurement: KeptMeasurement) -> None:
         """Keep what the station measures from now on; raises BadDataError if it names none, or two, of what it may."""
         one = measurement
         if sum((one.group is not None, bool(one.uuids), one.match is not None)) != 1:
             raise BadDataError("A measurement names a group, or nodes by UUID, or says which nodes match.")
-        values = (
-            one.id,
-            one.group,
-            json.dumps([uuid.hex() for uuid in one.uuids]),
-            json.dumps(list(one.channels)),
-            one.rate,
-            one.kind,
-            int(one.trigger),
-            int(one.actuators),
-            one.dead_man,
-            float(one.scalar_rate),
-            json.dumps(list(one.sinks)),
-            one.owner,
-            one.ends,
-            one.created,
-            int(one.test_pattern),
-            int(one.unsigned),
-            one.require,
-            one.match,
-            int(one.frozen),
-            one.pid,
-            one.started,
-        )
-        self._store.execute(f"INSERT OR REPLACE INTO measurements VALUES({places(values)})", values)
+        values = [_to_column(getattr(one, member.name)) for member in fields(one)]
+        self._store.execute(f"INSERT OR REPLACE INTO measurements({_COLUMNS}) VALUES({places(values)})", values)
 
     @contextmanager
     def owned_by_command(self, measurement: KeptMeasurement) -> Iterator[KeptMeasurement]:
@@ -401,16 +379,23 @@ def _process_start() -> int:
         return int(time.time())
 
 
+_COLUMNS: Final = ", ".join({"group": "group_name"}.get(member.name, member.name) for member in fields(KeptMeasurement))
+"""One for each field, under its name, but for a word of SQL."""
+
+
+def _to_column(value: Any) -> Any:
+    """Return a field as its column has it: lists are JSON, nodes in hex."""
+    if isinstance(value, tuple):
+        return json.dumps([part.hex() if isinstance(part, bytes) else part for part in value])
+    return int(value) if isinstance(value, bool) else value
+
+
 def _measurement(*row: Any) -> KeptMeasurement:
-    one = KeptMeasurement(*row)
-    return replace(
-        one,
-        uuids=tuple(bytes.fromhex(uuid) for uuid in json.loads(row[2])),
-        channels=tuple(json.loads(row[3])),
-        trigger=bool(one.trigger),
-        actuators=bool(one.actuators),
-        sinks=tuple(json.loads(row[10])),
-        test_pattern=bool(one.test_pattern),
-        unsigned=bool(one.unsigned),
-        frozen=bool(one.frozen),
-    )
+    """Return a row of :data:`_COLUMNS`."""
+    read: dict[str, Any] = {}
+    for member, column in zip(fields(KeptMeasurement), row, strict=True):
+        if isinstance(member.default, tuple):
+            read[member.name] = tuple(json.loads(column))
+        else:
+            read[member.name] = bool(column) if isinstance(member.default, bool) else column
+    return KeptMeasurement(**read | {"uuids": tuple(bytes.fromhex(uuid) for uuid in read["uuids"])})

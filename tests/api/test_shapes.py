@@ -126,7 +126,6 @@ def test_a_refusal_names_the_member_and_what_it_may_be(body: type[Any], members:
 @pytest.mark.parametrize(
     ("method", "body", "besides"),
     [
-        (client.Client.measure, bodies.NewMeasurement, set()),
         (client.Client.provision, bodies.Order, {"node"}),
         (client.Client.set, bodies.SetPoint, {"node", "channel"}),
         (client.Client.write_teds, bodies.SheetText, {"node", "dry_run"}),

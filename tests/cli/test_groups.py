@@ -21,7 +21,7 @@ def measured(home: Path) -> Path:
     with Station.inspect(home) as store:
         store.groups.put(Group("crane", (ONE,)))
         store.groups.put(Group("spare", (ONE,)))
-        store.measurements.keep(KeptMeasurement("1a2b3c4d", "crane", owner="page"))
+        store.measurements.keep(KeptMeasurement("1a2b3c4d", group="crane", owner="page"))
     return home
 
 

@@ -107,7 +107,7 @@ def test_the_next_reader_removes_the_row_of_a_killed_command(hall: Hall, reader:
 
 def test_a_process_that_got_the_process_id_of_a_killed_command_does_not_own_its_row(hall: Hall) -> None:
     with closing(Station.inspect(hall.station.home)) as store:
-        store.measurements.keep(KeptMeasurement("dead", "arm", owner="command", pid=os.getpid(), started=1))
+        store.measurements.keep(KeptMeasurement("dead", group="arm", owner="command", pid=os.getpid(), started=1))
     assert listed(ncap(hall)) == []
     assert rows(hall) == []
 
@@ -169,7 +169,7 @@ def test_a_measurement_whose_time_is_over_holds_its_nodes_no_longer(hall: Hall) 
     """It was listed as ended, and its nodes as measured, until somebody deleted it."""
     for seconds in (5, 20, 60):  # a busy machine takes longer than the first to start
         with closing(Station.inspect(hall.station.home)) as store:
-            store.measurements.keep(KeptMeasurement("brief", "arm", rate=20.0, ends=time.time() + seconds))
+            store.measurements.keep(KeptMeasurement("brief", group="arm", rate=20.0, ends=time.time() + seconds))
         service = ncap(hall)
         shown = listed(service)
         if shown:

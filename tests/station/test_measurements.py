@@ -36,7 +36,7 @@ def test_a_node_is_added_to_no_group_that_is_not_there(station: Station) -> None
 
 def test_with_a_group_go_its_measurements(station: Station) -> None:
     station.groups.put(Group("hand", (ONE,)))
-    wanted = KeptMeasurement("m1", "hand", rate=1000.0, sinks=("file.mcap",))
+    wanted = KeptMeasurement("m1", group="hand", rate=1000.0, sinks=("file.mcap",))
     station.measurements.keep(wanted)
     station.measurements.keep(KeptMeasurement("m2", uuids=(ONE, TWO), kind="event", trigger=True))
     assert station.measurements.get("m1") == wanted
@@ -46,7 +46,7 @@ def test_with_a_group_go_its_measurements(station: Station) -> None:
     assert not station.groups.delete("hand")
 
 
-@pytest.mark.parametrize("wrong", [KeptMeasurement("m"), KeptMeasurement("m", "hand", (ONE,))])
+@pytest.mark.parametrize("wrong", [KeptMeasurement("m"), KeptMeasurement("m", group="hand", uuids=(ONE,))])
 def test_a_measurement_names_a_group_or_nodes(station: Station, wrong: KeptMeasurement) -> None:
     station.groups.put(Group("hand"))
     with pytest.raises(BadDataError):

@@ -32,7 +32,6 @@ from teds_provision.measure.sinks import CommandTaker, Sink, open_sink
 from teds_provision.measure.sinks.foxglove import ARRAYS
 from teds_provision.measure.sinks.shown import SHOWN
 from teds_provision.measure.sinks.wide import WIDE
-from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.station.measurements import STATION
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import KeptMeasurement
@@ -217,16 +216,9 @@ def request_of(kept: KeptMeasurement, more: MeasurementRequest) -> MeasurementRe
     """Return the request for each node; ``more`` has what is not kept: patience, time-out, lease."""
     return replace(
         more,
-        channels=kept.channels,
-        rate=kept.rate,
-        kind=None if kept.kind is None else StreamKind[kept.kind.upper()],
-        trigger=kept.trigger,
+        **kept.settings(),
         newcomers=kept.match is not None and not kept.frozen,
-        actuators=kept.actuators,
-        dead_man=kept.dead_man,
-        test_pattern=kept.test_pattern,
-        unsigned=kept.unsigned,
-        require=Requirements(parse_require(kept.require, "--require")) if kept.require else None,
+        requirements=Requirements(parse_require(kept.require, "--require")) if kept.require else None,
     )
 
 

@@ -365,10 +365,9 @@ class Resources:
         if request.method == "GET":
             return _shown(request, {"measurements": await asyncio.to_thread(measuring.all)})
         body = await body_of(request, bodies.NewMeasurement)
-        said = {name: value for name, value in vars(body).items() if value is not None}  # else as the daemon has it
-        said["uuids"] = await self._nodes_of(body.uuids)
+        members = vars(body) | {"uuids": await self._nodes_of(body.uuids)}
         caller: Caller = request.scope[CALLER]
-        return JSONResponse(await changing(lambda: measuring.add(**said, owner=caller.owner)), 201)
+        return JSONResponse(await changing(lambda: measuring.add(members, caller.owner)), 201)
 
     async def rate(self, request: Request) -> Response:
         """GET /measurements/rate: of a group, or of nodes."""

@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from typing import Final, Literal, NamedTuple
 
+from teds_provision.shapes.measurement import MeasurementSpec
 from teds_provision.teds.image import Image
 
 UUID_OCTETS = 10
@@ -20,7 +21,6 @@ Assurance = Literal["tap", "bus", "uuid", "import", "registry"]
 KeyState = Literal["pending", "active"]
 KeySource = Literal["agreement", "import"]
 DraftStage = Literal["built", "signed"]
-MeasurementKind = Literal["periodic", "event", "free"]
 DetectionMode = Literal["transparent", "whitelist"]
 TrustRole = Literal["station", "ca"]
 Direction = Literal["out", "in"]
@@ -267,40 +267,19 @@ COMMAND: Final = "command"
 
 
 @dataclass(frozen=True)
-class KeptMeasurement:
-    """What the station measures after every start (operation.md section 7): a group, or nodes by UUID.
+class KeptMeasurement(MeasurementSpec):
+    """What the station measures after every start: its settings, and whose it is.
 
-    ``channels`` empty: every sensor. ``rate`` in Hz, None for that of the datasheets; ``kind`` None: as each channel
-    is. ``sinks`` are the strings that name files and topics; ``actuators``: set points may come by them, with a
-    ``dead_man`` in ms. ``scalar_rate`` in Hz is that of topics of one value. ``owner`` is ``ncap``, ``page``,
-    ``api:TOKEN`` or :data:`COMMAND`; of a command ``pid`` is the process ID and ``started`` the start of that process
-    (unix seconds). ``ends`` is when (unix seconds), None for never. ``test_pattern`` and ``unsigned`` as the options of
-    ``measure``; ``require`` is the text of its ``--require`` file, "" for none. ``match`` is the expression that
-    selects nodes as they come (measure/matching.py), None for none; ``frozen``: membership is fixed at the start; no
-    node joins or leaves.
+    ``owner`` is ``ncap``, ``page``, ``api:TOKEN`` or :data:`COMMAND`; of a command ``pid`` is the process ID and
+    ``started`` the start of that process (unix seconds). ``ends`` is when (unix seconds), None for never.
     """
 
     id: str
-    group: str | None = None
-    uuids: tuple[bytes, ...] = ()
-    channels: tuple[int, ...] = ()
-    rate: float | None = None
-    kind: MeasurementKind | None = None
-    trigger: bool = False
-    actuators: bool = False
-    dead_man: int = 1000
-    scalar_rate: float = 10.0
-    sinks: tuple[str, ...] = ()
-    owner: str = "ncap"
-    ends: float | None = None
-    created: str = field(default_factory=utc_now)
-    test_pattern: bool = False
-    unsigned: bool = False
-    require: str = ""
-    match: str | None = None
-    frozen: bool = False
-    pid: int | None = None
-    started: int | None = None
+    owner: str = field(default="ncap", kw_only=True)
+    ends: float | None = field(default=None, kw_only=True)
+    created: str = field(default_factory=utc_now, kw_only=True)
+    pid: int | None = field(default=None, kw_only=True)
+    started: int | None = field(default=None, kw_only=True)
 
     @property
     def lasting(self) -> bool:

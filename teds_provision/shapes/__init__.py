@@ -1,0 +1,9 @@
+"""Shapes that several rooms share, each defined once; the room is below all others and imports none.
+
+===============  =====================================================================================
+module           what it holds
+===============  =====================================================================================
+``metadata``     facts beside the type of a field: of its JSON schema, of its option on the command line
+``measurement``  a measurement's settings: options, request and answer of the API, the store's columns
+===============  =====================================================================================
+"""

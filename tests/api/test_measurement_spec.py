@@ -1,0 +1,79 @@
+"""A setting of a measurement is defined once: options, request, answer, row and client have the same ones."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from teds_provision.api import answers, bodies
+from teds_provision.cli.measure import measure
+from teds_provision.measure.request import MeasurementRequest
+from teds_provision.measure.running.measurement_job import request_of
+from teds_provision.shapes.measurement import NAMES, OPTIONS, PUBLISHED, MeasurementMembers, MeasurementSpec
+from teds_provision.station.store import KeptMeasurement
+
+from ..bench import make_station
+
+CHANGED: Mapping[str, Any] = {
+    "group": "arm",
+    "uuids": (bytes(10), bytes(range(10))),
+    "match": "type:gripper",
+    "frozen": True,
+    "channels": (3, 1),
+    "rate": 12.5,
+    "kind": "event",
+    "trigger": True,
+    "test_pattern": True,
+    "unsigned": True,
+    "sinks": ("ros2", "/r/run.csv"),
+    "actuators": True,
+    "dead_man": 250,
+    "require": '[angle]\nrange = ">= 360 deg"\n',
+    "scalar_rate": 2.5,
+}
+"""Of each known setting a value that is not its default."""
+
+
+def changed() -> MeasurementSpec:
+    return MeasurementSpec(**{name: CHANGED[name] for name in NAMES if name in CHANGED})
+
+
+def test_a_row_keeps_each_setting(tmp_path: Path) -> None:
+    """One without a column fails here: see ``station/store/schema.py``."""
+    wanted = KeptMeasurement("m1", **changed().settings() | {"group": None, "match": None})
+    with make_station(tmp_path / "home") as station:
+        station.measurements.keep(wanted)
+        assert station.measurements.get("m1") == wanted
+
+
+def test_the_request_to_each_node_has_each_setting() -> None:
+    kept = KeptMeasurement("m1", **changed().settings())
+    found = request_of(kept, MeasurementRequest(patient=True, timeout=3.0))
+    assert found.settings() == kept.settings()
+    assert (found.patient, found.timeout) == (True, 3.0)
+
+
+def test_request_and_answer_of_the_api_have_the_published_settings() -> None:
+    assert tuple(member.name for member in dataclasses.fields(bodies.NewMeasurement)) == PUBLISHED
+    assert get_type_hints(answers.Measurement).keys() >= set(PUBLISHED)
+    assert MeasurementMembers.__annotations__.keys() == set(PUBLISHED) - {"uuids"}, "the client's keywords"
+
+
+def test_a_body_becomes_the_settings_and_back() -> None:
+    """Of a command only, such as a test pattern, a body has none."""
+    published = {name: getattr(changed(), name) for name in PUBLISHED}
+    body = bodies.NewMeasurement(**published | {"uuids": [uuid.hex() for uuid in CHANGED["uuids"]]})
+    spec = MeasurementSpec.from_json(vars(body), actuators=True, dead_man=99)
+    assert spec == replace(MeasurementSpec(), **published)
+    assert bodies.NewMeasurement(**spec.to_json()) == replace(
+        body, channels=list(body.channels), sinks=list(body.sinks)
+    )
+    assert MeasurementSpec.from_json(vars(bodies.NewMeasurement(group="arm")), dead_man=99).dead_man == 99
+
+
+def test_the_command_has_an_option_for_each_setting_that_names_one() -> None:
+    flags = {parameter.name: "/".join(parameter.opts) for parameter in measure.params if parameter.name in OPTIONS}
+    assert flags == {name: option.flags.partition("/")[0] for name, option in OPTIONS.items()}
