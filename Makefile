@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # Compiled modules are kept: each of five pytests would else rewrite every assert again, 13 s of CPU each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo demo-page page-picture test test-system lint types unit compiled quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale bench-short test-rclpy fuzz faults pairs model house words man coverage mutants soak api test-other vectors-c sbom firmware firmware-faults firmware-zephyr firmware-arm firmware-coverage firmware-soak test-c room clean
+.PHONY: demo demo-page page-picture test test-system lint types unit compiled quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale bench-short test-rclpy test-smp fuzz faults pairs model house words man coverage mutants soak api test-other vectors-c sbom firmware firmware-faults firmware-zephyr firmware-arm firmware-coverage firmware-soak test-c room clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -119,6 +119,16 @@ test-rclpy: $(VENV)/.dev .venv-rclpy/.made
 .venv-rclpy/.made:
 	$(ROS_PYTHON) -m venv .venv-rclpy
 	.venv-rclpy/bin/python -m pip install --quiet $(foreach each,$(RCLPY),'$(each)')
+	@touch $@
+
+# An SMP client in Rust (mcumgr-toolkit of PyPI, in an environment of its own) updates a virtual node and the host port.
+test-smp: $(VENV)/.dev .venv-smp/.made
+	$(MAKE) -C firmware host
+	$(BIN)/python -m pytest tests/strangers/test_smp_peer.py tests/firmware/test_smp_peer.py -m soak -rs
+
+.venv-smp/.made:
+	$(PYTHON) -m venv .venv-smp
+	.venv-smp/bin/python -m pip install --quiet 'mcumgr-toolkit>=0.20'
 	@touch $@
 
 # Coverage-guided fuzzing of every parser of octets: RUNS inputs each (a million take about an hour and a half on one
@@ -323,4 +333,4 @@ sbom: .venv-release/.ready $(VENV)/.run
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .venv-fuzz .venv-release .venv-versions .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) .venv-fuzz .venv-smp .venv-release .venv-versions .mypy_cache .ruff_cache .pytest_cache

@@ -281,28 +281,49 @@ def check_can(data: bytes) -> None:
 
 
 def check_smp(data: bytes) -> None:
-    """SMP packets: the body as CBOR, and the virtual node's image manager behind the filter."""
+    """SMP packets: the body as CBOR, and the virtual node's filter before its manager.
+
+    The input is a packet, and pieces ``command u8 ‖ length u8 ‖ body`` that get a right header, of two sessions.
+    """
     from teds_provision.protocol.messages.frames import CommandRefusedError
-    from teds_provision.protocol.messages.smp import LISTED, decode_map, decode_packet
+    from teds_provision.protocol.messages.smp import LISTED, SmpPacket, decode_map, decode_packet
     from teds_provision.protocol.tim.manage import ManageFilter
     from tests.protocol.test_manage import Manager
 
     with suppress(ValueError):
         decode_map(data)
     manager = Manager(on_trial=bool(data and data[-1] & 1))
-    filtered = ManageFilter(manager, lambda: 0.0, 2048, claimed=lambda: False, staged_elsewhere=lambda session: None)
-    with suppress(CommandRefusedError):
-        decode_packet(filtered.run(data, None, "can:f1"))  # type: ignore[arg-type]
-    for packet in manager.got:
-        assert packet.command in LISTED
-        decode_map(packet.body)
+    now = 0.0
+    filtered = ManageFilter(manager, lambda: now, 2048, claimed=lambda: False, staged_elsewhere=lambda session: None)
+
+    def run(packet: bytes, session: object) -> None:
+        with suppress(CommandRefusedError):
+            decode_packet(filtered.run(packet, session, "can:f1"))  # type: ignore[arg-type]
+
+    run(data, None)
+    listed, sessions, at = sorted(LISTED), ("one", "other"), 0
+    while at + 2 <= len(data):
+        kind, length = data[at : at + 2]
+        run(
+            SmpPacket(listed[kind & 7], 7, data[at + 2 : at + 2 + length], whole=True).encode(), sessions[kind >> 3 & 1]
+        )
+        now += kind >> 4
+        at += 2 + length
+    for got in manager.got:
+        assert got.command in LISTED
+        decode_map(got.body)
 
 
 def smp_seeds() -> list[bytes]:
     """A packet of each listed command."""
     bodies = ("a0", "a16764", "a167636f6e6669726df5", "a4636f66660063646174614178636c656e0963736861410a")
     heads = ("0800000100000706", "0a00000100000700", "0a00000b00010700", "0a00001800010701")
-    return [bytes.fromhex(head + body) for head, body in zip(heads, bodies, strict=True)]
+    upload = bytes.fromhex(bodies[-1])
+    pieces = (b"\x07", b"\x0f", b"\xf7")  # uploads of one session, of the other, of the first much later
+    return [
+        *(bytes.fromhex(head + body) for head, body in zip(heads, bodies, strict=True)),
+        b"".join(piece + bytes([len(upload)]) + upload for piece in pieces),
+    ]
 
 
 def check_update(data: bytes) -> None:
@@ -809,7 +830,7 @@ TARGETS = {
         Target("operation", check_operation, lambda: [bytes(8), bytes(20), b"\0" + bytes(26)]),
         Target("nfc", check_nfc, nfc_seeds, ("Tp", "Ts", "Te", "urn:nfc:sn:")),
         Target("can", check_can, can_seeds, longest=1024),
-        Target("smp", check_smp, smp_seeds, longest=1024),
+        Target("smp", check_smp, smp_seeds, ("off", "len", "sha", "data", "hash", "confirm"), longest=1024),
         Target("update", check_update, update_seeds, ("off", "rc", "err", "images", "buf_size", "match"), longest=1024),
         Target("about", check_about, about_seeds, longest=128),
         Target("firmware", check_firmware, firmware_seeds, longest=512),
