@@ -6,6 +6,7 @@ import fcntl
 import os
 import random
 import socket
+import subprocess
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -82,3 +83,15 @@ def ros_domain() -> Iterator[int]:
             yield number
             return
     raise AssertionError("Every ROS domain from 100 to 199 is in use.")
+
+
+def self_signed(folder: Path) -> tuple[str, Path, str, Path]:
+    """The options for TLS: a new certificate for localhost and 127.0.0.1, and its key."""
+    certificate, key = folder / "cert.pem", folder / "key.pem"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2",
+         "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1", "-keyout", str(key),
+         "-out", str(certificate)],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    return "--tls-cert", certificate, "--tls-key", key

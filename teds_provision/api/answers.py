@@ -330,6 +330,7 @@ class Status(TypedDict):
     clients: NotRequired[int]
     measurements: list[Measurement]
     sinks: list[Sink]
+    foxglove: NotRequired[Annotated[str | None, Meta(description="address of the live Foxglove server, if one runs")]]
     clock_error: float | None
     budget: Budget
     plant: bool

@@ -22,7 +22,10 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
     Number,
     command,
+    exposure_options,
     file_units_option,
+    foxglove_address,
+    foxglove_options,
     link_options,
 )
 from teds_provision.cli.sample import ending, over_the_bus, where_met
@@ -75,9 +78,8 @@ _ABOVE = ("rate", "channels", "kind", "trigger", "test_pattern", "unsigned", "ac
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
 @click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST, with Home Assistant discovery.")
-@click.option("--foxglove", is_flag=True, help="Serve live values to Foxglove on 127.0.0.1:8765.")
-@click.option("--foxglove-at", metavar="HOST:PORT", help="Serve them on this address of this machine.")
-@click.option("--no-scalars", is_flag=True, help="Leave out the single-value topics of MCAP and Foxglove.")
+@foxglove_options
+@exposure_options
 @measurement_options("actuators", "dead_man", "require")
 @click.option("--require-firmware", is_flag=True, help="Refuse nodes whose firmware their type does not accept.")
 @measurement_options(but=_ABOVE)
@@ -96,6 +98,9 @@ def measure(
     foxglove: bool,
     foxglove_at: str | None,
     no_scalars: bool,
+    allow: Sequence[str],
+    certificate: Path | None,
+    key: Path | None,
     require: Path | None,
     output: Path | None,
     **wished: Any,
@@ -110,6 +115,11 @@ def measure(
         return
     if click.get_current_context().get_parameter_source("output") is ParameterSource.COMMANDLINE:
         raise UsageError("--output only works with `measure recover`.", hint="To record, use --to FILE.")
+    exposure = measure_room.exposure.Exposure(tuple(allow), certificate, key)
+    exposure.require_pair()
+    address = foxglove_address(foxglove, foxglove_at)
+    if address is not None:
+        measure_room.sinks.foxglove_server.address_of(address, exposure)
     if wide:
         files = _wide(files)
     files = [measure_room.sinks.in_units(name, file_units) for name in files]
@@ -121,8 +131,7 @@ def measure(
     links = where_met(station, links, uuids)
     _require_streams(links, trigger=wished["trigger"])
     ros = [name for name in ("ros1", "ros2") if wished[name]]
-    live = [f"foxglove:{foxglove_at}"] if foxglove_at else ["foxglove"] if foxglove else []
-    sinks = [*files, *ros, *filter(None, [mqtt]), *live]
+    sinks = [*files, *ros, *filter(None, [mqtt]), *([f"foxglove:{address}"] if address else [])]
     if no_scalars:
         sinks = [measure_room.sinks.without_scalars(sink) for sink in sinks]
     wished["channels"] = _numbers(station, uuids, wished["channels"])
@@ -135,6 +144,7 @@ def measure(
         request=measure_room.request.MeasurementRequest(
             timeout=links.timeout, require_firmware=wished["require_firmware"]
         ),
+        opened=lambda spec, take: measure_room.sinks.open_sink(spec, take, exposure),
     )
     for uuid in uuids:
         station.unlock(uuid)

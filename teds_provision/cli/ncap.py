@@ -27,7 +27,10 @@ from teds_provision.cli.options import (
     WholeNumber,
     command,
     examples,
+    exposure_options,
     file_units_option,
+    foxglove_address,
+    foxglove_options,
     said_here,
     tracing,
 )
@@ -81,15 +84,7 @@ _FILE = FileToRead(exists=True)
 @click.option("--rate", type=Number(min=0.001), metavar="HZ", help="With --measure: maximum samples per second.")
 @click.option("--frozen", is_flag=True, help="With --measure: only the nodes known at the start, as one group array.")
 @click.option("--http", metavar="HOST:PORT", help="Serve the page and the API on this address, e.g. 127.0.0.1:8351.")
-@click.option(
-    "--http-allow",
-    "allow",
-    multiple=True,
-    metavar="HOST",
-    help="Additional host name that browsers may use; repeatable.",
-)
-@click.option("--tls-cert", "certificate", type=_FILE, metavar="FILE", help="Certificate chain, PEM.")
-@click.option("--tls-key", "key", type=_FILE, metavar="FILE", help="Private key of the certificate, PEM.")
+@exposure_options
 @click.option(
     "--record",
     type=click.Path(path_type=Path, file_okay=False),
@@ -99,6 +94,7 @@ _FILE = FileToRead(exists=True)
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
 @click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST.")
+@foxglove_options
 @click.option("--actuators/--no-actuators", default=True, show_default=True, help="Accept set points from ROS topics.")
 @click.option("--dead-man", type=WholeNumber(20, 10_000), default=1000, show_default=True, metavar="MS",
               help="Time without set points before an actuator goes to its safe state.")  # fmt: skip
@@ -129,6 +125,9 @@ def run(
     ros1: bool,
     ros2: bool,
     mqtt: str | None,
+    foxglove: bool,
+    foxglove_at: str | None,
+    no_scalars: bool,
     trace: Path | None,
     **wished: Any,
 ) -> None:
@@ -152,6 +151,8 @@ def run(
         places=tuple(dict.fromkeys(places)),
         http=None if http is None else settings.parse_http(http),
         sinks=tuple(sinks),
+        foxglove=foxglove_address(foxglove, foxglove_at),
+        scalars=not no_scalars,
         brokers=brokers_of(config_path(app.home)),
         **wished,
     )
@@ -258,6 +259,8 @@ def _sentence(event: dict[str, Any]) -> str:
     if event.get("ready"):
         where = event["url"] or f"the Unix socket {event['api'].removeprefix('unix:')}"
         ready = f"Ready on {where}. To open the page: teds-provision ncap open"
+        if event.get("foxglove"):
+            ready += f"\nFoxglove: {event['foxglove']}"
         return ready if event.get("links") else f"{ready}\n{_NO_LINK}"
     facts = {key: value for key, value in event.items() if key not in ("event", "time", "state") and value}
     told = ", ".join(f"{key} {_text(value)}" for key, value in facts.items())
@@ -316,6 +319,8 @@ def _status(console: Console, found: dict[str, Any]) -> None:
             console.print(f"  {node['uuid']} {node['state']}{why}", markup=False)
         if any(node["why"] == "no room on the bus" for node in known["nodes"]):
             console.print("  → Running streams are not slowed down. A lower --rate leaves room for all.", markup=False)
+    if found.get("foxglove"):
+        console.print(f"Foxglove: {found['foxglove']}", markup=False)
     for known in found.get("sinks", ()):
         why = known["error"] or known["detail"]
         told = f"{known['state']}, {known['dropped']} dropped{f': {why}' if why else ''}"

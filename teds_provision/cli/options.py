@@ -26,9 +26,11 @@ from teds_provision.teds.certificate import split_channel
 if TYPE_CHECKING:
     from teds_provision import client
     from teds_provision.links import Trace
+    from teds_provision.measure.sinks import foxglove_server
     from teds_provision.trace import recorder
 else:
     client = late("teds_provision.client")  # HTTP: only if a base station runs
+    foxglove_server = late("teds_provision.measure.sinks.foxglove_server")
     recorder = late("teds_provision.trace.recorder")  # most runs have no trace
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -268,6 +270,47 @@ def said_here(*names: str) -> set[str]:
     """Return which of these options were given explicitly on the command line."""
     ctx = click.get_current_context()
     return {name for name in names if ctx.get_parameter_source(name) == ParameterSource.COMMANDLINE}
+
+
+def foxglove_options(function: Function) -> Function:
+    """Add --foxglove, --foxglove-at, --no-scalars."""
+    for option in (
+        click.option("--no-scalars", is_flag=True, help="Leave out the single-value topics of MCAP and Foxglove."),
+        click.option("--foxglove-at", metavar="HOST:PORT", help="Serve Foxglove on this address instead."),
+        click.option("--foxglove", is_flag=True, help="Serve live values to Foxglove on 127.0.0.1:8765."),
+    ):
+        function = option(function)
+    return function
+
+
+def foxglove_address(foxglove: bool, foxglove_at: str | None) -> str | None:
+    """Return HOST:PORT of the server that the options ask for, None for none."""
+    return foxglove_at or (foxglove_server.USUAL if foxglove else None)
+
+
+def exposure_options(function: Function) -> Function:
+    """Add --http-allow, --tls-cert, --tls-key: what a server needs to be reached from other machines."""
+    for option in (
+        click.option(
+            "--tls-key",
+            "key",
+            type=FileToRead(exists=True),
+            metavar="FILE",
+            help="Private key of the certificate, PEM.",
+        ),
+        click.option(
+            "--tls-cert", "certificate", type=FileToRead(exists=True), metavar="FILE", help="Certificate chain, PEM."
+        ),
+        click.option(
+            "--http-allow",
+            "allow",
+            multiple=True,
+            metavar="HOST",
+            help="Host name under which clients on other machines may connect; repeatable.",
+        ),
+    ):
+        function = option(function)
+    return function
 
 
 def fingerprint_option(says: str) -> Callable[[Function], Function]:

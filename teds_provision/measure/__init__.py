@@ -11,6 +11,7 @@ if TYPE_CHECKING:
         buses,
         capture,
         clock,
+        exposure,
         grid,
         held_actuator,
         interpreter,

@@ -25,6 +25,7 @@ from teds_provision.links.discovery import Sighting
 from teds_provision.links.opening import with_source
 from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.buses import Buses
+from teds_provision.measure.sinks.foxglove_server import FoxgloveServer
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor
 from teds_provision.ncap.names import Names
@@ -53,8 +54,8 @@ _DISCOVERY: Final = 1.5
 class Daemon:
     """All that runs, over one station; what the API calls."""
 
-    def __init__(self, station: Station, settings: Settings) -> None:
-        self.station, self.settings = station, settings
+    def __init__(self, station: Station, settings: Settings, foxglove: FoxgloveServer | None = None) -> None:
+        self.station, self.settings, self.foxglove = station, settings, foxglove
         self.live, self.node_locks, self.tokens = Live(), NodeLocks(), Tokens(station.home)
         self.directory = NodeDirectory(station, self.live)
         self.buses = Buses(news=self._saw, note=lambda text: self.live.event("link", state="notice", why=text))
@@ -66,6 +67,8 @@ class Daemon:
             actuators=settings.actuators,
             brokers=settings.brokers,
             units=settings.file_units,
+            foxglove=foxglove,
+            scalars=settings.scalars,
         )
         self.measurements = MeasurementSupervisor(
             station,
@@ -295,6 +298,7 @@ class Daemon:
             "clients": self.live.listeners,
             "measurements": self.measurements.all(),
             "sinks": self.measurements.sinks(),
+            "foxglove": self.foxglove.url if self.foxglove is not None else None,
             "clock_error": self.measurements.clock_error(),
             "budget": self.measurements.budget(),
             "plant": self.station.plant.joined is not None,

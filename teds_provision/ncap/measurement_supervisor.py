@@ -442,13 +442,16 @@ class MeasurementSupervisor:
 
     def sinks(self) -> list[dict[str, Any]]:
         """Every sink with what became of what it was given."""
+        return [sink_json(key, sink) for key, sink in self._open_sinks()]
+
+    def _open_sinks(self) -> list[tuple[str, Sink]]:
         with self._guard:
             jobs = [(key, running.job) for key, running in self._running.items() if running.job is not None]
-        return [sink_json(key, sink) for key, job in jobs for sink in job.sinks]
+        return [(key, sink) for key, job in jobs for sink in job.sinks]
 
     def budget(self) -> dict[str, Any]:
         """Messages a second that go to ROS and MQTT now, and how many are known to be carried."""
-        now, sent = time.monotonic(), sum(sink["messages"] for sink in self.sinks() if not sink["recorder"])
+        now, sent = time.monotonic(), sum(sink.stats.messages for _, sink in self._open_sinks() if sink.budgeted)
         before, count = self._messages
         if now - before >= 1.0:
             self._rate = max(0, sent - count) / (now - before)
@@ -666,7 +669,7 @@ class MeasurementSupervisor:
         try:
             unverified = running.kept.id == UnsignedNodes.text
             job = running.job = self._new_job(running, unverified=unverified)
-            live = [sink for sink in job.sinks if not sink.recorder]  # a file takes what comes: no budget is for it
+            live = [sink for sink in job.sinks if sink.budgeted]
             newcomers = DynamicMembership(
                 self._station,
                 self._directory,

@@ -16,6 +16,7 @@ from typing import Any, Final
 from teds_provision.client import SOCKET
 from teds_provision.errors import StoreLockedError
 from teds_provision.files import listen_alone, open_lock
+from teds_provision.measure.sinks.foxglove_server import FoxgloveServer
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.settings import Settings, require_safe
 from teds_provision.ncap.web.app import build
@@ -71,20 +72,25 @@ Tell = Callable[[dict[str, Any]], None]
 def run(station: Station, settings: Settings, tell: Tell) -> None:
     """Run until SIGTERM or Ctrl-C; ``tell`` gets the ready line, then a line for each event.
 
-    Raises StoreLockedError if this home has a daemon, LinkError if the address is taken, UsageError.
+    Raises StoreLockedError if this home has a daemon, LinkError if an address is taken, UsageError.
     """
     require_safe(settings)
     station.released = lambda _uuid, _command: nullcontext()  # in this process the turns of each node see to that
     with DaemonLock(station.home) as presence:
         local = presence.listen()
         tcp = listen(*settings.http) if settings.http is not None else None
-        daemon = Daemon(station, settings)
+        foxglove = FoxgloveServer(settings.foxglove, settings.exposure) if settings.foxglove is not None else None
         try:
+            if foxglove is not None:
+                foxglove.start(station.name)
+            daemon = Daemon(station, settings, foxglove)
             with MasterSocket(station.home, station.accept_masters):
                 asyncio.run(_serve(daemon, local, tcp, tell))
             if daemon.failure is not None:
                 raise daemon.failure
         finally:
+            if foxglove is not None:
+                foxglove.stop()
             for listener in (local, tcp):
                 if listener is not None:
                     listener.close()
@@ -107,15 +113,14 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
         await servers.serve(Guard(app, daemon.tokens, None), local)
         if tcp is not None:
             host, port = tcp.getsockname()[:2]
-            tls = daemon.settings.certificate is not None
-            named = front(daemon.settings.allow, port, tls=tls)
+            exposure = daemon.settings.exposure
+            named = front(exposure.allow, port, tls=exposure.tls)
             await servers.serve(Guard(app, daemon.tokens, named), tcp, daemon.settings)
-            allowed = daemon.settings.allow  # on every address, people call it by the first name that is allowed
-            name = allowed[0] if allowed and host in ("0.0.0.0", "::") else host
-            daemon.url = f"{'https' if tls else 'http'}://{f'[{name}]' if ':' in name else name}:{port}"
+            daemon.url = exposure.url("http", host, port)
         socket_path = str(Path(daemon.station.home) / SOCKET)
         links = list(daemon.settings.places)
-        tell({"ready": True, "url": daemon.url, "api": f"unix:{socket_path}", "pid": os.getpid(), "links": links})
+        ready = {"ready": True, "url": daemon.url, "api": f"unix:{socket_path}", "pid": os.getpid(), "links": links}
+        tell({**ready, "foxglove": daemon.foxglove.url if daemon.foxglove is not None else None})
         daemon.live.told = tell
         for event in early:
             tell(event)

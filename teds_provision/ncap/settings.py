@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import ipaddress
-import ssl
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Literal
+from typing import Literal
 
-from teds_provision.errors import BadDataError, UsageError
-from teds_provision.files import read_limited
+from teds_provision.errors import UsageError
 from teds_provision.links import Trace
 from teds_provision.links.opening import require_known_place
 from teds_provision.measure.display_units import FileUnits
+from teds_provision.measure.exposure import Exposure
+from teds_provision.measure.sinks.foxglove_server import address_of
 from teds_provision.measure.verified_session import DEAD_MAN
 
 Detection = Literal["transparent", "whitelist"]
 _FIRST, _SOURCES = 0xF2, 6
 """Addresses of daemons on a bus, 0xF2 to 0xF7: the command line, with 0xF1 by default, works beside."""
-_LOCAL_NAMES: Final = ("localhost",)
-_MOST_PEM: Final = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -32,12 +29,13 @@ class Settings:
     ``trust_dcc``: files with certificates (PEM), one of which must have signed a calibration certificate.
     ``unverified``: they are measured by their own datasheet, marked so. ``http`` is (host, port) or None: then only the
     Unix socket of the home is served. ``sinks`` take what is measured, beside those of each measurement; ``brokers``
-    are URLs by the names under which a measurement may name them; ``record`` is a folder for a recording of each
-    measurement. ``actuators``: set points may come by topics of ROS. ``measure`` selects nodes to measure as they come,
-    at ``rate`` in Hz at most; ``frozen``: only those selected at the start. ``dead_man`` in ms is for all actuators
-    whose measurement has no other. ``require_firmware``: only nodes whose
-    firmware their type accepts. ``registry``: the registry that was joined is followed. ``trace`` is an open one:
-    every frame of every link is written.
+    are URLs by the names under which a measurement may name them; ``foxglove`` is HOST:PORT of a Foxglove server for
+    all measurements; without ``scalars`` it and MCAP have no topics of single channels. ``record`` is a folder for a
+    recording of each measurement. ``actuators``: set points may come by topics of ROS. ``measure`` selects nodes to
+    measure as they come, at ``rate`` in Hz at most; ``frozen``: only those selected at the start. ``dead_man`` in ms is
+    for all actuators whose measurement has no other. ``require_firmware``: only nodes whose firmware their type
+    accepts. ``registry``: the registry that was joined is followed. ``trace`` is an open one: every frame of every link
+    is written.
     """
 
     places: tuple[str, ...] = ()
@@ -53,6 +51,8 @@ class Settings:
     key: Path | None = None
     record: Path | None = None
     sinks: tuple[str, ...] = ()
+    foxglove: str | None = None
+    scalars: bool = True
     brokers: Mapping[str, str] = field(default_factory=dict)
     actuators: bool = True
     dead_man: int = DEAD_MAN
@@ -64,6 +64,11 @@ class Settings:
     metrics: bool = False
     clause_12: bool = False
     trace: Trace | None = None
+
+    @property
+    def exposure(self) -> Exposure:
+        """How servers beyond loopback are protected."""
+        return Exposure(self.allow, self.certificate, self.key)
 
 
 def own_source(station_id: str) -> int:
@@ -80,37 +85,6 @@ def parse_http(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def is_loopback(host: str) -> bool:
-    """Return True if only this machine reaches a server on this address.
-
-    False for names that would have to be looked up.
-    """
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host.lower() in _LOCAL_NAMES
-
-
-def _require_pair(certificate: Path, key: Path) -> None:
-    """Raise BadDataError if OpenSSL cannot serve with these two files; there is no prompt for an encrypted key."""
-
-    def no_passphrase() -> str:
-        raise BadDataError(
-            f"{key} is encrypted.", hint="A service starts unattended: store the key decrypted, with mode 0600."
-        )
-
-    for path in (certificate, key):
-        if len(read_limited(path, _MOST_PEM, "PEM file")) == 0:
-            raise BadDataError(f"{path} is empty.")
-    try:
-        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, no_passphrase)
-    except (ssl.SSLError, OSError) as error:
-        raise BadDataError(
-            f"{certificate} and {key} are not a certificate and its key: {getattr(error, 'reason', None) or error}.",
-            hint="Both must be PEM files, and the certificate must come first in its file.",
-        ) from error
-
-
 def require_places(settings: Settings) -> None:
     """Raise UsageError for a link whose words are wrong: that does not mend itself, as a missing one may."""
     for place in settings.places:
@@ -119,19 +93,8 @@ def require_places(settings: Settings) -> None:
 
 def require_safe(settings: Settings) -> None:
     """Raise UsageError if the page would go to other machines without TLS, or with half of it."""
-    if (settings.certificate is None) != (settings.key is None):
-        raise UsageError("--tls-cert and --tls-key must be used together.", hint="Give both, or neither.")
-    if settings.certificate is not None and settings.key is not None:
-        _require_pair(settings.certificate, settings.key)
-    if settings.http is None or is_loopback(settings.http[0]):
-        return
-    if settings.certificate is None:
-        raise UsageError(
-            f"--http {settings.http[0]} would send values and tokens over the network unencrypted.",
-            hint="Add --tls-cert and --tls-key, or serve 127.0.0.1 and use an SSH tunnel.",
-        )
-    if not settings.allow:
-        raise UsageError(
-            f"--http {settings.http[0]} needs the names under which browsers may reach it.",
-            hint="Add --http-allow HOST for each of them.",
-        )
+    settings.exposure.require_pair()
+    if settings.http is not None:
+        settings.exposure.require_safe("--http", settings.http[0], sends="values and tokens", clients="browsers")
+    if settings.foxglove is not None:
+        address_of(settings.foxglove, settings.exposure)

@@ -16,7 +16,9 @@ from urllib.parse import urlsplit
 
 from teds_provision.errors import UsageError
 from teds_provision.measure.display_units import FileUnits
-from teds_provision.measure.sinks import FILES, CommandTaker, Sink, in_units, open_sink
+from teds_provision.measure.sinks import FILES, CommandTaker, Sink, in_units, open_sink, without_scalars
+from teds_provision.measure.sinks.foxglove import FoxgloveSink
+from teds_provision.measure.sinks.foxglove_server import FoxgloveServer
 from teds_provision.station.store import KeptMeasurement
 
 RECORDINGS: Final = "recordings"
@@ -34,7 +36,8 @@ class DaemonSinks:
     """``specs`` are the words of the sinks that take every measurement, ``record`` a folder for recordings of each.
 
     ``units`` are those of values in files. ``brokers``: URLs by the names that config.toml gives them. ``actuators``:
-    whether set points may come by the topics of any of the sinks. Raises UsageError for a name or URL that is none.
+    whether set points may come by the topics of any of the sinks. ``foxglove`` publishes every measurement. Without
+    ``scalars`` Foxglove and MCAP have no topics of single channels. Raises UsageError for a name or URL that is none.
     """
 
     def __init__(
@@ -46,7 +49,10 @@ class DaemonSinks:
         actuators: bool,
         brokers: Mapping[str, str] | None = None,
         units: FileUnits = "si",
+        foxglove: FoxgloveServer | None = None,
+        scalars: bool = True,
     ) -> None:
+        self._foxglove, self._scalars = foxglove, scalars
         self._units: FileUnits = units
         self._home, self._specs, self.actuators = home, tuple(specs), actuators
         self._record = record.absolute() if record is not None else None
@@ -80,7 +86,7 @@ class DaemonSinks:
                 f"Broker {spec!r} is no longer configured.",
                 hint=f'Name it in config.toml: [ncap.brokers], {spec} = "mqtts://HOST".',
             )
-        return open_sink(in_units(self._brokers.get(spec, spec), self._units), take)
+        return self._open(self._brokers.get(spec, spec), take)
 
     def more(self, kept: KeptMeasurement, take: CommandTaker | None) -> list[Sink]:
         """Return the daemon's own sinks for one run of a measurement, without those that it names itself.
@@ -93,7 +99,14 @@ class DaemonSinks:
             stamp = time.strftime("%Y%m%d-%H%M%S")
             name = re.sub(r"[^A-Za-z0-9_-]+", "_", kept.group or kept.id)[:60] or "measurement"
             specs.append(str(self._folder() / f"{name}-{stamp}.csv"))
-        return [open_sink(in_units(spec, self._units), take) for spec in specs]
+        sinks = [self._open(spec, take) for spec in specs]
+        if self._foxglove is not None:
+            sinks.append(FoxgloveSink(self._foxglove, own=False, scalars=self._scalars))
+        return sinks
+
+    def _open(self, spec: str, take: CommandTaker | None) -> Sink:
+        whole = in_units(spec, self._units)
+        return open_sink(whole if self._scalars else without_scalars(whole), take)
 
     def moves(self, kept: KeptMeasurement) -> bool:
         """Return True if set points may come for this measurement: it and the daemon allow it, with a ROS sink."""

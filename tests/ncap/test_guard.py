@@ -7,7 +7,6 @@ import json
 import os
 import socket
 import stat
-import subprocess
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +28,7 @@ from teds_provision.ncap.web.tokens import Tokens
 from tests.e2e.desk import PASSPHRASE, Desk
 from tests.ncap.service import Answer, Service, virtual
 from tests.pace import PATIENCE, until
+from tests.places import self_signed
 
 pytestmark = pytest.mark.link
 JSON = {"Content-Type": "application/json"}
@@ -399,14 +399,7 @@ def _strings(value: Any) -> set[str]:
 
 def test_another_host_needs_tls_and_a_name(desk: Desk, tmp_path: Path) -> None:
     station = desk.station()
-    certificate, key = tmp_path / "cert.pem", tmp_path / "key.pem"
-    subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2",
-         "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost", "-keyout", str(key),
-         "-out", str(certificate)],
-        check=True, capture_output=True,
-    )  # fmt: skip
-    tls = ["--tls-cert", certificate, "--tls-key", key]
+    tls = self_signed(tmp_path)
     refused = station.refuses("ncap", "run", "--http", "0.0.0.0:0", code=2)
     assert "--tls-cert" in refused["hint"]
     assert "--http-allow" in station.refuses("ncap", "run", "--http", "0.0.0.0:0", *tls, code=2)["hint"]
@@ -419,7 +412,7 @@ def test_another_host_needs_tls_and_a_name(desk: Desk, tmp_path: Path) -> None:
     import ssl
     import urllib.request
 
-    context = ssl.create_default_context(cafile=str(certificate))
+    context = ssl.create_default_context(cafile=str(tls[1]))
     request = urllib.request.Request(
         f"https://localhost:{port}/api/v1/status", headers={"Authorization": f"Bearer {token}"}
     )

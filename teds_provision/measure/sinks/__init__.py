@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import UsageError
 from teds_provision.lazy import lazy
 from teds_provision.measure.display_units import FileUnits
+from teds_provision.measure.exposure import Exposure
 from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, as_sink_failure
-from teds_provision.measure.sinks.foxglove import ARRAYS, FoxgloveSink
+from teds_provision.measure.sinks.foxglove import ARRAYS, foxglove_sink
 from teds_provision.measure.sinks.mcap.recording import McapSink
 from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
@@ -23,10 +24,10 @@ from teds_provision.measure.sinks.shown import SHOWN, ShownJsonLinesSink, ShownT
 from teds_provision.measure.sinks.text import JsonLinesSink, TextSink
 from teds_provision.measure.sinks.wide import WIDE, WideSink
 
-__all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "in_units", "open_sink"]
+__all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "in_units", "open_sink", "without_scalars"]
 
 if TYPE_CHECKING:
-    from teds_provision.measure.sinks import lines, mcap
+    from teds_provision.measure.sinks import foxglove_server, lines, mcap
 else:
     __getattr__ = lazy(__name__)
 
@@ -48,7 +49,7 @@ SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {
     "ros2": ros2_sink,
     "mqtt": MqttSink,
     "mqtts": MqttSink,
-    "foxglove": FoxgloveSink,
+    "foxglove": foxglove_sink,
 }
 
 
@@ -69,16 +70,23 @@ def in_units(spec: str, units: FileUnits) -> str:
     return f"{SHOWN}{spec}" if text and not spec.startswith(SHOWN) else spec
 
 
-def open_sink(spec: str, commands: CommandTaker | None = None) -> Sink:
+def open_sink(spec: str, commands: CommandTaker | None = None, exposure: Exposure | None = None) -> Sink:
     """Return the sink of a spec, not yet opened.
 
     A file, ``wide:FILE``, either of them behind ``shown:`` for display units, ``ros1[:URL]``, ``ros2[:DOMAIN]``,
     ``mqtt://HOST`` or ``foxglove[:HOST:PORT]``; MCAP and Foxglove behind ``arrays:`` have no topics of single channels.
-    ``commands`` receives set points that come by the sink; None if no actuator may be moved. Raises UsageError.
+    ``commands`` receives set points that come by the sink; None if no actuator may be moved. ``exposure`` protects a
+    server beyond loopback. Raises UsageError.
     """
     if spec.startswith(ARRAYS):
         bare = spec.removeprefix(ARRAYS)
-        return FoxgloveSink(bare, scalars=False) if is_foxglove(bare) else McapSink(Path(bare), scalars=False)
+        return (
+            foxglove_sink(bare, scalars=False, exposure=exposure)
+            if is_foxglove(bare)
+            else McapSink(Path(bare), scalars=False)
+        )
+    if is_foxglove(spec):
+        return foxglove_sink(spec, exposure=exposure)
     service = spec.partition(":")[0]
     if service in SERVICES:
         return SERVICES[service](spec, commands)

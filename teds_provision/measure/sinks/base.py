@@ -53,7 +53,11 @@ class Sink(Protocol):
 
     @property
     def recorder(self) -> bool:
-        """True if it keeps whatever the disk has room for; else it is live, and counts against the budget."""
+        """True if it keeps whatever the disk has room for; else it is live."""
+
+    @property
+    def budgeted(self) -> bool:
+        """True if its messages count against the budget of those that go to ROS and MQTT."""
 
     @property
     def wants_rows(self) -> bool:
@@ -97,6 +101,7 @@ class ThreadedSink(ABC):
     """
 
     recorder = False
+    budgeted = False
     wants_rows = False  # whether rows of a group's grid are of use to it
 
     def __init__(self, name: str) -> None:

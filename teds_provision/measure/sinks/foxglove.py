@@ -2,24 +2,22 @@
 
 The topics and schemas are those of our MCAP (``sinks/mcap/recording.py``): one of each stream, one of each channel
 unless the sink was made without, ``…/teds`` with the facts, and ``reports``; the log time of a message is that of the
-sample. The facts of channels are parameters too, which nobody can set: the SDK accepts a connection from any page in a
-local browser (its Origin is not checked), so nothing here changes anything. Values reach a client in order; for one
-that reads too slowly the server drops the oldest (1,024 messages are kept for each client).
+sample. The facts of channels are parameters too. Values reach a client in order. ``measure`` has a server for its one
+measurement, ``ncap run`` one for all of them (:mod:`.foxglove_server`).
 """
 
 from __future__ import annotations
 
-import ipaddress
 import json
 import time
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from teds_provision.errors import LinkError, UsageError
-from teds_provision.lazy import how_to_install
 from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, GroupRows, NodeReport, StationFacts
+from teds_provision.measure.exposure import Exposure
 from teds_provision.measure.sinks.base import CommandTaker, Item, ThreadedSink
+from teds_provision.measure.sinks.foxglove_server import USUAL, FoxgloveServer, MeasurementTopics
 from teds_provision.measure.sinks.lines import facts_as_json
 from teds_provision.measure.sinks.mcap.recording import (
     FLOAT,
@@ -41,67 +39,35 @@ if TYPE_CHECKING:
 FOXGLOVE: Final = "foxglove"
 ARRAYS: Final = "arrays:"
 """Prefix of the string of a sink without topics of single channels: this one and MCAP."""
-PORT: Final = 8765
-"""The port that Foxglove offers when a connection is opened."""
 _HEAD: Final = b"\x00\x01\x00\x00"
 
 
 class FoxgloveSink(ThreadedSink):
-    """``foxglove`` or ``foxglove:HOST:PORT``; ``scalars`` False leaves out the topics of single channels."""
+    """Publishes one measurement on a server; without ``scalars`` it has no topics of single channels.
 
-    def __init__(self, spec: str, _commands: CommandTaker | None = None, *, scalars: bool = True) -> None:
+    ``own``: the server is for this measurement alone, and starts and stops with it.
+    """
+
+    def __init__(self, server: FoxgloveServer, *, own: bool, scalars: bool = True) -> None:
         super().__init__(FOXGLOVE)
-        self._host, self._port = address_of(spec)
-        self._with_scalars = scalars
+        self.server = server
+        self._own, self._with_scalars = own, scalars
+        self._published: MeasurementTopics | None = None
         self._topics = Topics(StationFacts(""))
         self._facts: dict[tuple[str, int], ChannelFacts] = {}
         self._streams: dict[tuple[str, int, tuple[int, ...], bool], tuple[foxglove.Channel, np.ndarray, int]] = {}
-        self._channels: dict[str, foxglove.Channel] = {}
-        self._latest: dict[str, bytes] = {}  # facts by topic, for clients that subscribe later
-        self._sdk: Any = None
-        self._context: foxglove.Context | None = None
-        self._server: Any = None
-
-    @property
-    def port(self) -> int:
-        """The port on which it listens, 0 before it is opened."""
-        return int(self._server.port) if self._server is not None else 0
 
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
-        try:
-            import foxglove
-        except ImportError as error:
-            raise UsageError("Foxglove needs the package foxglove-sdk.", hint=how_to_install("foxglove")) from error
-        foxglove.set_log_level("ERROR")  # its server writes a line for each client that leaves
-        self._sdk, self._context = foxglove, foxglove.Context()
         self._topics = Topics(station)
-        listener = _listener(foxglove, self)
-        try:
-            self._server = foxglove.start_server(
-                name=f"teds-provision {station.name}",
-                host=self._host,
-                port=self._port,
-                capabilities=[foxglove.Capability.Parameters],
-                server_listener=listener,
-                context=self._context,
-            )
-        except (RuntimeError, OSError) as error:
-            raise LinkError(
-                f"No Foxglove server can listen on {self._host}:{self._port}: {error}.",
-                hint="Choose another port: --foxglove-at 127.0.0.1:PORT",
-            ) from error
+        if self._own:
+            self.server.start(station.name)
+        self._published = self.server.begin()
         self._channel(self._reports, "std_msgs/msg/String", STRING, {})  # before the first one, else it is missed
         self._describe(facts)
 
     @property
     def _reports(self) -> str:
         return f"/{self._topics.station}/reports"
-
-    def parameters(self, names: list[str]) -> list[Any]:
-        """Return the facts of channels as parameters, by topic; all of them if no name is given."""
-        found = {self._topics.channel(*key): facts_as_json(facts) for key, facts in tuple(self._facts.items())}
-        make = self._sdk.websocket.Parameter
-        return [make(name, value=json.dumps(value)) for name, value in found.items() if not names or name in names]
 
     def _process_item(self, item: Item) -> None:
         if isinstance(item, Block):
@@ -116,25 +82,20 @@ class FoxgloveSink(ThreadedSink):
             return
         self._facts.update((channel_facts.key, channel_facts) for channel_facts in facts)
         self._topics.learn(facts)
+        published = self._published
+        assert published is not None
+        published.parameters = {
+            self._topics.channel(*key): json.dumps(facts_as_json(known)) for key, known in self._facts.items()
+        }
         for uuid in dict.fromkeys(channel_facts.uuid for channel_facts in facts):
             every = [facts_as_json(known) for known in self._facts.values() if known.uuid == uuid]
             topic = self._topics.of_node(uuid, "teds")
-            self._latest[topic] = self._text(topic, json.dumps({"uuid": uuid, "channels": every}), time.time())
+            published.latest[topic] = self._text(topic, json.dumps({"uuid": uuid, "channels": every}), time.time())
         self._streams = {key: value for key, value in self._streams.items() if key[0] not in {f.uuid for f in facts}}
 
     def _channel(self, topic: str, kind: str, definition: str, metadata: dict[str, str]) -> foxglove.Channel:
-        """Return the channel of a topic, which clients see from now on; one topic keeps its channel."""
-        if topic not in self._channels:
-            schema = self._sdk.Schema(name=kind, encoding="ros2msg", data=definition.encode())
-            self._channels[topic] = self._sdk.Channel(
-                topic, schema=schema, message_encoding="cdr", context=self._context, metadata=metadata
-            )
-        return self._channels[topic]
-
-    def repeat(self, topic: str) -> None:
-        """Send the facts of a node again, if ``topic`` is theirs; called from a thread of the SDK."""
-        if topic in self._latest:
-            self._channels[topic].log(self._latest[topic], log_time=time.time_ns())
+        assert self._published is not None
+        return self._published.channel(topic, kind, definition, metadata)
 
     def _text(self, topic: str, words: str, at: float) -> bytes:
         octets = words.encode() + b"\0"
@@ -172,47 +133,15 @@ class FoxgloveSink(ThreadedSink):
         return len(block.channels) * len(times)
 
     def _finish(self) -> None:
-        if self._server is not None:
-            self._server.stop()
+        if self._published is not None:
+            self._published.end()
+        if self._own:
+            self.server.stop()
 
 
-def _listener(sdk: Any, sink: FoxgloveSink) -> Any:
-    """Return what the SDK calls from its threads; the base class is the SDK's, which is loaded late."""
-
-    class Listener(sdk.websocket.ServerListener):  # type: ignore[misc]
-        """Answers requests for parameters, and sends a late subscriber the facts; nothing can be set."""
-
-        def on_get_parameters(self, _client: Any, param_names: list[str], _request_id: str | None = None) -> list[Any]:
-            """Return the parameters of these names, or all."""
-            return sink.parameters(param_names)
-
-        def on_set_parameters(self, _client: Any, parameters: list[Any], _request_id: str | None = None) -> list[Any]:
-            """Return the present values: what a client sets is ignored."""
-            return sink.parameters([parameter.name for parameter in parameters])
-
-        def on_subscribe(self, _client: Any, channel: Any) -> None:
-            """Send the facts again to a client that subscribed after they had been sent."""
-            sink.repeat(channel.topic)
-
-    return Listener()
-
-
-def address_of(spec: str) -> tuple[str, int]:
-    """Return host and port of ``foxglove[:HOST:PORT]``; raises UsageError for a host that is not of this machine."""
-    where = spec.removeprefix(FOXGLOVE).removeprefix(":")
-    if not where:
-        return "127.0.0.1", PORT
-    host, _, port = where.rpartition(":")
-    host = host.strip("[]") or "127.0.0.1"
-    if not port.isdecimal() or int(port) > 65535:
-        raise UsageError(f"{where!r} is no address.", hint="Give HOST:PORT, for example 127.0.0.1:8765.")
-    try:
-        loopback = host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        loopback = False
-    if not loopback:
-        raise UsageError(
-            f"Foxglove's server has no login, so it listens on this machine only, not on {host}.",
-            hint=f"From another machine: ssh -L {port}:127.0.0.1:{port} THIS-MACHINE",
-        )
-    return host, int(port)
+def foxglove_sink(
+    spec: str, _commands: CommandTaker | None = None, *, scalars: bool = True, exposure: Exposure | None = None
+) -> FoxgloveSink:
+    """Return the sink of ``foxglove`` or ``foxglove:HOST:PORT``, with a server of its own; raises UsageError."""
+    address = spec.removeprefix(FOXGLOVE).removeprefix(":")
+    return FoxgloveSink(FoxgloveServer(address or USUAL, exposure), own=True, scalars=scalars)

@@ -85,6 +85,7 @@ class TopicSink(ThreadedSink):
     """Decides what goes out; subclasses carry it: six steps, all on the sink's thread."""
 
     wants_rows = True
+    budgeted = True
 
     def __init__(self, name: str, commands: CommandTaker | None) -> None:
         super().__init__(name)

@@ -16,9 +16,12 @@ import pytest
 
 from teds_provision.errors import LinkError, UsageError
 from teds_provision.measure.blocks import NodeReport
+from teds_provision.measure.exposure import Exposure
 from teds_provision.measure.running.measurement_job import whole_path
 from teds_provision.measure.sinks import open_sink, without_scalars
-from teds_provision.measure.sinks.foxglove import FoxgloveSink, address_of
+from teds_provision.measure.sinks.foxglove import FoxgloveSink, foxglove_sink
+from teds_provision.measure.sinks.foxglove_server import FoxgloveServer, address_of
+from tests.places import self_signed
 
 from .parts import ANGLE, ARM, STATION, block
 
@@ -39,7 +42,7 @@ def client(port: int, messages: int, channels: int) -> subprocess.Popen[str]:
 def received(sink: FoxgloveSink, items: list[Any], messages: int, channels: int) -> dict[str, Any]:
     sink.open((ANGLE,), STATION)
     sink.write(items[0])  # so that its channels exist when the client subscribes
-    with client(sink.port, messages, channels) as reader:
+    with client(sink.server.port, messages, channels) as reader:
         assert reader.stdout is not None
         assert json.loads(reader.stdout.readline())["subscribed"]
         for item in items[1:]:
@@ -56,7 +59,7 @@ def received(sink: FoxgloveSink, items: list[Any], messages: int, channels: int)
 def test_a_client_of_another_process_decodes_streams_channels_reports_and_parameters() -> None:
     data = block([[10, 20], [11, 21]], valid=[[True, False], [True, True]], channels=(1, 2), index=5)
     report = NodeReport(ARM, "running", lost=3, time=1_795_000_001.0)
-    found = received(FoxgloveSink("foxglove:127.0.0.1:0"), [block(channels=(1, 2), raw=[[1, 2]]), data, report], 7, 5)
+    found = received(foxglove_sink("foxglove:127.0.0.1:0"), [block(channels=(1, 2), raw=[[1, 2]]), data, report], 7, 5)
     streams = found["messages"]["/bench/arm/stream_0"]
     assert [message["index"] for message in streams] == [5, 6]
     assert [message["raw"] for message in streams] == [[10, 20], [11, 21]]
@@ -75,7 +78,7 @@ def test_a_client_of_another_process_decodes_streams_channels_reports_and_parame
 
 
 def test_without_scalars_there_are_streams_alone() -> None:
-    sink = FoxgloveSink("foxglove:127.0.0.1:0", scalars=False)
+    sink = foxglove_sink("foxglove:127.0.0.1:0", scalars=False)
     found = received(sink, [block([[1]]), block([[7]])], 1, 3)
     assert set(found["channels"]) == {"/bench/arm/stream_0", "/bench/arm/teds", "/bench/reports"}
 
@@ -89,16 +92,28 @@ def test_a_kept_sink_is_made_again_as_it_was_asked_for(tmp_path: Path) -> None:
     assert without_scalars("run.csv") == "run.csv"
 
 
-def test_only_this_machine_is_served_and_a_taken_port_is_said() -> None:
-    assert address_of("foxglove") == ("127.0.0.1", 8765)
-    assert address_of("foxglove:[::1]:9000") == ("::1", 9000)
-    for spec in ("foxglove:192.168.1.2:8765", "foxglove:0.0.0.0:8765", "foxglove:bench:8765", "foxglove:127.0.0.1:x"):
-        with pytest.raises(UsageError):
-            address_of(spec)
-    first = FoxgloveSink("foxglove:127.0.0.1:0")
-    first.open((ANGLE,), STATION)
+def test_only_this_machine_is_served_unless_a_name_is_allowed_and_tls_is_there(tmp_path: Path) -> None:
+    tls = self_signed(tmp_path)
+    alone, open_ = Exposure(), Exposure(("bench",), tls[1], tls[3])
+    assert address_of("[::1]:9000", alone) == ("::1", 9000)
+    assert address_of("localhost:9000", alone) == ("localhost", 9000)
+    assert address_of("9000", alone) == ("127.0.0.1", 9000)
+    for address in ("192.168.1.2:8765", "0.0.0.0:8765", "bench:8765"):
+        assert address_of(address, open_)[1] == 8765
+        for lacking in (alone, Exposure(("bench",)), Exposure((), tls[1], tls[3])):
+            with pytest.raises(UsageError, match=address.partition(":")[0]):
+                address_of(address, lacking)
+    for address in ("127.0.0.1:x", "127.0.0.1:65536", "localhost"):
+        with pytest.raises(UsageError, match="no address"):
+            address_of(address, open_)
+    assert open_.url("ws", "0.0.0.0", 8765) == "wss://bench:8765"
+
+
+def test_a_taken_port_is_said() -> None:
+    first = FoxgloveServer("127.0.0.1:0")
+    first.start("bench")
     try:
         with pytest.raises(LinkError, match=str(first.port)):
-            FoxgloveSink(f"foxglove:127.0.0.1:{first.port}").open((ANGLE,), STATION)
+            foxglove_sink(f"foxglove:127.0.0.1:{first.port}").open((ANGLE,), STATION)
     finally:
-        first.close()
+        first.stop()

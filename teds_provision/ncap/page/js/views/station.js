@@ -15,6 +15,7 @@ export function stationView(main) {
   const linkless = noLink();
   const sinks = h("ul", { class: "lines" });
   const noSink = h("div", {});
+  const foxglove = h("p", { class: "hint", hidden: true });
   const plantFacts = h("dl", { class: "facts-list" });
   const plant = h("ul", { class: "lines" });
   const holders = h("ul", { class: "lines", "aria-label": "Who holds a node" });
@@ -37,7 +38,7 @@ export function stationView(main) {
       h("section", { class: "panel", "aria-label": "About" }, h("h3", {}, "About"), facts),
       plantPanel,
       line.panel,
-      h("section", { class: "panel", "aria-label": "Where values go" }, h("h3", {}, "Where values go"), noSink, sinks),
+      h("section", { class: "panel", "aria-label": "Where values go" }, h("h3", {}, "Where values go"), foxglove, noSink, sinks),
       h("section", { class: "panel", "aria-label": "Published names" }, h("div", { class: "panel-head" }, h("h3", {}, "Published names"), find), noName, h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Published names" }, table), further),
     ),
   );
@@ -49,12 +50,14 @@ export function stationView(main) {
       again(element, [one.state, one.why], () => [icon(one.kind ?? "can"), h("span", { class: "grow" }, h("strong", {}, linkName(one.kind)), " ", one.name), chip(up ? "good" : "warn", up ? "good" : "warn", one.state), one.why ? h("p", { class: "hint full" }, one.why, one.hint ? ` ${one.hint}` : "") : null]);
     });
     linkless.hidden = !isLinkless();
-    keyed(sinks, status.sinks ?? [], (one) => one.name, () => h("li", {}), (element, one) => {
+    foxglove.hidden = !status.foxglove;
+    fill(foxglove, "Live for Foxglove on ", h("code", {}, status.foxglove ?? ""));
+    keyed(sinks, status.sinks ?? [], (one) => `${one.measurement}/${one.name}`, () => h("li", {}), (element, one) => {
       const bad = one.state === "failed";
       again(element, one, () => [h("span", { class: "grow" }, h("strong", {}, one.name), h("span", { class: "hint" }, ` ${count(one.written ?? 0, "value")} written, ${one.dropped ?? 0} dropped`)), chip(bad ? "bad" : one.dropped ? "warn" : "good", bad || one.dropped ? "warn" : "good", one.state), one.error || ((one.recorder || one.state === "waiting") && one.detail) ? h("p", { class: "hint full" }, one.error || one.detail, one.hint ? ` ${one.hint}` : "") : null]);
     });
-    if ((status.sinks ?? []).length) noSink.replaceChildren();
-    else if (!noSink.firstChild) fill(noSink, empty("Values are not recorded or published.", h("p", {}, "Start ncap run with --record, --ros1, --ros2 or --mqtt, or enter a file name when you start a group.")));
+    if ((status.sinks ?? []).length || status.foxglove) noSink.replaceChildren();
+    else if (!noSink.firstChild) fill(noSink, empty("Values are not recorded or published.", h("p", {}, "Start ncap run with --record, --ros1, --ros2, --mqtt or --foxglove, or enter a file name when you start a group.")));
     about(status);
     paintPlant();
     if (state.names.length) noName.replaceChildren();
