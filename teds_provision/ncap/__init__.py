@@ -5,6 +5,7 @@ module                      what it does
 ==========================  ========================================================================
 ``service_run``             from start to end: lock, socket, servers, signals
 ``settings``                what it was started with
+``waits``                   how long it pauses between looks
 ``daemon``                  begins and ends all of its parts, in order
 ``measurement_supervisor``  what it measures, across restarts
 ``dynamic_membership``      who joins and leaves one that measures whoever comes

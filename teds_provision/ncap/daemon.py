@@ -39,23 +39,27 @@ from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.ncap.plant import PlantWatch
 from teds_provision.ncap.settings import Detection, Settings, own_source
 from teds_provision.ncap.sinks import DaemonSinks
+from teds_provision.ncap.waits import USUAL, Waits
 from teds_provision.ncap.web.tokens import Tokens
 from teds_provision.station.station import Station
 from teds_provision.steps.commands import locate_here, locate_measured
 from teds_provision.talk.conversation import Conversation
 
 _log = logging.getLogger(__name__)
-_LOOK: Final = 1.0
-"""Seconds between two looks whether another process has changed the store."""
 _ENDING: Final = 8.0
-_DISCOVERY: Final = 1.5
 
 
 class Daemon:
     """All that runs, over one station; what the API calls."""
 
-    def __init__(self, station: Station, settings: Settings, foxglove: FoxgloveServer | None = None) -> None:
-        self.station, self.settings, self.foxglove = station, settings, foxglove
+    def __init__(
+        self,
+        station: Station,
+        settings: Settings,
+        foxglove: FoxgloveServer | None = None,
+        waits: Waits = USUAL,
+    ) -> None:
+        self.station, self.settings, self.foxglove, self.waits = station, settings, foxglove, waits
         self.live, self.node_locks, self.tokens = Live(), NodeLocks(), Tokens(station.home)
         self.directory = NodeDirectory(station, self.live)
         self.buses = Buses(news=self._saw, note=lambda text: self.live.event("link", state="notice", why=text))
@@ -80,6 +84,7 @@ class Daemon:
             self._admits,
             dead_man=settings.dead_man,
             require_firmware=settings.require_firmware,
+            waits=self.waits,
         )
         self.node_locks.given = self._free_again
         self._takes_set_points = sinks.take_set_points
@@ -164,7 +169,7 @@ class Daemon:
             watch.join(max(0.1, until - time.monotonic()))
         self.virtuals.stop()
         self.live.history.close()
-        self._observer.join(_LOOK)
+        self._observer.join(self.waits.store)
 
     async def serve(self, begin: Callable[[], Any], stop: asyncio.Event) -> None:
         """Fan out what is live until ``stop``; ``begin`` is awaited once the loop runs."""
@@ -194,9 +199,17 @@ class Daemon:
         def transparent() -> bool:
             return self.detection == "transparent"
 
-        buses, trace = self.buses, self.settings.trace
         return LinkWatch(
-            place, self.station, self.directory, self.live, self.node_locks, self, transparent, buses, trace
+            place,
+            self.station,
+            self.directory,
+            self.live,
+            self.node_locks,
+            self,
+            transparent,
+            self.buses,
+            self.settings.trace,
+            self.waits,
         )
 
     def _start_virtuals(self) -> None:
@@ -209,8 +222,8 @@ class Daemon:
             self.virtuals.start()
 
     def _observe(self) -> None:
-        """Follow within a second what the command line does beside us; end the service if a newer version did it."""
-        while not self._stop.wait(_LOOK):
+        """Follow what the command line does beside us; end the service if a newer version did it."""
+        while not self._stop.wait(self.waits.store):
             try:
                 self._look_at_vault()
                 for uuid in self.directory.follow_profiles():
@@ -354,7 +367,7 @@ class Daemon:
         """Ask every link now, and give the nodes after a moment."""
         for watch in self.watches:
             watch.look_at_all()
-        self._stop.wait(_DISCOVERY)
+        self._stop.wait(self.waits.discovery)
         return self.directory.nodes()
 
     def locate(self, uuid: str, seconds: int) -> None:

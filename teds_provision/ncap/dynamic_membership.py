@@ -33,6 +33,7 @@ from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.measure.standing import why_not_measured
 from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
+from teds_provision.ncap.waits import Waits
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 
@@ -47,8 +48,6 @@ FIRST_ASK, LAST_ASK, ASKED = (
 ANSWERING: Final = 1.0
 AGAIN: Final = 30.0  # seconds until one that may not be measured, or has no room, is tried again without other news
 SLOWEST: Final = 50.0  # a newcomer is slowed down so many times at most; then it waits for room
-WELCOMING: Final = 10.0  # seconds between looks at whose keys are held
-FOLLOWING: Final = 2.0  # seconds between checks whether members are still selected, after a change of the store
 NO_ROOM: Final = "no room on the bus"
 
 
@@ -102,7 +101,9 @@ class DynamicMembership:
         past: Callable[[str], None],
         budget: float | None,
         rows: bool,
+        waits: Waits,
     ) -> None:
+        self._pauses = waits
         self._station, self._directory, self._node_locks, self._buses, self._job = station, roster, turns, buses, job
         self._match, self._elsewhere, self._budget = match, elsewhere, budget
         self._rows = rows
@@ -119,7 +120,7 @@ class DynamicMembership:
         self._left: set[str] = set()  # nodes that are not members, and about which there was a notice
         self._places: dict[str, Sighting] = {}  # where each was measured, or was to be
         self._version: object = None
-        self._welcomed, self._followed = -WELCOMING, -FOLLOWING
+        self._welcomed, self._followed = -waits.keys, -waits.selection
         self._began = time.monotonic()
         self._measurement: Measurement | None = None
         self._askers = ThreadPoolExecutor(4, thread_name_prefix="ask")
@@ -195,7 +196,7 @@ class DynamicMembership:
             for uuid in list(self._members):
                 self._release(uuid)
             self._measurement = measurement
-            self._version, self._followed = None, -FOLLOWING
+            self._version, self._followed = None, -self._pauses.selection
         now = time.monotonic()
         self._follow_the_store(now)
         for uuid in list(self._members):
@@ -235,12 +236,12 @@ class DynamicMembership:
     def _follow_the_store(self, now: float) -> None:
         """Re-evaluate the selection after a change by another process (a name, a group, a ban, a key)."""
         version = self._station.version()
-        if now - self._welcomed >= WELCOMING:
+        if now - self._welcomed >= self._pauses.keys:
             self._welcomed = now
             held = {uuid for uuid, *_ in self._station.keys.all_key_names()}
             self._buses.presence.welcome(held)
         changed = version != self._version or self._anew.is_set()
-        if not changed or now - self._followed < FOLLOWING:
+        if not changed or now - self._followed < self._pauses.selection:
             return
         self._anew.clear()
         self._version, self._followed = version, now

@@ -42,6 +42,7 @@ from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.inspection import as_problem
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
 from teds_provision.ncap.sinks import DaemonSinks, sink_json
+from teds_provision.ncap.waits import USUAL, Waits
 from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.shapes.measurement import MeasurementSpec
 from teds_provision.station.station import Station
@@ -110,7 +111,9 @@ class MeasurementSupervisor:
         *,
         dead_man: int = DEAD_MAN,
         require_firmware: bool = False,
+        waits: Waits = USUAL,
     ) -> None:
+        self._waits = waits
         self._require_firmware = require_firmware
         self._station, self._directory, self._live, self._node_locks = station, roster, live, turns
         self._unverified: UnsignedNodes | None = None
@@ -686,6 +689,7 @@ class MeasurementSupervisor:
                 past=past,
                 budget=BUDGET if live else None,
                 rows=any(sink.wants_rows for sink in live),
+                waits=self._waits,
             )
             running.membership = newcomers
         except TedsProvisionError as error:

@@ -19,6 +19,7 @@ from teds_provision.files import listen_alone, open_lock
 from teds_provision.measure.sinks.foxglove_server import FoxgloveServer
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.settings import Settings, require_safe
+from teds_provision.ncap.waits import USUAL, Waits
 from teds_provision.ncap.web.app import build
 from teds_provision.ncap.web.guard import Guard, front
 from teds_provision.ncap.web.server import Servers, listen
@@ -69,7 +70,7 @@ class DaemonLock:
 Tell = Callable[[dict[str, Any]], None]
 
 
-def run(station: Station, settings: Settings, tell: Tell) -> None:
+def run(station: Station, settings: Settings, tell: Tell, waits: Waits = USUAL) -> None:
     """Run until SIGTERM or Ctrl-C; ``tell`` gets the ready line, then a line for each event.
 
     Raises StoreLockedError if this home has a daemon, LinkError if an address is taken, UsageError.
@@ -83,7 +84,7 @@ def run(station: Station, settings: Settings, tell: Tell) -> None:
         try:
             if foxglove is not None:
                 foxglove.start(station.name)
-            daemon = Daemon(station, settings, foxglove)
+            daemon = Daemon(station, settings, foxglove, waits)
             with MasterSocket(station.home, station.accept_masters):
                 asyncio.run(_serve(daemon, local, tcp, tell))
             if daemon.failure is not None:

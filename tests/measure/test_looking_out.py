@@ -19,7 +19,8 @@ from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.discovery import LEAST, BroadcastPace, Sighting
 from teds_provision.measure.presence import Presence
-from teds_provision.ncap.nodes.link_watch import CHECK, MAX_PARALLEL, PresenceCheck
+from teds_provision.ncap.nodes.link_watch import MAX_PARALLEL, PresenceCheck
+from teds_provision.ncap.waits import USUAL
 from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from tests.links.can.conftest import hub, nodes  # noqa: F401  fixtures
@@ -128,7 +129,7 @@ def test_a_question_that_the_missing_node_did_not_hear_is_asked_again_at_once(
 
     with looked_for(lookout):
         until(lambda: asked(hub)[0] >= 3)
-        best_of(BELIEVED - 1, LEAST, pause)
+        best_of(BELIEVED - 1, LEAST, pause, because="as many announcements are believed")
     pace = BroadcastPace(time.monotonic(), first=SOON)
     until(lambda: pace.is_due(wanted=False, missing=True, poll=None))
     pace.asked = time.monotonic()
@@ -229,8 +230,8 @@ def asks(bus: Bus, known: dict[str, Sighting], held: str = "") -> dict[str, bool
 
 def test_a_node_is_gone_when_it_does_not_answer_twice_and_not_before() -> None:
     uuids = {number: bytes([number]) * 10 for number in range(1, 6)}
-    known = {uuid.hex(): last_heard(uuid, number, 2 * CHECK) for number, uuid in uuids.items()}
-    known["fresh"] = last_heard(ONE, 9, CHECK / 2)
+    known = {uuid.hex(): last_heard(uuid, number, 2 * USUAL.silent_node) for number, uuid in uuids.items()}
+    known["fresh"] = last_heard(ONE, 9, USUAL.silent_node / 2)
     other = seen(b"\x63" * 10, 3).identity
     bus = Bus(
         a1=None, a2=[None, seen(uuids[2], 2).identity], a3=other, a4=AddressConflictError("two"), a5=LinkError("x")
@@ -245,6 +246,7 @@ def test_a_node_is_gone_when_it_does_not_answer_twice_and_not_before() -> None:
 
 def test_who_is_held_is_not_asked_and_no_more_than_five_are_at_once() -> None:
     uuids = [bytes([number]) * 10 for number in range(1, 12)]
-    known = {uuid.hex(): last_heard(uuid, number, 2 * CHECK + number) for number, uuid in enumerate(uuids, 1)}
+    silence = 2 * USUAL.silent_node
+    known = {uuid.hex(): last_heard(uuid, number, silence + number) for number, uuid in enumerate(uuids, 1)}
     found = asks(Bus(), known, held=uuids[-1].hex())
     assert list(found) == [uuid.hex() for uuid in reversed(uuids[-1 - MAX_PARALLEL : -1])]

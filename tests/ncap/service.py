@@ -16,6 +16,7 @@ import jsonschema
 from teds_provision import client
 from teds_provision.api.operations import document
 from tests.e2e.desk import Desk, Running, Station
+from tests.ncap import short_waits
 from tests.pace import PATIENCE, until
 
 
@@ -84,10 +85,10 @@ class Service:
     closing: list[client.Client] = field(default_factory=list)
 
     def start(self, *more: object, **how: Any) -> Service:
-        """Start it, and wait until it says that it is ready."""
-        self.process = self.station.start(
-            "--json", "ncap", "run", "--http", "127.0.0.1:0", "--can", self.desk.links.can, *self.words, *more, **how
-        )
+        """Start it, and wait until it says that it is ready; with short waits unless ``program`` is another one."""
+        words = ("--json", "ncap", "run", "--http", "127.0.0.1:0", "--can", self.desk.links.can, *self.words, *more)
+        how.setdefault("program", short_waits.PROGRAM)
+        self.process = self.station.start(*words, **how)
         [ready, *_] = self.process.wait_for_lines(1)
         assert ready.get("ready") is True, ready
         self.url = ready["url"]

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
+from tests.cli.shell import PROGRAM
 from tests.e2e.desk import ANGLE
 from tests.measure.hall import Hall, events
 from tests.ncap.service import Service, until, verdict
@@ -57,7 +58,7 @@ def test_a_node_of_the_whitelist_does_not_wait_for_strangers(hall: Hall, tmp_pat
     group, port = of_spec(hall.desk.links.can)
     service = Service(hall.desk, hall.station, ("--detection", "transparent"))
     with Attacker(group, port, silent_strangers(STRANGERS)):
-        asked = service.start().client()
+        asked = service.start(program=PROGRAM).client()
         until(lambda: sum(node["present"] for node in asked.nodes()) == len(STRANGERS))
         hall.nodes["a"].start(can=hall.desk.links.can)
         until(lambda: asked.node(hall.nodes["a"].uuid)["verified"])
@@ -75,7 +76,7 @@ def test_the_count_of_strangers_is_told_now_and_then(hall: Hall) -> None:
     service = Service(hall.desk, hall.station, ("--detection", "whitelist"))
     said: list[bytes] = []
     with Attacker(group, port, always_new(STRANGERS, said)):
-        asked = service.start().client()
+        asked = service.start(program=PROGRAM).client()
         until(lambda: len(said) > 2 * len(STRANGERS) and asked.status()["strangers"])
     assert service.process is not None
     service.end()
@@ -88,7 +89,7 @@ def test_reads_of_a_node_that_does_not_answer_hold_up_no_other_request(hall: Hal
     """Six of them, with a token that may only read, had stopped the whole API: status, other tokens, set points."""
     service = Service(hall.desk, hall.station, ("--detection", "whitelist"))
     node = hall.nodes["a"].start(can=hall.desk.links.can)
-    asked = service.start().client()
+    asked = service.start(program=PROGRAM).client()
     until(lambda: asked.node(node.uuid)["verified"])
     reader = {"Authorization": f"Bearer {service.token('reader', '--read-only')}"}
     writer = {"Authorization": f"Bearer {service.token('writer')}", "Content-Type": "application/json"}

@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.web import app
+from teds_provision.ncap.waits import USUAL
 from teds_provision.ncap.web.app import MOST_LISTENERS, OF_ONE_TOKEN, LiveSlots
 from teds_provision.ncap.web.tokens import Tokens, digest_of
 from teds_provision.station.store import StoreLock
@@ -79,7 +79,7 @@ def read_on(client: ClientConnection) -> None:
 
 @pytest.mark.link
 def test_a_token_that_is_removed_ends_its_open_channel_and_no_other(service: Service) -> None:
-    assert app.LOOK_AT_TOKEN <= 1.0, "within two seconds"
+    assert USUAL.token <= 1.0, "within two seconds"
     with listening(service, service.token("stays")) as stays, listening(service, service.token("goes")) as goes:
         service.station.ask("ncap", "token", "remove", "goes")
         with pytest.raises(ConnectionClosed) as ended:

@@ -15,6 +15,7 @@ from urllib.parse import quote
 from teds_provision import client
 from tests.bench import PASSPHRASE, make_station
 from tests.e2e.desk import ANGLE, Desk, Node, Running, Station
+from tests.ncap import short_waits
 from tests.places import free_tcp_port
 
 if TYPE_CHECKING:
@@ -76,6 +77,7 @@ class Lab:
         """Start the daemon and wait until it serves."""
         links = ["--can", self.can, "--nfc", self.desk.links.nfc]
         words = ["--home", self.station.home, "--json", "ncap", "run", "--http", f"127.0.0.1:{self.port}", *links]
+        more.setdefault("program", short_waits.PROGRAM)
         self.daemon = self.desk.start(*words, *options, passphrase=PASSPHRASE, **more)
         self.daemon.wait_for('"ready": true')
 

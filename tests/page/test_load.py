@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.cli.shell import PROGRAM
+
 from .lab import Lab
 from .load import run
 
@@ -18,7 +20,7 @@ pytestmark = [pytest.mark.system, pytest.mark.realtime]
 def test_twenty_channels_at_100_hz_lose_nothing_that_is_not_told_and_need_no_more_memory(
     browser: Browser, fresh: Lab
 ) -> None:
-    fresh.run()
+    fresh.run(program=PROGRAM)
     seen = run(browser, fresh, 8)
     assert seen.grown < 3_000_000, seen
     assert seen.drawn > 0, seen

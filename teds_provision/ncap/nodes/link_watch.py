@@ -27,6 +27,7 @@ from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.inspection import NodeInspection, as_problem, look, read_anew
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
+from teds_provision.ncap.waits import USUAL, Waits
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLostError
@@ -34,10 +35,9 @@ from teds_provision.talk.conversation import Conversation, SessionLostError
 # Whether a node that was seen on a bus is still there: it is asked itself, twice, before it is said to have left.
 #
 # Everybody is asked every 30 s only (operation.md section 7), and on a busy machine an answer to that may come too
-# late. So a node that was silent for CHECK seconds gets an Identify of its own: at most MAX_PARALLEL a second, once in
-# 10 s each, the bound that the contract sets for nodes that announce themselves.
+# late. So a node that was silent for a while (Waits.silent_node) gets an Identify of its own: at most MAX_PARALLEL a
+# second, once in 10 s each, the bound that the contract sets for nodes that announce themselves.
 
-CHECK: Final = 10.0
 MAX_PARALLEL: Final = 5
 PATIENCE: Final = (1.0, 3.0)  # seconds for the answer to the first question, and to the second
 
@@ -45,8 +45,8 @@ PATIENCE: Final = (1.0, 3.0)  # seconds for the answer to the first question, an
 class PresenceCheck:
     """Asks the nodes of one bus. ``held`` returns nodes that other parts hear meanwhile: measured, or worked with."""
 
-    def __init__(self, port: MeasuringLink, held: Callable[[str], bool]) -> None:
-        self._port, self._held = port, held
+    def __init__(self, port: MeasuringLink, held: Callable[[str], bool], waits: Waits = USUAL) -> None:
+        self._port, self._held, self._silence = port, held, waits.silent_node
         self._asked: dict[str, float] = {}
         self._last = 0.0
 
@@ -55,7 +55,7 @@ class PresenceCheck:
         now = time.monotonic()
         if now - self._last < 1.0:
             return
-        due = [uuid for uuid, last in known.items() if now - max(last.at, self._asked.get(uuid, 0.0)) >= CHECK]
+        due = [uuid for uuid, last in known.items() if now - max(last.at, self._asked.get(uuid, 0.0)) >= self._silence]
         due.sort(key=lambda uuid: known[uuid].at)
         silent = [uuid for uuid in due if not self._held(uuid)][:MAX_PARALLEL]
         self._asked = {uuid: at for uuid, at in self._asked.items() if uuid in known} | dict.fromkeys(silent, now)
@@ -91,7 +91,6 @@ FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 LOOK_AGAIN: Final = 30.0  # seconds until a node that could not be looked at is looked at again
 SILENT: Final = 37.5  # seconds after which a node has left that is not asked by itself
 LENDING: Final = 10.0
-LOOK: Final = 0.5
 
 
 class NodeObserver(Protocol):
@@ -127,7 +126,9 @@ class LinkWatch:
         transparent: Callable[[], bool],
         buses: Buses,
         trace: Trace | None = None,
+        waits: Waits = USUAL,
     ) -> None:
+        self._waits = waits
         self.place = place
         self.state = LinkState(place)
         self.port: Port | None = None
@@ -219,7 +220,7 @@ class LinkWatch:
         """
         bus = self._buses.add(port)
         bus.discovery.poll(port.poll_seconds)
-        asked = PresenceCheck(port, self._is_held) if port.capabilities.connectionless else None
+        asked = PresenceCheck(port, self._is_held, self._waits) if port.capabilities.connectionless else None
         while not self._stop.is_set():
             if self._anew.is_set():
                 self._anew.clear()
@@ -239,7 +240,7 @@ class LinkWatch:
             else:
                 self._see_who_left(SILENT)
             self._tell_of_strangers()
-            self._anew.wait(LOOK)
+            self._anew.wait(self._waits.link)
 
     def _look_for_all(self) -> None:
         """Inspect all that answer from now on; the others are still known, and so are seen to leave."""

@@ -32,8 +32,6 @@ PAGE: Final = Path(__file__).parent.parent / "page"
 MOST_LISTENERS: Final = 200
 OF_ONE_TOKEN: Final = 100
 """Places that one token may have, while there is room."""
-LOOK_AT_TOKEN: Final = 1.0
-"""Seconds until it is noticed that a token was removed, or is over."""
 _FULL, _NOT_GOOD = 1013, 1008
 _UUID: Final = re.compile(r"[0-9a-f]{20}")
 _LONGEST_PATH: Final = 200
@@ -170,7 +168,7 @@ def _live(daemon: Daemon) -> Callable[[WebSocket], Awaitable[None]]:
             listener = daemon.live.join(reader=caller.read_only)
             try:
                 tasks.append(asyncio.create_task(_send(socket, listener, daemon.hello())))
-                tasks.append(asyncio.create_task(_end_in_time(socket, daemon.tokens, caller, leaving)))
+                tasks.append(asyncio.create_task(_end_in_time(socket, daemon, caller, leaving)))
                 while (await socket.receive())["type"] != "websocket.disconnect":
                     pass
             finally:
@@ -187,19 +185,19 @@ def _watched(daemon: Daemon) -> simulation.Watch:
     """Return what ends the connection of a simulation whose token is invalid."""
 
     async def watch(socket: WebSocket, caller: Caller, leaving: asyncio.Event) -> None:
-        await _end_in_time(socket, daemon.tokens, caller, leaving)
+        await _end_in_time(socket, daemon, caller, leaving)
 
     return watch
 
 
-async def _end_in_time(socket: WebSocket, tokens: Tokens, caller: Caller, leaving: asyncio.Event) -> None:
+async def _end_in_time(socket: WebSocket, daemon: Daemon, caller: Caller, leaving: asyncio.Event) -> None:
     """End the connection when its token is invalid, or its place is another one's."""
     while True:
         with suppress(TimeoutError):
-            await asyncio.wait_for(leaving.wait(), LOOK_AT_TOKEN)
+            await asyncio.wait_for(leaving.wait(), daemon.waits.token)
         if leaving.is_set():
             code, why = _FULL, "This connection was closed to make room for another token."
-        elif caller.kind != "socket" and not _is_good(tokens, caller.digest):
+        elif caller.kind != "socket" and not _is_good(daemon.tokens, caller.digest):
             code, why = _NOT_GOOD, "This token is invalid or has expired."
         else:
             continue
