@@ -15,6 +15,8 @@ from typing import TypeVar
 T = TypeVar("T")
 
 PATIENCE = 120.0  # seconds; what comes at all comes by then, on any machine
+TRIES = 3
+"""Tries that need no reason."""
 
 
 class FailedTryWarning(UserWarning):
@@ -30,11 +32,12 @@ def costs_at_most(seconds: float) -> Iterator[None]:
     assert took < seconds, f"{took:.3f} s of CPU"
 
 
-def best_of(tries: int, limit: float, attempt: Callable[[], float]) -> None:
+def best_of(tries: int, limit: float, attempt: Callable[[], float], *, because: str = "") -> None:
     """Try until ``attempt``, which returns the seconds that it took, took less than ``limit``; once if all is quiet.
 
-    Each failed try is a warning of the run. More than five tries need a comment that says why.
+    Each failed try is a warning of the run. More than three tries must say what a busy machine spoils (``because``).
     """
+    _require_reason(tries, because)
     took: list[float] = []
     while not took or took[-1] >= limit:
         assert len(took) < tries, f"{took} s, never less than {limit} s"
@@ -43,17 +46,22 @@ def best_of(tries: int, limit: float, attempt: Callable[[], float]) -> None:
             _report_failed_try(len(took), tries, f"{took[-1]:.3f} s, not less than {limit} s")
 
 
-def succeeds(tries: int, attempt: Callable[[], object]) -> None:
+def succeeds(tries: int, attempt: Callable[[], object], *, because: str = "") -> None:
     """Try until ``attempt`` finds nothing wrong (it gives something false), ``tries`` times at most.
 
-    For what a busy machine may spoil, once: a defect spoils it each time.
+    For what a busy machine may spoil, once: a defect spoils it each time. Failed tries and ``because``: as for best_of.
     """
+    _require_reason(tries, because)
     wrong: list[object] = []
     while not wrong or wrong[-1]:
         assert len(wrong) < tries, wrong
         wrong.append(attempt())
         if wrong[-1]:
             _report_failed_try(len(wrong), tries, str(wrong[-1]))
+
+
+def _require_reason(tries: int, because: str) -> None:
+    assert because or tries <= TRIES, f"{tries} tries: say what a busy machine spoils (because=)"
 
 
 def _report_failed_try(number: int, tries: int, why: str) -> None:

@@ -193,7 +193,7 @@ class _Record:
         self.outcomes = Outcomes()
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        if report.outcome == "rerun":  # type: ignore[comparison-overlap]  # of pytest-rerunfailures
+        if str(report.outcome) == "rerun":  # of pytest-rerunfailures
             self.outcomes.reruns += 1
         elif report.failed and report.when == "call":
             because = getattr(report, _BECAUSE, "")

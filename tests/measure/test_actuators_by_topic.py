@@ -57,9 +57,8 @@ def test_a_topic_drives_an_actuator_until_it_falls_silent(bench: Bench, master: 
     try:
         process.wait_for('"value": 0.0499')
         running.wait_for('"channel":1')
-        best_of(
-            10, 1, lambda: stopped_within(process, 1.0)
-        )  # a node, a station and a publisher must run in it; twice the dead-man: set points keep it alive
+        why = "a node, a station and a publisher must run in the second, twice the dead-man"
+        best_of(10, 1, lambda: stopped_within(process, 1.0), because=why)  # set points keep it alive
         before = process.out.count('"safe": true')
     finally:
         publisher.kill()

@@ -240,4 +240,4 @@ def test_wall_time_is_read_once() -> None:
     def off() -> float:
         return float(abs(WallClock.now().unix(np.array([time.monotonic()]))[0] - time.time()))
 
-    best_of(5, 0.5, off)
+    best_of(3, 0.5, off)

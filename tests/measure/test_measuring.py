@@ -101,7 +101,7 @@ def test_sample_gives_calibrated_values_with_unit_and_uncertainty(bench: Bench) 
         assert sample["uncertainty"] == pytest.approx(0.01745, abs=1e-4)
         return max(before - sample["time"], sample["time"] - time.time())
 
-    best_of(5, 0.5, beside)
+    best_of(5, 0.5, beside, because="an exchange with the clock is as good as its delay")
     some = bench.ask("sample", bench.gripper.uuid, 3)["samples"]
     assert [item["channel"] for item in some] == [3]
 
@@ -113,7 +113,12 @@ def test_sample_of_an_actuator_or_of_nothing_is_refused(bench: Bench) -> None:
 
 def test_a_measurement_ends_with_its_counts_and_every_file_says_the_same(bench: Bench, tmp_path: Path) -> None:
     tries = iter(range(5))
-    best_of(5, 0.1, lambda: counted(bench, tmp_path / str(next(tries))))
+    best_of(
+        5,
+        0.1,
+        lambda: counted(bench, tmp_path / str(next(tries))),
+        because="a clock is known as well as its best exchange was quick",
+    )
 
 
 def counted(bench: Bench, folder: Path) -> float:
@@ -173,7 +178,7 @@ def test_a_group_is_measured_by_name_begins_together_and_is_frozen_meanwhile(ben
         zeros = [line["time"][0] - line["index"] / 50 for line in firsts]
         return float(max(lines[-1]["began_apart"], abs(zeros[0] - zeros[1])))
 
-    best_of(5, 0.05, apart)
+    best_of(5, 0.05, apart, because="50 ms hold a trigger's way through two processes")
     assert bench.station.ask("group", "remove", "crane", bench.angle.uuid)["groups"][0]["uuids"] == [bench.gripper.uuid]
     assert bench.station.ask("group", "delete", "crane")["groups"] == []
 

@@ -370,7 +370,8 @@ def test_an_actuator_moves_within_its_limits_and_is_let_go(asked: Client, hand: 
         refused(asked, 422, "bad-data", "PUT", f"/nodes/{hand}/channels/9", {"value": 1})
         return bool(asked.node(hand)["channels"][0]["actuator"]["safe"])
 
-    succeeds(5, is_safe_again)  # nor does another channel's refusal end it
+    # Another channel's refusal does not end it either.
+    succeeds(5, is_safe_again, because="a service that is not run for its dead-man lets go, as it must")
     assert asked.request("PUT", path, {"hold": 0})["safe"] is True
     assert asked.node(hand)["channels"][0]["actuator"]["safe"] is True
     assert "0.11" in refused(asked, 422, "refused", "PUT", path, {"value": 5, "hold": 1})
@@ -390,7 +391,7 @@ def test_an_actuator_that_nobody_asks_for_again_is_safe_soon(asked: Client, hand
         until(lambda: asked.node(hand)["channels"][0]["actuator"]["safe"] is True)
         return time.monotonic() - began
 
-    best_of(5, 5, let_go)
+    best_of(5, 5, let_go, because="five seconds hold a request, a dead-man and a node's answer")
 
 
 def test_an_actuator_that_is_held_again_while_it_is_let_go_can_be_let_go(

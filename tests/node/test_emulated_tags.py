@@ -177,7 +177,7 @@ def test_a_paced_exchange_lasts_as_long_as_on_air() -> None:
         assert took > 0.0205  # 10 x 2.09 ms
         return took
 
-    best_of(10, 0.05, ten)  # 21 ms each, and twenty sleeps that a busy machine may prolong
+    best_of(10, 0.05, ten, because="21 ms each, and twenty sleeps that a busy machine may prolong")
 
 
 def test_a_tag_that_cannot_be_is_refused() -> None:

@@ -192,7 +192,7 @@ def test_a_stranger_among_our_own(fd_angle: Stranger, gripper: Stranger) -> None
             found += [stream for stream in streams if stream["late"] > 0.1 * stream["messages"]]
         return found
 
-    succeeds(4, disturbed)
+    succeeds(4, disturbed, because="two measurements of a node that takes turns with them")
 
 
 def test_a_strangers_actuator_is_set_and_left_safe(gripper: Stranger) -> None:
@@ -210,7 +210,7 @@ def test_a_strangers_actuator_is_set_and_left_safe(gripper: Stranger) -> None:
         ended = acting.end().out.splitlines()[-1]
         return safe or (state["claimant"], ended) != (0xF1, '{"event": "end", "safe": true}')
 
-    succeeds(5, let_go_too_soon)
+    succeeds(5, let_go_too_soon, because="a command that is not run for half a second lets go, as it must")
     acting = station.start("--json", "set", gripper.uuid, 1, 0.05, "--dead-man", 500, "--can", gripper.can)
     acting.wait_for('"applied"')
     acting.process.kill()

@@ -180,7 +180,7 @@ def test_two_nodes_are_measured_over_the_air(desk: Desk, air: Air) -> None:
         late = sum(stream["late"] for stream in streams)
         return late if late > sum(stream["messages"] for stream in streams) / 10 else 0
 
-    succeeds(4, late)
+    succeeds(4, late, because="two nodes over a radio in software, each a process of its own")
 
 
 def test_no_trigger_goes_over_the_air(desk: Desk, bench: Station) -> None:

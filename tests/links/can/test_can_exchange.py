@@ -111,7 +111,7 @@ def test_an_exchange_takes_milliseconds(group: str, nodes: Start) -> None:
             link.exchange(write(bytes(700)))
             return time.perf_counter() - began
 
-        best_of(100, 0.1, exchange)  # milliseconds each: among a hundred even a busy machine has a quiet one
+        best_of(100, 0.1, exchange, because="milliseconds each: among a hundred even a busy machine has a quiet one")
 
 
 def test_a_hundred_exchanges_under_load(group: str, nodes: Start) -> None:
@@ -236,7 +236,7 @@ def test_what_a_board_announced_while_it_was_served_is_no_news(other: bool) -> N
     if other:
         assert ended_the_pause()
     else:
-        succeeds(10, ended_the_pause)  # a busy machine may take the whole 15 ms for itself
+        succeeds(10, ended_the_pause, because="the machine may take the whole 15 ms for itself")
 
 
 def test_watch_survives_a_bus_that_goes_away() -> None:
@@ -275,7 +275,7 @@ def test_a_node_pulled_in_the_middle_of_its_answer_holds_up_nobody_else() -> Non
         watch = threading.Thread(target=lambda: list(port.watch(stop=stop, notice=quiet)))
         watch.start()
         try:
-            best_of(5, 1.8, between)
+            best_of(5, 1.8, between, because="two rounds of 0.7 s leave 0.4 s to three threads")
         finally:
             stop.set()
             watch.join()
@@ -361,7 +361,7 @@ def test_a_node_is_asked_first_where_it_is_thought_to_be(hub: Hub) -> None:
             asked = {identifier for identifier, _ in hub.frames if identifier >> 16 in (0x18DA, 0x18DB)}
             return asked ^ {0x18DA21F1, 0x18DAF121}
 
-        succeeds(5, others)
+        succeeds(5, others, because="the node has 50 ms to answer")
         assert find(port, address=0x22).address == 0x21, "the guess is wrong: then everyone is asked"
 
 
@@ -376,7 +376,7 @@ def test_nobody_is_there(hub: Hub) -> None:
             assert took > 1.0
             return took
 
-        best_of(5, 3.0, looked)
+        best_of(5, 3.0, looked, because="a try is 1.2 s of waiting and two of patience")
 
 
 def test_another_node_than_the_wanted_is_told_and_waited_past(hub: Hub) -> None:
@@ -391,7 +391,7 @@ def test_another_node_than_the_wanted_is_told_and_waited_past(hub: Hub) -> None:
             kinds = [notice.kind for notice in told]
             return [] if "2121" in str(error.value) and kinds == ["waiting", "foreign-tag"] else [str(error.value)]
 
-        succeeds(5, others)
+        succeeds(5, others, because="the node has 50 ms to answer")
 
 
 def test_a_node_that_falls_silent(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -50,7 +50,7 @@ def test_doubled_frames_harm_nobody(group: str, nodes: Start) -> None:
         assert tally(port, 100, 20) == 20
         return time.monotonic() - began
 
-    best_of(5, 10, twenty)  # a sequence error would cost a second or more each time
+    best_of(5, 10, twenty, because="twenty exchanges of two processes; a sequence error costs a second each time")
     port.close()
 
 
@@ -81,7 +81,7 @@ def test_a_lost_flow_control_ends_the_wait_at_once(hub: Hub, nodes: Start) -> No
         assert lost
         return time.monotonic() - began
 
-    best_of(5, 4.0, took)  # not the five seconds of a reply
+    best_of(5, 4.0, took, because="the exchange itself may take seconds, a reply that is waited for five")
     port.close()
 
 
@@ -107,7 +107,7 @@ def test_an_order_is_sent_again_after_a_quarter_and_a_half_and_given_up_at_the_e
         assert took >= 0.5
         return took
 
-    best_of(5, 1.0, with_first_reply_lost)
+    best_of(5, 1.0, with_first_reply_lost, because="half of the second is the wait itself")
     hub.lose = lambda identifier, _data: identifier == 0x18DAF121
 
     def with_every_reply_lost() -> float:
@@ -120,7 +120,7 @@ def test_an_order_is_sent_again_after_a_quarter_and_a_half_and_given_up_at_the_e
         requests = [data for identifier, data in hub.frames if identifier == 0x18DA21F1]
         return took if len(requests) == 3 else float("inf")
 
-    best_of(5, 1.2, with_every_reply_lost)
+    best_of(5, 1.2, with_every_reply_lost, because="0.8 s are the wait itself")
     hub.frames.clear()
     with pytest.raises(LinkError):
         link.exchange_within(write(bytes(20)), 0.8)  # whose flow control is lost: it is begun anew until then

@@ -104,7 +104,7 @@ def test_stop_is_honoured_at_once(start_node: StartNode, port: Port, tag: str, l
         time.sleep(0.2)
         return watch.end()
 
-    best_of(10, 0.3, stopped)  # the end of a thread, which a busy machine may not run for as long
+    best_of(10, 0.3, stopped, because="the end of a thread, which a busy machine may not run for as long")
 
 
 def test_a_reader_that_was_killed_leaves_the_node_to_the_next(
