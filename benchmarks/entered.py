@@ -24,6 +24,7 @@ from teds_provision.links import LinkSettings, Notice, open_port
 from teds_provision.links.ports import free_port
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder, prepare
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import provision
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
@@ -67,7 +68,7 @@ def provision_one(station: Station, calls: Counter[str]) -> None:
             try:
                 found = port.find(lambda identity: identity.uuid == uuid, seconds=20, notice=_quiet)
                 with Conversation(found, notice=_quiet) as node:
-                    done = provision(station, node, order, accept=lambda who: None, reporter=SilentReporter())
+                    done = provision(station, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
             finally:
                 port.close()
     assert done.verified.verdict == "authentic"

@@ -31,6 +31,7 @@ from teds_provision.protocol.keys import SoftwareKey, node_key_message, prove_me
 from teds_provision.protocol.plant.evidence import EvidenceClaim, seal
 from teds_provision.protocol.plant.signing import SignRequest, challenge, seal_request
 from teds_provision.steps.build import BuildOrder, prepare
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import provision
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import Image
@@ -145,7 +146,7 @@ def boards(folder: Path, count: int) -> tuple[float, float]:
             used = time.process_time()
             with talk(board) as node:
                 station, order = (plain, alike) if hook is None else (line, hook.order)
-                provision(station, node, order, accept=lambda who: None, reporter=SilentReporter(), line=hook)
+                provision(station, node, order, operator=AcceptingOperator(), reporter=SilentReporter(), line=hook)
             spent[place] += time.process_time() - used
     plain.close()
     line.close()

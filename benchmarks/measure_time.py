@@ -39,6 +39,7 @@ from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.station.station import Station, initialise
 from teds_provision.station.store import KeptMeasurement
 from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import provision
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
@@ -60,7 +61,7 @@ def provisioned(station: Station, folder: Path, name: str) -> bytes:
     (folder / "calibration.csv").write_text(CALIBRATION)
     order = BuildOrder(TYPE, calibration=folder / "calibration.csv", name=name)
     with Conversation(on_reader(node), notice=lambda _notice: None) as talk:
-        provision(station, talk, order, accept=lambda _who: None, reporter=SilentReporter())
+        provision(station, talk, order, operator=AcceptingOperator(), reporter=SilentReporter())
     return node.tim.flash.uuid
 
 

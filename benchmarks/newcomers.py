@@ -45,6 +45,7 @@ from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.announce import LAST_ADDRESS, default_can_address, is_announce
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import provision
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
@@ -250,7 +251,7 @@ def made(station: Station, folder: Path, count: int) -> dict[str, bytes]:
         node = VirtualNode(folder / name)
         order = BuildOrder(TYPE, calibration=folder / "calibration.csv", name=name)
         with Conversation(on_reader(node), notice=lambda _notice: None) as talk:
-            provision(station, talk, order, accept=lambda _who: None, reporter=SilentReporter())
+            provision(station, talk, order, operator=AcceptingOperator(), reporter=SilentReporter())
         found[name] = uuid
     return found
 

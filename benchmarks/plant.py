@@ -33,6 +33,7 @@ from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.page import PageDraft, seal_page
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder, prepare
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import provision
 from teds_provision.talk.progress import SilentReporter
 from tests.bench import Board, make_station, talk
@@ -130,7 +131,9 @@ def _local(boards: int) -> None:
                 board = Board(uuid=(1 + number).to_bytes(10, "big"))
                 wall, used = time.perf_counter(), time.process_time()
                 with talk(board) as node:
-                    provision(stations[place], node, orders[place], accept=lambda who: None, reporter=SilentReporter())
+                    provision(
+                        stations[place], node, orders[place], operator=AcceptingOperator(), reporter=SilentReporter()
+                    )
                 spent.append((time.perf_counter() - wall, time.process_time() - used, place))
         for column, what in enumerate(("by the clock", "of the processor")):
             without, beside = ([spent_row[column] for spent_row in spent if spent_row[2] == place] for place in (0, 1))

@@ -39,6 +39,7 @@ from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station, initialise
 from teds_provision.station.store.database import Database
 from teds_provision.steps.build import BuildOrder, prepare
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import provision
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
@@ -283,7 +284,7 @@ def measure(station: Station, disk: Disk, line: Line, count: int) -> list[Run]:
                 timed = Timed(contact.link)
                 known = Contact(contact.identity, timed, contact.tag_uid, contact.address)
                 with Conversation(known, notice=_quiet) as node:
-                    done = provision(station, node, order, accept=lambda who: None, reporter=SilentReporter())
+                    done = provision(station, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
                 ended = time.perf_counter()
                 good = done.verified.verdict == "authentic"
                 limit = _least(line, timed.sizes)

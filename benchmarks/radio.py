@@ -26,7 +26,7 @@ from teds_provision.links import LinkSettings
 from teds_provision.links.ports import free_port
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.identify import IdentifiedNode
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import SilentReporter
@@ -52,17 +52,17 @@ def main(words: list[str]) -> None:
         station.close()
 
 
-def _accept(_who: IdentifiedNode) -> None:
-    """Whoever lies there."""
-
-
 def _run(station: Station, links: LinkSettings, name: str) -> tuple[ProvisionResult, float, float]:
     """Provision whoever is there; seconds until it was found, and from then to the verdict."""
     began = time.perf_counter()
     with meet(station, links, None, SilentReporter()) as node:
         found = time.perf_counter()
         done = provision(
-            station, node, BuildOrder(profile=PROFILE, name=name), accept=_accept, reporter=SilentReporter()
+            station,
+            node,
+            BuildOrder(profile=PROFILE, name=name),
+            operator=AcceptingOperator(),
+            reporter=SilentReporter(),
         )
         verdict = time.perf_counter()
     return done, found - began, verdict - found

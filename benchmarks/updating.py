@@ -40,6 +40,7 @@ from teds_provision.node.firmware.boot_loader import ImageSlots
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import provision
 from teds_provision.steps.update import BoardUpdate, UpdateOrder, update_boards
 from teds_provision.talk.meeting import meet
@@ -320,7 +321,7 @@ def _provision(station: Station, links: LinkSettings, uuids: list[bytes]) -> Non
                 station,
                 node,
                 BuildOrder(PROFILE, accept_calibration="a benchmark"),
-                accept=lambda who: None,
+                operator=AcceptingOperator(),
                 reporter=SilentReporter(),
             )
 

@@ -173,9 +173,9 @@ def test_numbers_without_a_calibration_need_no_numpy(module: str) -> None:
 
 
 _AT_A_NODE = ("at_node", "build", "provision", "verify", "whitelist")
-# Acts of a module beyond one for each of its commands: write --from brings back, verify takes files, lists are planned,
-# provision --firmware keys the board first.
-_MORE_ACTS = {"build": 1, "provision": 1, "verify": 2, "whitelist": 9}
+# Acts of a module beyond one for each of its commands: write --from brings back, --dry-run plans, verify takes files,
+# lists are planned, provision --firmware keys the board first.
+_MORE_ACTS = {"build": 2, "provision": 1, "verify": 2, "whitelist": 9}
 _ROOMS_THAT_ACT = ("steps", "talk", "links", "handover", "backup")
 
 

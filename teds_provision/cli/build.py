@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,13 +29,17 @@ from teds_provision.cli.options import (
 from teds_provision.cli.rendering import local_time, reporter_for
 from teds_provision.errors import UsageError
 from teds_provision.files import SHARED, read_limited, write_whole
+from teds_provision.lazy import late
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
+    from teds_provision.cli import terminal_operator
     from teds_provision.plant.sign_requests import OfficeOrder
     from teds_provision.station.station import Station
     from teds_provision.steps.write import WriteResult
     from teds_provision.teds.certificate import CertificateReference
+else:  # loads the steps
+    terminal_operator = late("teds_provision.cli.terminal_operator")
 
 MAX_INPUT_OCTETS = 32 << 20
 
@@ -130,7 +133,12 @@ def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, ye
     octets = station.nodes.resolve(uuid)
     order = replace(order, choose=app.chooses_item())
     built = steps.build.build(
-        station, octets, order, edition=int(edition), keep_draft=not dry_run, retype=app.asks_retype(yes=yes)
+        station,
+        octets,
+        order,
+        edition=int(edition),
+        keep_draft=not dry_run,
+        retype=terminal_operator.TerminalOperator(app, yes=yes).retype,
     )
     if output is not None and not dry_run:
         write_file(output, built.image.to_json())
@@ -318,19 +326,19 @@ def write(
             raise UsageError("--from and --image cannot be combined.", hint="Use one of them.")
         _bring_back(app, uuid, sequence, links, dry_run=dry_run)
         return
-    confirm = partial(app.confirm, yes=yes)
-    done = steps.commands.write_at(
-        app.station(),
-        links,
-        uuid,
-        reporter_for(app),
-        file=image,
-        dry_run=dry_run,
-        jump=confirm if sequence_jump else None,
-        low=confirm,
-        retype=app.asks_retype(yes=yes),
-        retyped=retype,
-    )
+    if dry_run:
+        done = steps.commands.plan_write(app.station(), uuid, image)
+    else:
+        done = steps.commands.write_at(
+            app.station(),
+            links,
+            uuid,
+            reporter_for(app),
+            file=image,
+            operator=terminal_operator.TerminalOperator(app, yes=yes),
+            jump=sequence_jump,
+            retyped=retype,
+        )
     node, written = done.image.uuid.hex(), done.written
     if written is None:
         blocks, octets = len(done.image.blocks), sum(map(len, done.image.blocks.values()))

@@ -202,18 +202,6 @@ class App:
         asked = _as_question(f"{question} [{default}]" if default else question)
         return str(click.prompt(asked, default=default, err=True, show_default=False)).strip()
 
-    def asks_retype(self, *, yes: bool) -> Callable[[bytes, tuple[str, ...]], None] | None:
-        """Who is asked before a board becomes one of another type: a person at a terminal who answered nothing yet."""
-
-        def ask(uuid: bytes, differences: tuple[str, ...]) -> None:
-            self.note(f"Board {uuid.hex()} reports a different type from the one it would be given:")
-            for text in differences:
-                self.note(f"  {text}")
-            if not self.ask_yes_no("Change it to the new type?"):
-                raise PolicyError(f"Cancelled. Board {uuid.hex()} keeps its type; nothing was written.")
-
-        return ask if self.interactive and not yes else None
-
     def chooses_item(self) -> ChooseItem | None:
         """Return who is asked which result of a certificate is meant: a person at a terminal."""
         answers: dict[str, str] = {}  # the same file is read again when its board comes

@@ -21,7 +21,8 @@ from teds_provision.cli.build import calibration_json, order_options
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, said_here, yes_option
 from teds_provision.cli.rendering import firmware_words, print_table, reporter_for
-from teds_provision.errors import NotWhitelistedError, TedsProvisionError, UsageError, WrongImageError
+from teds_provision.errors import TedsProvisionError, UsageError, WrongImageError
+from teds_provision.lazy import late
 from teds_provision.links import LinkSettings
 from teds_provision.sanitize import sanitize
 from teds_provision.talk.progress import Reporter, StepResult
@@ -29,18 +30,17 @@ from teds_provision.talk.progress import Reporter, StepResult
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from teds_provision.cli import terminal_operator
     from teds_provision.firmware_image import FirmwareImage
     from teds_provision.links import Notice
     from teds_provision.station.station import Station
     from teds_provision.station.summary import NodeSummary
-    from teds_provision.steps.adoption import FactoryDatasheet
-    from teds_provision.steps.batch import BatchRun, ProvisionPlan, ProvisionRequest, Questions
+    from teds_provision.steps.batch import BatchRun, ProvisionPlan, ProvisionRequest
     from teds_provision.steps.batch_sheet import BoardResult, SheetRow
-    from teds_provision.steps.identify import IdentifiedNode
+    from teds_provision.steps.operator import Operator
     from teds_provision.steps.provision import ProvisionResult
-    from teds_provision.teds.diff import Change
-
-_CHANGES_SHOWN = 20
+else:  # loads the steps
+    terminal_operator = late("teds_provision.cli.terminal_operator")
 
 
 @command(
@@ -192,10 +192,10 @@ def provision(
         boards.unlock()  # asked for before the screen shows instructions
         begun = None if several else reporter  # with several readers one board may be begun while another one ends
         with screen_for(app, boards, begun) as screen:
-            questions = _questions(app, yes, strangers=not everything, several=True)
-            _many(app, boards, questions, screen, totals=everything or batch is not None or job is not None)
+            person = terminal_operator.TerminalOperator(app, yes=yes, strangers=not everything, several=True)
+            _many(app, boards, person, screen, totals=everything or batch is not None or job is not None)
     else:
-        _one(app, boards, _questions(app, yes))
+        _one(app, boards, terminal_operator.TerminalOperator(app, yes=yes))
 
 
 def _with_firmware(
@@ -209,10 +209,8 @@ def _with_firmware(
     yes: bool,
 ) -> str:
     """Key the one board, install firmware on it, and return its UUID."""
-    questions = _questions(app, yes)
-    uuid = steps_room.commands.key_board_at(
-        base, links, node, reporter, accept=questions.accept, take_over=questions.take_over
-    )
+    operator = terminal_operator.TerminalOperator(app, yes=yes)
+    uuid = steps_room.commands.key_board_at(base, links, node, reporter, operator=operator)
     update = steps_room.update
     order, onward = update.UpdateOrder(image), links.after_agreeing()
     plan = update.plan_update(base, onward, uuid, order, reporter)
@@ -241,16 +239,16 @@ def _check_line(request: ProvisionRequest, job: str | None, only: str | None) ->
         )
 
 
-def _one(app: App, boards: BatchRun, questions: Questions) -> None:
+def _one(app: App, boards: BatchRun, operator: Operator) -> None:
     try:
-        done = boards.one(questions)
+        done = boards.one(operator)
     except steps_room.build.UnrequestedChangeError as error:
         # With --json the changes are beside the error, so that the caller can name them.
         changes = [change.text for change in error.changes]
         app.conclude({"changes": changes}, "\n".join(f"  {text}" for text in changes), error)
         return
     except steps_room.adoption.NotAdoptedError as error:
-        _show_brought(app, error.datasheet)
+        terminal_operator.show_brought(app, error.datasheet)
         app.conclude({"findings": error.datasheet.findings}, None, error)
         return
     failure = steps_room.batch_sheet.BoardResult(done.who.uuid, 0.0, done).failure
@@ -262,10 +260,10 @@ def _of_line(boards: BatchRun, uuid: bytes) -> dict[str, Any]:
     return boards.line.unit_to_json(uuid) if boards.line is not None else {}
 
 
-def _many(app: App, boards: BatchRun, questions: Questions, screen: Screen, *, totals: bool) -> None:
+def _many(app: App, boards: BatchRun, operator: Operator, screen: Screen, *, totals: bool) -> None:
     signal.signal(signal.SIGTERM, lambda *_: boards.stop.request_stop())
     try:
-        for board in boards.many(questions):
+        for board in boards.many(operator):
             if boards.expected and not app.json:
                 _tell_one_of(app, boards, board)
             elif not screen.tells:
@@ -282,89 +280,6 @@ def _many(app: App, boards: BatchRun, questions: Questions, screen: Screen, *, t
         raise click.exceptions.Exit(error.exit_code)
     if error is not None:
         raise error
-
-
-# -- questions ---------------------------------------------------------------------------------------------------------
-
-
-def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = False) -> Questions:
-    """Return the questions to ask; ``strangers`` False: --yes does not add nodes that were not named."""
-    # A board comes onto the whitelist when it has its key: one that was lost before is not asked about twice.
-    accepted: set[tuple[bytes, str]] = set()
-    turn = threading.Lock()  # one question at a time, however many readers there are
-
-    def accept(who: IdentifiedNode) -> None:
-        if (yes and strangers) or (who.uuid, who.fingerprint) in accepted:
-            return
-        if not app.interactive:
-            raise NotWhitelistedError(
-                f"Node {who.uuid.hex()} is not on the whitelist, and there is no terminal to ask on.",
-                hint=f"Add --yes, or: teds-provision whitelist add {who.uuid.hex()} --fingerprint {who.fingerprint}",
-            )
-        with turn:
-            if not app.ask_for_key(
-                f"Node {who.uuid.hex()}, key {who.fingerprint[:32]}\nTrust this board and add it to the whitelist?",
-                who.fingerprint,
-            ):
-                raise steps_room.batch_sheet.DeclinedError(
-                    f"Cancelled. Node {who.uuid.hex()} was not whitelisted; nothing was changed."
-                )
-        accepted.add((who.uuid, who.fingerprint))
-
-    def confirm(uuid: bytes, changes: tuple[Change, ...]) -> None:
-        with turn:
-            app.note(
-                f"Node {uuid.hex()} has a different datasheet. This would also change, although you did not name it:"
-            )
-            for change in changes[:_CHANGES_SHOWN]:
-                app.note(f"  {change.text}")
-            if len(changes) > _CHANGES_SHOWN:
-                app.note(f"  and {len(changes) - _CHANGES_SHOWN} more")
-            if not app.ask_yes_no("Write it?"):
-                raise steps_room.batch_sheet.DeclinedError(f"Cancelled. Node {uuid.hex()} keeps its datasheet.")
-
-    def low(question: str) -> None:
-        with turn:
-            app.confirm(question, yes=yes)
-
-    def take_over(question: str) -> None:
-        with turn:  # regardless of --yes: it locks another station out, and no option of this command names that
-            if not app.ask_yes_no(question):
-                raise steps_room.batch_sheet.DeclinedError("Cancelled. The node keeps its key; nothing was changed.")
-
-    asked = app.interactive
-    retype = app.asks_retype(yes=yes or several)
-
-    def adopt(brought: FactoryDatasheet) -> None:
-        with turn:
-            if not yes and not asked:
-                steps_room.adoption.refuse_adoption(brought)
-            _show_brought(app, brought)
-            if yes:
-                return
-            if not app.ask_yes_no("Sign this datasheet, and put the node in service?"):
-                raise steps_room.batch_sheet.DeclinedError("Cancelled. The board's datasheet was not signed.")
-
-    return steps_room.batch.Questions(
-        accept, confirm if asked else None, low, take_over if asked else None, retype, adopt
-    )
-
-
-def _show_brought(app: App, brought: FactoryDatasheet) -> None:
-    """Show a board's own datasheet, a line for each channel, and its findings."""
-    app.note(f"Node {brought.image.uuid.hex()} brought its own datasheet: {brought.name or '(no name)'}")
-    for channel in brought.channels[:_CHANGES_SHOWN]:
-        kind = channel.kind.word if channel.kind is not None else "of unknown kind"
-        limits = f"{channel.show(channel.low)} to {channel.show(channel.high)}"
-        exact = (
-            f", ± {channel.show(channel.stated_uncertainty, difference=True)}" if channel.stated_uncertainty > 0 else ""
-        )
-        made = f", calibrated {channel.calibrated_at:%Y-%m-%d}" if channel.calibrated_at else ""
-        app.note(f"  channel {channel.number}: {channel.name or '(no name)'}, {kind}, {limits}{exact}{made}")
-    if len(brought.channels) > _CHANGES_SHOWN:
-        app.note(f"  and {len(brought.channels) - _CHANGES_SHOWN} more channels")
-    for finding in brought.findings[:_CHANGES_SHOWN]:
-        app.note(f"  {finding['severity']}: {finding['message']}")
 
 
 # -- telling -----------------------------------------------------------------------------------------------------------

@@ -30,6 +30,7 @@ from teds_provision.protocol.plant.roster import Role
 from teds_provision.protocol.plant.signing import SignRequest
 from teds_provision.station.station import Station
 from teds_provision.steps.board_type import WrongBoardError
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import ProvisionResult, provision, verify_only
 from teds_provision.steps.verify import require_authentic
 from teds_provision.talk.meeting import meet
@@ -154,7 +155,7 @@ def _build(demo: Demo, line: LineRun, uuid: bytes) -> int:
     """Provision one board of the job; its unit."""
     with meet(line.station, demo.over("nfc"), uuid, SilentReporter()) as node:
         done: ProvisionResult = provision(
-            line.station, node, line.order, accept=lambda who: None, reporter=SilentReporter(), line=line
+            line.station, node, line.order, operator=AcceptingOperator(), reporter=SilentReporter(), line=line
         )
     require_authentic(done.verified)
     return int(line.unit_to_json(uuid)["unit"])

@@ -38,6 +38,7 @@ from teds_provision.station.store import TrustRecord
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.steps.teds_read import read_image
 from teds_provision.steps.verify import require_authentic
@@ -83,7 +84,7 @@ class Demo:
 def provision_over(demo: Demo, station: Station, via: str, uuid: bytes, order: BuildOrder) -> ProvisionResult:
     """Every step of provisioning, from one station over one link; raises unless the node is authentic at the end."""
     with meet(station, demo.over(via), uuid, demo.reporter) as node:
-        done = provision(station, node, order, accept=lambda who: None, reporter=demo.reporter)
+        done = provision(station, node, order, operator=AcceptingOperator(), reporter=demo.reporter)
     require_authentic(done.verified)
     demo.steps.done += done.steps
     return done

@@ -6,7 +6,7 @@ error, names and texts that people and topics will see. The board's own claims d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -53,10 +53,6 @@ class FactoryDatasheet:
         """For the API and --json: ``severity``, ``message``."""
         both = (("error", self.errors), ("warning", self.warnings))
         return [{"severity": severity, "message": text} for severity, said in both for text in said]
-
-
-Adopt = Callable[[FactoryDatasheet], None]
-"""Asks before a board's own datasheet is signed; raises if the answer is no."""
 
 
 class NotAdoptedError(PolicyError):

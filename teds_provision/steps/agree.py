@@ -36,8 +36,11 @@ from teds_provision.teds.image import SECURITY
 
 _BEGINNINGS = 5
 
-TakeOver = Callable[[str], object]
-"""Asks before another station of the owner is locked out of a node; raises if the answer is no."""
+TakeOver = Callable[[str, PolicyError], object]
+"""Asks before another station of the owner is locked out of a node; raises if the answer is no.
+
+It gets the question, and the error for one that cannot be asked.
+"""
 
 
 @dataclass(frozen=True)
@@ -334,7 +337,8 @@ class _TakeoverConsent:
             uuid = node.uuid.hex()
             self.take_over(
                 f"Node {uuid} has a key that this station does not hold. Take the node over and lock"
-                " out the current holder?"
+                " out the current holder?",
+                must_take_over(station, node.uuid),
             )
         elif not self.rotate:
             raise must_take_over(station, node.uuid)

@@ -25,8 +25,8 @@ from teds_provision.errors import (
 from teds_provision.links import Contact, LinkSettings, Port, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
-from teds_provision.steps.adoption import Adopt, read_factory_datasheet, refuse_adoption
-from teds_provision.steps.agree import TakeOver, require_session
+from teds_provision.steps.adoption import read_factory_datasheet
+from teds_provision.steps.agree import require_session
 from teds_provision.steps.batch_sheet import (
     BatchTotals,
     BoardResult,
@@ -39,26 +39,24 @@ from teds_provision.steps.batch_sheet import (
     worse,
     write_report,
 )
-from teds_provision.steps.board_type import Retype, WrongBoardError, differences
+from teds_provision.steps.board_type import WrongBoardError, differences
 from teds_provision.steps.build import (
     BuildOrder,
-    Confirm,
     PreparedOrder,
     compose,
     for_several,
     merged,
     named_for,
-    no_confirmation,
     prepare,
     propose,
 )
 from teds_provision.steps.identify import IdentifiedNode, examine
+from teds_provision.steps.operator import Operator
 from teds_provision.steps.parallel import ParallelWork
-from teds_provision.steps.provision import Accept, ProductionLine, ProvisionResult, provision, verify_only
+from teds_provision.steps.provision import ProductionLine, ProvisionResult, provision, verify_only
 from teds_provision.steps.readings import verdict_of
 from teds_provision.steps.teds_read import take_snapshot
 from teds_provision.steps.verify_node import verify_in_session
-from teds_provision.steps.write import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.meeting import (
     IdleStop,
@@ -104,23 +102,6 @@ class ProvisionRequest:
 
 _AFTER: Final = ("build", "sign", "write", "verify", "check")
 """Steps behind the key agreement."""
-
-
-@dataclass(frozen=True)
-class Questions:
-    """The questions: before an unknown node is whitelisted, and before unnamed changes are written (None: refuse).
-
-    ``low``: before a node with a low battery is written. ``take_over``: before a node with another station's key gets
-    one of ours (None: refuse). ``retype``: before a board becomes one of another type. ``adopt``: before a datasheet
-    that it brought is signed.
-    """
-
-    accept: Accept
-    confirm: Confirm | None
-    low: Low = wait_for_charge
-    take_over: TakeOver | None = None
-    retype: Retype | None = None
-    adopt: Adopt = refuse_adoption
 
 
 @dataclass(frozen=True)
@@ -183,10 +164,10 @@ class BatchRun:
 
     # -- one node --------------------------------------------------------------------------------------------------
 
-    def one(self, questions: Questions) -> ProvisionResult:
+    def one(self, operator: Operator) -> ProvisionResult:
         """Provision the one node; raises what ends it."""
         with meet(self._station, self._links, self.node, self._reporter, before=self._station.unlock) as node:
-            return self._provision(node, questions)
+            return self._provision(node, operator)
 
     def plan(self) -> ProvisionPlan:
         """Look at the one node, plainly, and return the preview; changes nothing anywhere."""
@@ -286,13 +267,13 @@ class BatchRun:
         finally:
             port.close()
 
-    def many(self, questions: Questions) -> Iterator[BoardResult]:
+    def many(self, operator: Operator) -> Iterator[BoardResult]:
         """Provision board after board, or all at once; one that fails does not end it. At the end comes the report."""
         try:
             if self.progress is not None and not self.progress.open:
                 return
             self._station.unlock()
-            for board in self._all_at_once(questions) if self._request.everyone else self._as_they_come(questions):
+            for board in self._all_at_once(operator) if self._request.everyone else self._as_they_come(operator):
                 self._note(board)
                 yield board
         finally:
@@ -319,10 +300,10 @@ class BatchRun:
         skipped = results.count("skipped")
         return BatchTotals(passed, results.count("failed"), skipped, seconds, share, mean_steps(steps), self.worst)
 
-    def _as_they_come(self, questions: Questions) -> Iterator[BoardResult]:
+    def _as_they_come(self, operator: Operator) -> Iterator[BoardResult]:
         def work(node: Conversation) -> ProvisionResult:
             with self.stop.working():
-                return self._provision(node, questions)
+                return self._provision(node, operator)
 
         for arrival in watch_nodes(self._links, work, self._reporter, self.stop):
             row = self._rows.pop(arrival.uuid, None)
@@ -333,11 +314,11 @@ class BatchRun:
             if self.progress is not None and not (self.progress.open if self._request.watch else self.progress.untried):
                 self.stop.set()
 
-    def _all_at_once(self, questions: Questions) -> Iterator[BoardResult]:
+    def _all_at_once(self, operator: Operator) -> Iterator[BoardResult]:
         port = open_port(self._links)
         try:
             everyone, contacts = self._on_the_bus(port)
-            yield from self._side_by_side(port, contacts, questions)
+            yield from self._side_by_side(port, contacts, operator)
             if not self.stop.is_asked:
                 self._all_done = True
                 refuse_duplicate_uuids(everyone)  # the others are done, and what is not done is not passed over
@@ -358,7 +339,7 @@ class BatchRun:
             self._require_known(found)
         return everyone, contacts
 
-    def _side_by_side(self, port: Port, contacts: list[Contact], questions: Questions) -> Iterator[BoardResult]:
+    def _side_by_side(self, port: Port, contacts: list[Contact], operator: Operator) -> Iterator[BoardResult]:
         """Provision each of these nodes in a thread, as many at a time as the bus and the token bear.
 
         Once a person asks to stop, no further node is begun; those that are begun are finished and yielded.
@@ -367,7 +348,7 @@ class BatchRun:
         workers = max(1, min(_TOKEN_WORKERS if token else port.capabilities.max_parallel, len(contacts)))
         self.expected = len(contacts)
         work = ParallelWork(
-            contacts, lambda contact: self._board(contact, port.place, questions), at_once=workers, name="node"
+            contacts, lambda contact: self._board(contact, port.place, operator), at_once=workers, name="node"
         )
         locked: VaultLockedError | None = None
         try:
@@ -428,7 +409,7 @@ class BatchRun:
         image = self._station.datasheets.datasheet(uuid)
         return image is not None and self._lacks_calibration(uuid, image) is not None
 
-    def _board(self, contact: Contact, place: str, questions: Questions) -> BoardResult | None:
+    def _board(self, contact: Contact, place: str, operator: Operator) -> BoardResult | None:
         """Provision one node of the bus; None if it turns out to be finished already."""
         began, uuid = time.monotonic(), contact.identity.uuid
         done: ProvisionResult | None = None
@@ -439,7 +420,7 @@ class BatchRun:
             with Conversation(contact, notice=told.notice) as node:
                 if self._was_finished_elsewhere(node):
                     return None
-                done = self._provision(node, questions, told)
+                done = self._provision(node, operator, told)
             error = self._lacks_calibration(uuid, done.image)
         except VaultLockedError:  # of the whole command, and of no board
             raise
@@ -493,29 +474,24 @@ class BatchRun:
             hint=f"Calibrate it: teds-provision provision {uuid.hex()} --calibration FILE; for many: --batch SHEET.",
         )
 
-    def _provision(self, node: Conversation, questions: Questions, reporter: Reporter | None = None) -> ProvisionResult:
-        def accept(who: IdentifiedNode) -> None:
-            row = self._rows.get(who.uuid)
-            listed = self.line is not None and self.line.lists(who)
-            if not listed and (row is None or row.by_order):  # a sheet or job that names the board is a person's word
-                questions.accept(who)
-
+    def _provision(self, node: Conversation, operator: Operator, reporter: Reporter | None = None) -> ProvisionResult:
         if self.line is not None and self.line.only_verify:
             return verify_only(self._station, node, self.line, self._reporter)
         return provision(
             self._station,
             node,
             self._for,
-            accept=accept,
+            operator=operator,
             reporter=reporter or self._reporter,
-            confirm=questions.confirm or no_confirmation,
             onward=continue_over_ble(self._links, self._reporter.notice),
-            low=questions.low,
-            take_over=questions.take_over,
-            retype=questions.retype,
             line=self.line,
-            adopt=questions.adopt,
+            named=self._is_named,
         )
+
+    def _is_named(self, who: IdentifiedNode) -> bool:
+        """Return True if a sheet or job names this very board, which is a person's word."""
+        row = self._rows.get(who.uuid)
+        return (self.line is not None and self.line.lists(who)) or not (row is None or row.by_order)
 
     def _for(self, who: IdentifiedNode) -> PreparedOrder:
         """Return what this board gets.

@@ -41,12 +41,13 @@ from teds_provision.steps.agree import (
     require_session,
     reset_node,
 )
-from teds_provision.steps.board_type import Retype, differences, is_remembered, require_board_type, shown_by
+from teds_provision.steps.board_type import differences, is_remembered, shown_by
 from teds_provision.steps.build import guard, own_name, require_free_name
 from teds_provision.steps.firmware import keep_firmware, locate, read_firmware
 from teds_provision.steps.identify import IdentifiedNode, describe, identify
+from teds_provision.steps.operator import Operator
 from teds_provision.steps.parallel import ParallelWork
-from teds_provision.steps.provision import Accept, add_to_whitelist, key_board
+from teds_provision.steps.provision import add_to_whitelist, key_board
 from teds_provision.steps.readings import keep
 from teds_provision.steps.sign import SignResult, known_image, known_node_keys, require_not_measured, sign
 from teds_provision.steps.teds_read import read_identity, read_image, take_snapshot
@@ -59,7 +60,7 @@ from teds_provision.steps.verify import (
     verify_image,
 )
 from teds_provision.steps.verify_node import open_or_say_why, provenance_check, verify_at_node
-from teds_provision.steps.write import Low, WriteResult, wait_for_charge, write
+from teds_provision.steps.write import WriteResult, write
 from teds_provision.talk.conversation import HEARD, Conversation, SessionLostError
 from teds_provision.talk.meeting import Arrival, meet, meet_everyone, watch_nodes
 from teds_provision.talk.progress import Reporter
@@ -261,13 +262,12 @@ def key_board_at(
     node: str | None,
     reporter: Reporter,
     *,
-    accept: Accept,
-    take_over: TakeOver | None = None,
+    operator: Operator,
 ) -> bytes:
     """Identify, whitelist and key the board that ``node`` names (None: the one that is there); return its UUID."""
     wanted = None if node is None else station.nodes.resolve(node)
     with meet(station, links, wanted, reporter, before=station.unlock) as there:
-        return key_board(station, there, accept=accept, reporter=reporter, take_over=take_over).uuid
+        return key_board(station, there, operator=operator, reporter=reporter).uuid
 
 
 # -- agree, address ----------------------------------------------------------------------------------------------------
@@ -306,8 +306,9 @@ def agree_at(
     if confirm and station.keys.restored(uuid) and rotate and not LINKS[links.via].capabilities.tapped:
         confirm(f"Node {uuid.hex()} is {station.keys.rotation_due(uuid)}. Is it still this station's?")
     links = replace(links, via_chosen=True)  # a first key is agreed on by a tap, unless a bus is named
+    take_over: TakeOver | None = None if confirm is None else lambda question, _refusal: confirm(question)
     with at_node(station, links, uuid, reporter, unlock="always", writes="agree") as visit:
-        return AgreeReport(uuid, agree(station, visit.node, visit.who, rotate=rotate, take_over=confirm))
+        return AgreeReport(uuid, agree(station, visit.node, visit.who, rotate=rotate, take_over=take_over))
 
 
 @dataclass(frozen=True)
@@ -566,6 +567,13 @@ def _wanted(station: Station, uuid: bytes, file: Path | None) -> tuple[Image, di
     return wanted, facts
 
 
+def plan_write(station: Station, node: str, file: Path | None) -> WriteReport:
+    """Return what :func:`write_at` would write, for a dry run; raises what it does before it meets the node."""
+    uuid = station.nodes.resolve(node)
+    station.policy.require_whitelisted(uuid)
+    return WriteReport(_wanted(station, uuid, file)[0], None)
+
+
 def write_at(
     station: Station,
     links: LinkSettings,
@@ -573,26 +581,22 @@ def write_at(
     reporter: Reporter,
     *,
     file: Path | None,
-    dry_run: bool = False,
-    jump: Callable[[str], object] | None = None,
-    low: Low = wait_for_charge,
-    retype: Retype | None = None,
+    operator: Operator,
+    jump: bool = False,
     retyped: bool = False,
 ) -> WriteReport:
     """Write a signed image to the node that ``node`` names: of a file, else the draft, else its last reading.
 
-    ``jump`` is asked before a sequence far ahead of the node's is written, and raises for a no; None: it is refused;
-    ``low`` before a node with a low battery is written; ``retype`` before a board becomes one of another type than it
-    claims (None: that is refused), unless it was ``retyped`` by an option. Raises NotFoundError (nothing built),
-    BadDataError (not signed), PolicyError (another node's image), as ``write`` does.
+    ``operator`` is asked before a node with a low battery is written, and before a board becomes one of another type
+    than it claims, unless it was ``retyped`` by an option. ``jump``: a sequence far ahead of the node's is written.
+    Raises NotFoundError (nothing built), BadDataError (not signed), PolicyError (another node's image), as ``write``
+    does.
     """
     uuid = station.nodes.resolve(node)
     station.policy.require_whitelisted(uuid)
     wanted, facts = _wanted(station, uuid, file)
-    if dry_run:
-        return WriteReport(wanted, None)
-    if jump is not None:
-        jump("This uses up the node's sequence numbers up to that point, permanently. Write it?")
+    if jump:
+        operator.jump("This uses up the node's sequence numbers up to that point, permanently. Write it?")
     with at_node(station, links.after_agreeing(), uuid, reporter, writes="write") as visit:
         visit.session()
         if not retyped:
@@ -601,9 +605,16 @@ def write_at(
             profile = facts.get("profile")
             known = isinstance(profile, str) and is_remembered(station, uuid, profile, factory=False)
             if told and not known:
-                (retype or require_board_type)(uuid, told)
-        far = jump is not None
-        written = write(station, visit.node, wanted, progress=reporter.written, facts=facts, jump=far, low=low)
+                operator.retype(uuid, told)
+        written = write(
+            station,
+            visit.node,
+            wanted,
+            progress=reporter.written,
+            facts=facts,
+            jump=jump,
+            low=operator.low_battery,
+        )
         return WriteReport(wanted, written)
 
 

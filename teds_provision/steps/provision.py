@@ -19,11 +19,10 @@ from teds_provision.station.shown_units import shown_units, units_of
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry
 from teds_provision.station.store.records import Assurance
-from teds_provision.steps.adoption import Adopt, read_factory_datasheet, refuse_adoption, require_a_reason
-from teds_provision.steps.agree import AgreeResult, TakeOver, agree, require_own_ca
+from teds_provision.steps.adoption import read_factory_datasheet, require_a_reason
+from teds_provision.steps.agree import AgreeResult, agree, require_own_ca
 from teds_provision.steps.board_type import (
     HardwareCheck,
-    Retype,
     check_hardware,
     differences,
     further,
@@ -33,24 +32,23 @@ from teds_provision.steps.board_type import (
 )
 from teds_provision.steps.build import (
     BuildOrder,
-    Confirm,
     PreparedOrder,
     Proposal,
     certificate_brought,
     merged,
     named_for,
-    no_confirmation,
     no_profile,
     prepare,
     propose,
 )
 from teds_provision.steps.firmware import read_firmware, require_firmware
 from teds_provision.steps.identify import IdentifiedNode, identify
+from teds_provision.steps.operator import Operator
 from teds_provision.steps.sign import SignResult, require_not_measured, sign
 from teds_provision.steps.teds_read import NodeSnapshot, take_snapshot
 from teds_provision.steps.verify import Verification
 from teds_provision.steps.verify_node import verify_at_node, verify_node
-from teds_provision.steps.write import Low, WriteResult, wait_for_charge, write
+from teds_provision.steps.write import WriteResult, write
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.progress import DONE, NOTHING, SKIPPED, Reporter, StepResult, Steps
 from teds_provision.teds.calibration.formula import sentence
@@ -62,8 +60,6 @@ Order = BuildOrder | PreparedOrder | Callable[["IdentifiedNode"], PreparedOrder]
 """What a node gets: as it was ordered, read already, or by its identity (which raises if it gets nothing)."""
 Onward = Callable[[Conversation], None]
 """Takes the conversation to another link; see ``talk/meeting.py``."""
-Accept = Callable[[IdentifiedNode], None]
-"""Asks before an unknown node is whitelisted; raises if the answer is no."""
 
 
 @dataclass(frozen=True)
@@ -197,26 +193,19 @@ def provision(
     node: Conversation,
     order: Order,
     *,
-    accept: Accept,
+    operator: Operator,
     reporter: Reporter,
-    confirm: Confirm = no_confirmation,
     onward: Onward | None = None,
-    low: Low = wait_for_charge,
-    take_over: TakeOver | None = None,
-    retype: Retype | None = None,
     line: ProductionLine | None = None,
-    adopt: Adopt = refuse_adoption,
+    named: Callable[[IdentifiedNode], bool] = lambda _who: False,
 ) -> ProvisionResult:
     """Bring one node from any state to a verified datasheet; raises at the first step that fails.
 
-    ``accept`` is asked before an unknown node is whitelisted, ``confirm`` before a datasheet changes in what the order
-    does not name, ``low`` before a node with a low battery is written, ``take_over`` before a node with another
-    station's key gets one of ours (None: that is refused), ``retype`` before a board becomes one of another type than
-    it claims, ``adopt`` before a datasheet that the board brought itself is signed. ``onward`` moves the conversation
-    to another link after the agreement. ``line`` gives the board a unit before the agreement, and records its evidence.
-    A failure is in the audit log with its step.
+    ``operator`` answers what a person has to decide. ``named``: a sheet or job names this very board, so it is
+    whitelisted without a question. ``onward`` moves the conversation to another link after the agreement. ``line``
+    gives the board a unit before the agreement, and records its evidence. A failure is in the audit log with its step.
     """
-    run = _Run(station, node, order, accept, confirm, reporter, onward, low, take_over, retype, line, adopt)
+    run = _Run(station, node, order, operator, reporter, onward=onward, line=line, named=named)
     try:
         with station.node_lock(node.uuid), station.released(node.uuid, "provision") as released, station.run():
             run.released = bool(released)
@@ -227,17 +216,12 @@ def provision(
         raise
 
 
-def key_board(
-    station: Station, node: Conversation, *, accept: Accept, reporter: Reporter, take_over: TakeOver | None = None
-) -> IdentifiedNode:
+def key_board(station: Station, node: Conversation, *, operator: Operator, reporter: Reporter) -> IdentifiedNode:
     """Identify, whitelist and agree, as :func:`provision` begins, for a board that gets new firmware before the rest.
 
-    ``accept`` and ``take_over`` are asked as there.
+    ``operator`` is asked as there.
     """
-    order, low = BuildOrder(), wait_for_charge
-    run = _Run(
-        station, node, order, accept, no_confirmation, reporter, None, low, take_over, None, None, refuse_adoption
-    )
+    run = _Run(station, node, BuildOrder(), operator, reporter)
     with station.node_lock(node.uuid), station.released(node.uuid, "provision"), station.run():
         return run.keyed()
 
@@ -248,20 +232,16 @@ class _Run:
         station: Station,
         node: Conversation,
         order: Order,
-        accept: Accept,
-        confirm: Confirm,
+        operator: Operator,
         reporter: Reporter,
-        onward: Onward | None,
-        low: Low,
-        take_over: TakeOver | None,
-        retype: Retype | None,
-        line: ProductionLine | None,
-        adopt: Adopt,
+        *,
+        onward: Onward | None = None,
+        line: ProductionLine | None = None,
+        named: Callable[[IdentifiedNode], bool] = lambda _who: False,
     ) -> None:
         self.station, self.node, self.order = station, node, order
-        self.accept, self.confirm, self.reporter = accept, confirm, reporter
-        self.steps, self.onward, self.low, self.take_over = Steps(reporter), onward, low, take_over
-        self.retype, self._retyped, self.adopt = retype or require_board_type, False, adopt
+        self.operator, self.reporter, self.named = operator, reporter, named
+        self.steps, self.onward, self._retyped = Steps(reporter), onward, False
         self.line = line
         self.unit: Unit | None = None
         self._enlisting: StepResult | None = None
@@ -335,7 +315,7 @@ class _Run:
             return
         if is_remembered(self.station, who.uuid, wanted, factory=who.state == NodeState.FACTORY):
             return
-        self.retype(who.uuid, told)
+        self.operator.retype(who.uuid, told)
         self._retyped = True
 
     def _identify(self) -> IdentifiedNode:
@@ -373,14 +353,15 @@ class _Run:
                 return None
             require_own_ca(self.station, who.uuid, who.state, who.security_teds)
             entry = new_whitelist_entry(self.station, self.node, who)
-            self.accept(who)
+            if not self.named(who):
+                self.operator.accept(who)
         self._enlisting = step
         return entry
 
     def _agree(self, who: IdentifiedNode, entry: WhitelistEntry | None) -> AgreeResult:
         try:
             with self.steps.deferred("agree") as step:
-                agreed = agree(self.station, self.node, who, newcomer=entry, take_over=self.take_over)
+                agreed = agree(self.station, self.node, who, newcomer=entry, take_over=self.operator.take_over)
                 step.result = DONE if agreed.fresh else NOTHING
                 step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"
         finally:
@@ -397,7 +378,7 @@ class _Run:
             brings = prepared.order.adopt and present.identity.state != NodeState.PROVISIONED
             proposal = self._adopted(prepared, present) if brings else propose(self.station, prepared, present)
             self._require_its_board(who, prepared, differences(present.image.blocks, proposal.image))
-            proposal.require_a_yes(self.confirm)
+            proposal.require_a_yes(self.operator.confirm)
             if not proposal.changes:
                 step.result = NOTHING
             fits = "".join(f"; {sentence(calibration)}" for calibration in proposal.calibrations.values())
@@ -411,7 +392,7 @@ class _Run:
         reason = prepared.order.accept_calibration
         if brought.errors and reason is None:
             require_a_reason(self.station, brought, None)
-        self.adopt(brought)
+        self.operator.adopt(brought)
         require_a_reason(self.station, brought, reason)
         self.station.audit("adopt", brought.image.uuid, "accepted", teds=brought.image.digest(), name=brought.name)
         return Proposal(brought.image, (), True, brought.warnings, name=brought.name or None)
@@ -455,7 +436,7 @@ class _Run:
                 present=present,
                 progress=self.reporter.written,
                 facts={fact: value for fact, value in facts.items() if value is not None},
-                low=self.low,
+                low=self.operator.low_battery,
             )
             step.result = DONE if written.octets else NOTHING
             step.detail = f"{written.octets} octets" if written.octets else ""

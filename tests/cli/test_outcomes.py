@@ -11,8 +11,8 @@ import pytest
 from rich.spinner import Spinner
 
 from teds_provision.cli.context import App
-from teds_provision.cli.provision import _questions
 from teds_provision.cli.rendering import LiveReporter, tidy
+from teds_provision.cli.terminal_operator import TerminalOperator
 from teds_provision.errors import NotAuthenticError
 from teds_provision.links import Notice
 from teds_provision.links.nfc.message import NdefRecord
@@ -71,11 +71,9 @@ def test_the_store_is_free_while_a_person_is_asked(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(click, "prompt", prompt)
     monkeypatch.setattr(App, "interactive", True)
-    questions = _questions(App(home=home, quiet=True), False)
+    operator = TerminalOperator(App(home=home, quiet=True), yes=False)
     with talk(board) as node:
-        done = provision(
-            station, node, ANGLE, accept=questions.accept, reporter=SilentReporter(), confirm=questions.confirm
-        )
+        done = provision(station, node, ANGLE, operator=operator, reporter=SilentReporter())
     assert done.verified.verdict == "authentic"
     assert len(asked) == 1
 

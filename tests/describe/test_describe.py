@@ -20,7 +20,8 @@ from teds_provision.handover.life import revoke
 from teds_provision.measure.running.measurement_job import station_facts
 from teds_provision.measure.sinks.names import Topics
 from teds_provision.station.station import Station
-from teds_provision.steps.build import BuildOrder, no_confirmation
+from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import provision
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.profile.load import shipped_profiles
@@ -45,9 +46,8 @@ def gripper(station: Station, board: Board, folder: Path, nameplate: str = NAMEP
             station,
             node,
             BuildOrder(str(own), name="hand"),
-            accept=lambda _who: None,
+            operator=AcceptingOperator(),
             reporter=SilentReporter(),
-            confirm=no_confirmation,
         )
     return described_node(station, board.uuid)
 

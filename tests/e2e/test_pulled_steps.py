@@ -16,9 +16,10 @@ from teds_provision.errors import LinkError, NoReaderError
 from teds_provision.links import LinkSettings
 from teds_provision.links.nfc import port
 from teds_provision.station.station import Station as BaseStation
-from teds_provision.steps.batch import BatchRun, ProvisionRequest, Questions
+from teds_provision.steps.batch import BatchRun, ProvisionRequest
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.inventory import inventory
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.talk.progress import SilentReporter
 from tests.bench import PASSPHRASE
 from tests.links.nfc.field import Field
@@ -56,7 +57,7 @@ def pull_at_each(home: Path, field: Field, path: str, lying: list[tuple[str, str
     pulling = Pulling(field)
     request = ProvisionRequest(order=BuildOrder(ANGLE), watch=True)
     run = BatchRun(station, LinkSettings("nfc", path, timeout=30.0), request, pulling)
-    came = run.many(Questions(accept=lambda who: None, confirm=None))
+    came = run.many(AcceptingOperator())
     (other, other_path), *others = lying
     try:
         for (uuid, board), point in zip(others, POINTS, strict=True):

@@ -16,6 +16,7 @@ from teds_provision.station.store import Handover, TrustRecord, WhitelistEntry
 from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.talk.progress import SilentReporter
 from tests.bench import Board, MemoryLink, make_station, talk
@@ -41,7 +42,7 @@ def key_up(station: Station, board: Board, *, name: str | None = None) -> None:
 def provisioned(station: Station, board: Board, profile: str = "temperature-sensor") -> ProvisionResult:
     """All steps on one board."""
     with talk(board) as node:
-        return provision(station, node, BuildOrder(profile), accept=lambda who: None, reporter=SilentReporter())
+        return provision(station, node, BuildOrder(profile), operator=AcceptingOperator(), reporter=SilentReporter())
 
 
 def session(station: Station, board: Board, *, via: str = "can") -> int:

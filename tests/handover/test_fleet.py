@@ -114,7 +114,7 @@ def test_they_rekey_each_others_nodes_by_tap_where_a_person_says_so(
     with talk(board) as node, pytest.raises(PolicyError, match="lock out the current holder"):
         agree(other, node, identify(other, node))
 
-    def no(question: str) -> None:
+    def no(question: str, _refusal: PolicyError) -> None:
         raise PolicyError("You said no.")
 
     for rotate in (False, True):
@@ -124,7 +124,10 @@ def test_they_rekey_each_others_nodes_by_tap_where_a_person_says_so(
         provisioned(other, board)
     assert (board.state, other.keys.held(board.uuid)) == (before, False)
     with talk(board) as node:
-        assert agree(other, node, identify(other, node), take_over=asked.append).epoch == 2
+        assert (
+            agree(other, node, identify(other, node), take_over=lambda question, _refusal: asked.append(question)).epoch
+            == 2
+        )
     assert len(asked) == 1
     assert board.state.ca == one.ca
     assert provisioned(other, board).verified.verdict == "authentic"
@@ -154,7 +157,7 @@ def test_who_is_asked_once_is_not_asked_again_when_the_link_fails(pair: tuple[St
         who = identify(other, node)
         monkey = node.lives
         node.lives = lambda: True  # type: ignore[method-assign]
-        assert agree(other, node, who, take_over=asked.append).epoch == 2
+        assert agree(other, node, who, take_over=lambda question, _refusal: asked.append(question)).epoch == 2
         node.lives = monkey  # type: ignore[method-assign]
     assert len(asked) == 1
 

@@ -17,6 +17,7 @@ from teds_provision.station.store import WhitelistEntry
 from teds_provision.steps.agree import ResetReceipt, agree, reset_node
 from teds_provision.steps.identify import identify
 from teds_provision.steps.inventory import inventory
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.verify import verify_image
 from teds_provision.teds.image import Image
 from tests.bench import Board, talk
@@ -172,7 +173,7 @@ def calibrated(pair: Pair, tmp_path: Path) -> Board:
     calibration.write_text("# channel: 1\nraw,value\n0,-40\n21120,125\n")
     with talk(board) as node:
         order = BuildOrder("temperature-sensor", calibration=calibration, name="thermo")
-        provision(pair.north, node, order, accept=lambda who: None, reporter=SilentReporter())
+        provision(pair.north, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
     return board
 
 

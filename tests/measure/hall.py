@@ -18,6 +18,7 @@ from teds_provision.station.store import WhitelistEntry, utc_now
 from teds_provision.steps.agree import agree
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import provision
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
@@ -45,7 +46,7 @@ def provisioned(station: Station, folder: Path, type_: str, name: str, uuid: byt
             who = identify(station, talk)
             agree(station, talk, who, newcomer=WhitelistEntry(talk.uuid, who.fingerprint, utc_now(), "tap", name))
             return talk.uuid.hex()
-        done = provision(station, talk, order, accept=lambda _who: None, reporter=SilentReporter())
+        done = provision(station, talk, order, operator=AcceptingOperator(), reporter=SilentReporter())
     assert done.verified.verdict == "authentic"
     return node.tim.flash.uuid.hex()
 

@@ -39,10 +39,12 @@ from teds_provision.station.plant.parcels import ParcelRow
 from teds_provision.station.station import Station
 from teds_provision.steps.board_type import WrongBoardError
 from teds_provision.steps.build import BuildOrder, PreparedOrder, prepare
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import ProvisionResult, provision, verify_only
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.certificate import certificate_reference_of
 from teds_provision.teds.profile.load import files_digest, find_profile, shipped_profiles
+from tests.answers import Answers
 from tests.bench import PASSPHRASE, Board, MemoryLink, make_station, talk
 from tests.teds.certificates import ANGLE as CERTIFICATE
 
@@ -59,7 +61,9 @@ def owner(tmp_path: Path) -> Iterator[Station]:
 
 def build(line: LineRun, board: Board, link: MemoryLink | None = None) -> ProvisionResult:
     with talk(board, link) as node:
-        return provision(line.station, node, line.order, accept=lambda who: None, reporter=SilentReporter(), line=line)
+        return provision(
+            line.station, node, line.order, operator=AcceptingOperator(), reporter=SilentReporter(), line=line
+        )
 
 
 def line_of(owner: Station, calibrations: Path | None = None, **changes: Any) -> LineRun:
@@ -201,7 +205,7 @@ def test_a_board_of_another_type_costs_no_unit(tmp_path: Path, owner: Station) -
     other, one = make_station(tmp_path / "other"), board(1)
     with talk(one) as node:
         order = BuildOrder(profile="tactile-finger-sensor")
-        provision(other, node, order, accept=lambda who: None, reporter=SilentReporter())
+        provision(other, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
     line = line_of(owner)
     with pytest.raises(WrongBoardError):
         build(line, one)
@@ -279,7 +283,7 @@ def test_evidence_names_the_calibration_that_was_read_whatever_lies_there_later(
         file.write_text(TABLE.replace("6.28", "6.27"))
 
     with talk(one) as node:
-        provision(owner, node, line.order, accept=rewrite, reporter=SilentReporter(), line=line)
+        provision(owner, node, line.order, operator=Answers(accept=rewrite), reporter=SilentReporter(), line=line)
     (row,) = owner.plant.line.evidence(uuid=one.uuid)
     assert codec.read(row.document).facts.calibration_sha256 == read
 
@@ -437,7 +441,7 @@ def test_a_second_station_tests_what_another_one_made(tmp_path: Path) -> None:
     other = board(2)
     with talk(other) as node:
         order = BuildOrder(profile="tactile-finger-sensor")
-        provision(plant.north, node, order, accept=lambda who: None, reporter=SilentReporter())
+        provision(plant.north, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
     with talk(other) as node, pytest.raises(WrongBoardError):
         verify_only(tester, node, tests, SilentReporter())
     tampered = {**one.state.blocks, (0, 12): one.state.blocks[0, 12][:-3] + b"\0\0\0"}

@@ -11,6 +11,7 @@ from teds_provision import plant
 from teds_provision.errors import PolicyError, UnprovenError
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import provision
 from teds_provision.steps.verify import Verification, require_authentic, snapshot_trust, verify_image, verify_images
 from teds_provision.talk.progress import SilentReporter
@@ -30,7 +31,9 @@ def plants(tmp_path: Path) -> Iterator[Plant]:
 def made_by(station: Station, board: Board) -> Image:
     """The datasheet that a station provisions a board with."""
     with talk(board) as node:
-        provision(station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=SilentReporter())
+        provision(
+            station, node, BuildOrder("temperature-sensor"), operator=AcceptingOperator(), reporter=SilentReporter()
+        )
     image = station.datasheets.datasheet(board.uuid)
     assert image is not None
     return image

@@ -17,6 +17,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store import NodeRecord
 from teds_provision.station.store.audit import ACTOR
 from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import provision
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
@@ -39,7 +40,7 @@ class Watched:
         self.statements.clear()
         with talk(board) as node:
             order = BuildOrder("temperature-sensor")
-            provision(self.station, node, order, accept=lambda who: None, reporter=SilentReporter())
+            provision(self.station, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
         rows = commits = open_rows = self.waited = 0
         last, waits = "", True
         for statement in self.statements:
@@ -114,7 +115,11 @@ def test_the_key_is_on_the_disk_before_its_confirmation_leaves_and_the_sequence_
     watched.station._store._connection.set_trace_callback(stated)
     with talk(Board()) as node:
         provision(
-            watched.station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=SilentReporter()
+            watched.station,
+            node,
+            BuildOrder("temperature-sensor"),
+            operator=AcceptingOperator(),
+            reporter=SilentReporter(),
         )
         told.append("told")
     of_teds = [doing for doing in told if doing.startswith(("TEDS", "on the disk", "the commit"))]
@@ -129,7 +134,11 @@ def test_a_run_that_ends_early_is_on_the_disk_all_the_same(watched: Watched, syn
     link = MemoryLink(Board(), lose_request=3)
     with pytest.raises(LinkError), talk(link.board, link) as node:
         provision(
-            watched.station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=SilentReporter()
+            watched.station,
+            node,
+            BuildOrder("temperature-sensor"),
+            operator=AcceptingOperator(),
+            reporter=SilentReporter(),
         )
     assert synced == ["store.sqlite3-wal"]
 

@@ -18,6 +18,7 @@ from teds_provision.steps.adoption import FactoryDatasheet, NotAdoptedError
 from teds_provision.steps.agree import require_session, reset_node
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import NOTHING, SilentReporter
@@ -26,6 +27,7 @@ from teds_provision.teds.codec.frame import frame, raw_tuple, unframe
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.profile.load import load_profile
 from teds_provision.teds.sheet import Sheet
+from tests.answers import Answers
 from tests.bench import on_reader
 from tests.e2e.desk import ANGLE
 
@@ -57,7 +59,7 @@ def adopted(
             raise says
 
     with Conversation(on_reader(node), notice=lambda _notice: None) as talk:
-        done = provision(station, talk, order, accept=lambda _who: None, reporter=SilentReporter(), adopt=ask)
+        done = provision(station, talk, order, operator=Answers(adopt=ask), reporter=SilentReporter())
     return done, shown
 
 
@@ -82,7 +84,7 @@ def test_without_a_yes_it_stays_as_it_was(station: Station, tmp_path: Path) -> N
         Conversation(on_reader(node), notice=lambda _notice: None) as talk,
         pytest.raises(NotAdoptedError, match="not approved for signing yet"),
     ):
-        provision(station, talk, ADOPT, accept=lambda _who: None, reporter=SilentReporter())
+        provision(station, talk, ADOPT, operator=AcceptingOperator(), reporter=SilentReporter())
     assert node.tim.flash.sequence == 0
     done, _ = adopted(station, node)
     assert done.verified.verdict == "authentic"

@@ -14,6 +14,7 @@ from teds_provision.station.station import Station
 from teds_provision.steps.board_type import WrongBoardError
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.datasheet_edit import plan_sheet, write_sheet
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.calibration import Calibration, read_calibrations
@@ -32,7 +33,7 @@ DEGREES = "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n"
 
 def provisioned(station: Station, board: Board, order: BuildOrder) -> ProvisionResult:
     with talk(board) as node:
-        return provision(station, node, order, accept=lambda _who: None, reporter=SilentReporter())
+        return provision(station, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
 
 
 @pytest.fixture

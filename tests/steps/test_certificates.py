@@ -13,6 +13,7 @@ from teds_provision.station.station import Station
 from teds_provision.steps.batch_sheet import read_sheet
 from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.datasheet_edit import without_stale_certificates
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.calibration.zero import with_zero_offset
@@ -29,7 +30,7 @@ CERTIFICATE = (1, AccessCode.CERTIFICATE)
 def run(station: Station, board: Board, calibration: Path | None, **more: object) -> ProvisionResult:
     order = replace(BuildOrder(PROFILE, calibration), **more)  # type: ignore[arg-type]
     with talk(board) as node:
-        return provision(station, node, order, accept=lambda _: None, reporter=SilentReporter())
+        return provision(station, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
 
 
 def test_the_certificate_teds_is_signed_with_its_calibration_kept_with_it_and_goes_with_it(
@@ -84,7 +85,7 @@ def test_a_certificate_for_one_channel_leaves_those_of_the_other_channels(statio
     def calibrate(file: str, channel: int) -> ProvisionResult:
         order = BuildOrder("tactile-finger-sensor", tmp_path / file, channel=channel, accept_calibration="a test")
         with talk(board) as node:
-            return provision(station, node, order, accept=lambda _: None, reporter=SilentReporter())
+            return provision(station, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
 
     calibrate("one.xml", 1)
     both = calibrate("two.xml", 2).image.blocks

@@ -14,6 +14,7 @@ from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.steps.write import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
+from tests.answers import Answers
 from tests.bench import Board, contact
 
 ANGLE = "magnetic-angular-position-sensor"
@@ -26,7 +27,7 @@ def run(
     there = replace(contact(board), charging=charging)
     with Conversation(there, notice=lambda _notice: None) as node:
         order = BuildOrder(profile=ANGLE, name=name)
-        return provision(station, node, order, accept=lambda _who: None, reporter=SilentReporter(), low=low)
+        return provision(station, node, order, operator=Answers(low_battery=low), reporter=SilentReporter())
 
 
 def test_below_ten_per_cent_nothing_is_written_without_a_word(station: Station, board: Board) -> None:

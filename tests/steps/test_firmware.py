@@ -29,6 +29,7 @@ from teds_provision.steps.firmware import (
 )
 from teds_provision.steps.identify import identify
 from teds_provision.steps.inventory import inventory
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import ProvisionResult, add_to_whitelist, provision
 from teds_provision.steps.verify_node import verify_at_node
 from teds_provision.talk.conversation import Conversation
@@ -83,7 +84,7 @@ def profile(folder: Path, table: str) -> str:
 def given(station: Station, board: Board, wanted: str | None, *, link: MemoryLink | None = None) -> ProvisionResult:
     with met(board, link or on_bus(board)) as node:
         order = BuildOrder(wanted)
-        return provision(station, node, order, accept=lambda _who: None, reporter=SilentReporter())
+        return provision(station, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
 
 
 # -- reading ---------------------------------------------------------------------------------------------------------

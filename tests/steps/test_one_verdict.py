@@ -25,6 +25,7 @@ from teds_provision.steps.agree import require_session
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
 from teds_provision.steps.inventory import inventory
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.sign import known_node_keys
 from teds_provision.steps.teds_read import read_image
 from teds_provision.steps.verify import possession_check
@@ -193,7 +194,7 @@ def test_another_security_teds_makes_everything_be_read(station: Station, board:
         from teds_provision.steps.provision import provision
         from teds_provision.talk.progress import SilentReporter
 
-        provision(station, node, BuildOrder(name="other"), accept=lambda _who: None, reporter=SilentReporter())
+        provision(station, node, BuildOrder(name="other"), operator=AcceptingOperator(), reporter=SilentReporter())
     assert shown(station, board) == ("authentic", "session")
     image = station.datasheets.datasheet(board.uuid)
     assert image is not None

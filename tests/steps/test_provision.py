@@ -30,6 +30,7 @@ from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY
+from tests.answers import Answers
 from tests.bench import Board, MemoryLink, make_station, talk
 
 ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")
@@ -47,7 +48,7 @@ def run(
     accept: Callable[[IdentifiedNode], None] = accept,
 ) -> ProvisionResult:
     with talk(board, link) as node:
-        return provision(station, node, order, accept=accept, reporter=SilentReporter())
+        return provision(station, node, order, operator=Answers(accept=accept), reporter=SilentReporter())
 
 
 def results(done: ProvisionResult) -> dict[str, str]:
@@ -204,7 +205,7 @@ def test_a_revoked_node_is_refused(station: Station, board: Board) -> None:
         run(station, board)
 
 
-def _must_not_be_asked(question: str) -> None:
+def _must_not_be_asked(question: str, _refusal: PolicyError) -> None:
     raise AssertionError(question)
 
 
@@ -214,7 +215,7 @@ def test_another_owners_station_is_refused(station: Station, board: Board, tmp_p
     with pytest.raises(PolicyError, match="belongs to another owner's CA"):
         run(stranger, board)
     with talk(board) as node, pytest.raises(PolicyError, match="belongs to another owner's CA"):
-        provision(stranger, node, ANGLE, accept=accept, reporter=SilentReporter(), take_over=_must_not_be_asked)
+        provision(stranger, node, ANGLE, operator=Answers(take_over=_must_not_be_asked), reporter=SilentReporter())
     assert stranger.pins.entry(board.uuid) is None
     assert board.state == before
 

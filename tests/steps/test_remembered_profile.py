@@ -9,8 +9,9 @@ import pytest
 from teds_provision.station.shown_units import shown_units
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import reset_node
-from teds_provision.steps.build import BuildOrder, UnrequestedChangeError, build, no_confirmation
+from teds_provision.steps.build import BuildOrder, UnrequestedChangeError, build
 from teds_provision.steps.identify import identify
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.profile.load import shipped_profiles
@@ -23,9 +24,7 @@ OVEN = (shipped_profiles() / "temperature-sensor.toml").read_text()
 
 def provisioned(station: Station, board: Board, order: BuildOrder) -> ProvisionResult:
     with talk(board) as node:
-        return provision(
-            station, node, order, accept=lambda _who: None, reporter=SilentReporter(), confirm=no_confirmation
-        )
+        return provision(station, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
 
 
 @pytest.fixture

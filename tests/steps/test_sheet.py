@@ -19,7 +19,7 @@ from teds_provision.errors import (
 )
 from teds_provision.links import Contact, LinkSettings
 from teds_provision.station.station import Station
-from teds_provision.steps.batch import BatchRun, ProvisionRequest, Questions
+from teds_provision.steps.batch import BatchRun, ProvisionRequest
 from teds_provision.steps.batch_sheet import (
     BatchSheet,
     BoardResult,
@@ -31,6 +31,7 @@ from teds_provision.steps.batch_sheet import (
     write_report,
 )
 from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.operator import Operator
 from teds_provision.talk.progress import SilentReporter
 from tests.bench import Board, contact
 from tests.pace import PATIENCE
@@ -297,7 +298,7 @@ def test_boards_that_are_finished_when_the_vault_is_locked_are_counted(
     contacts = [on_reader_number(number) for number in range(4)]
     locked, begun = threading.Event(), threading.Barrier(4)
 
-    def board(contact: Contact, place: str, _questions: Questions) -> BoardResult:
+    def board(contact: Contact, place: str, _operator: Operator) -> BoardResult:
         uuid = contact.identity.uuid
         begun.wait(PATIENCE)  # what has not begun when the vault is locked does not begin any more
         if uuid == contacts[0].identity.uuid:
@@ -309,7 +310,7 @@ def test_boards_that_are_finished_when_the_vault_is_locked_are_counted(
 
     monkeypatch.setattr(boards, "_board", board)
     came: list[bytes] = []
-    everyone = boards._side_by_side(SixAtOnce(), contacts, Questions(lambda _who: None, None))  # type: ignore[arg-type]
+    everyone = boards._side_by_side(SixAtOnce(), contacts, Operator())  # type: ignore[arg-type]
     with pytest.raises(VaultLockedError):
         came.extend(ended.uuid for ended in everyone)
     assert sorted(came) == sorted(contact.identity.uuid for contact in contacts[1:])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,10 +18,11 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.operation.commands import OPERATION, ChannelState, OperationReply
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session, reset_node
-from teds_provision.steps.batch import BatchRun, ProvisionRequest, Questions
+from teds_provision.steps.batch import BatchRun, ProvisionRequest
 from teds_provision.steps.board_type import WrongBoardError, check_hardware, differences, operate
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.identify import identify
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.steps.teds_read import read_image
 from teds_provision.talk.conversation import Conversation
@@ -28,6 +30,7 @@ from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile.load import load_profile
 from teds_provision.teds.sheet import Sheet
+from tests.answers import Answers
 from tests.bench import Board, on_reader, talk
 from tests.e2e.desk import ANGLE
 from tests.measure.hall import CALIBRATIONS
@@ -59,9 +62,9 @@ def order(tmp_path: Path, profile: str | None, **more: bool) -> BuildOrder:
     return BuildOrder(profile, calibration=file, **more)
 
 
-def given(station: Station, contact: Contact, what: BuildOrder, **asked: object) -> ProvisionResult:
+def given(station: Station, contact: Contact, what: BuildOrder, **answers: Callable[..., object]) -> ProvisionResult:
     with Conversation(contact, notice=lambda _notice: None) as node:
-        return provision(station, node, what, accept=lambda _who: None, reporter=SilentReporter(), **asked)  # type: ignore[arg-type]
+        return provision(station, node, what, operator=Answers(**answers), reporter=SilentReporter())
 
 
 def test_a_factory_board_of_another_type_is_refused_before_it_becomes_ours(
@@ -245,7 +248,7 @@ def test_a_row_of_a_sheet_waits_for_its_own_board(station: Station, angle: Virtu
     sheet = tmp_path / "boards.csv"
     sheet.write_text("uuid,name,profile\n,cell,load-cell\n")
     boards = BatchRun(station, LinkSettings("nfc"), ProvisionRequest(None, BuildOrder(), sheet=sheet), SilentReporter())
-    asked = Questions(lambda _who: None, None)
+    asked = AcceptingOperator()
     from teds_provision.steps.batch_sheet import BoardResult as Ended
 
     def tap(contact: Contact) -> Ended:

@@ -21,6 +21,7 @@ from teds_provision.protocol.repetition import Repetition
 from teds_provision.station.station import Station
 from teds_provision.steps import update as update_step
 from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import provision
 from teds_provision.steps.update import BoardUpdate, UpdateOrder, update_boards
 from teds_provision.talk.conversation import Conversation
@@ -104,7 +105,7 @@ class UpdateBench:
     def provision(self) -> None:
         self.station.unlock()
         with Conversation(self.contact(), notice=lambda notice: None) as node:
-            provision(self.station, node, BuildOrder(PROFILE), accept=lambda who: None, reporter=SilentReporter())
+            provision(self.station, node, BuildOrder(PROFILE), operator=AcceptingOperator(), reporter=SilentReporter())
 
     def update(self, image: FirmwareImage, **order: Any) -> BoardUpdate:
         """Run the step once, as the command does."""

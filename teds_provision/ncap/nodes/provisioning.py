@@ -35,10 +35,12 @@ from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.station.store.audit import ACTOR
+from teds_provision.steps.adoption import FactoryDatasheet
 from teds_provision.steps.agree import agree
 from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.datasheet_edit import write_sheet
 from teds_provision.steps.identify import identify
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import ProvisionResult, new_whitelist_entry, provision
 from teds_provision.steps.teds_read import list_blocks
 from teds_provision.steps.verify import Verification, require_authentic
@@ -240,9 +242,7 @@ class Provisioning:
         reporter = _RunReporter(run, self._live)
         try:
             # A request for this very node, or for the one that is about to be tapped, has accepted its key.
-            done: ProvisionResult = provision(
-                self._station, node, order, accept=lambda _who: None, reporter=reporter, adopt=lambda _brought: None
-            )
+            done: ProvisionResult = provision(self._station, node, order, operator=_APPROVED, reporter=reporter)
         except SessionLostError as lost:
             raise lost.cause from lost
         run.verdict = done.verified.verdict
@@ -261,6 +261,16 @@ class Provisioning:
     def _publish(self, run: ProvisioningRun) -> None:
         facts = {"waits_for": run.waits_for, "until": run.until, "error": run.error, "verdict": run.verdict}
         self._live.event("provision", uuid=run.uuid, state=run.state, **facts)
+
+
+class _ApprovedOperator(AcceptingOperator):
+    """The request, or ``ncap run --adopt --yes``, has approved the datasheet that the board brought, too."""
+
+    def adopt(self, brought: FactoryDatasheet) -> None:
+        """Return for every datasheet; one with errors is refused all the same."""
+
+
+_APPROVED: Final = _ApprovedOperator()
 
 
 class _RunReporter:
@@ -387,9 +397,8 @@ class AutoProvisioner:
                 self._station,
                 node,
                 BuildOrder(adopt=True),
-                accept=lambda _who: None,
+                operator=_APPROVED,
                 reporter=SilentReporter(),
-                adopt=lambda _brought: None,
             )
         except (BadDataError, PolicyError) as error:
             self._refused[uuid] = error
@@ -408,7 +417,7 @@ class AutoProvisioner:
             order = BuildOrder(
                 profile, calibration=self._virtuals.calibration_of(uuid), name=self._virtuals.name_of(uuid) or None
             )
-            return provision(station, node, order, accept=lambda _who: None, reporter=SilentReporter()).verified
+            return provision(station, node, order, operator=AcceptingOperator(), reporter=SilentReporter()).verified
         blocks = self._virtuals.blocks_of(uuid)
         with station.node_lock(node.uuid):
             agree(station, node, identify(station, node))

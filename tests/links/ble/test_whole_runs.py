@@ -15,7 +15,7 @@ from teds_provision.node import node_template
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.station.station import Station as OpenStation
 from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.identify import IdentifiedNode
+from teds_provision.steps.operator import AcceptingOperator
 from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.meeting import meet
@@ -34,16 +34,12 @@ Air = Callable[..., Radio]
 ENOUGH = 50  # messages, and so at least as many samples
 
 
-def accept(_who: IdentifiedNode) -> None:
-    """Whoever it is."""
-
-
 def tapped_once(station: OpenStation, folder: Path) -> None:
     """Provision the node in ``folder`` at a tap, so that it has a key of ``station``."""
     node_template.create(folder, profile=ANGLE)
     node = VirtualNode(folder, exclusive=True)
     with Conversation(on_reader(node), notice=lambda _notice: None) as there:
-        provision(station, there, BuildOrder(profile=ANGLE), accept=accept, reporter=SilentReporter())
+        provision(station, there, BuildOrder(profile=ANGLE), operator=AcceptingOperator(), reporter=SilentReporter())
     node.flash_file.release()
 
 
@@ -69,7 +65,7 @@ class CutsAt(SilentReporter):
 
 def over_the_air(station: OpenStation, reporter: SilentReporter, order: BuildOrder) -> ProvisionResult:
     with meet(station, LinkSettings(via="ble", timeout=20), None, reporter) as node:
-        return provision(station, node, order, accept=accept, reporter=reporter)
+        return provision(station, node, order, operator=AcceptingOperator(), reporter=reporter)
 
 
 def test_a_cut_in_the_middle_of_every_step_does_no_harm(station: OpenStation, air: Air, tmp_path: Path) -> None:
