@@ -232,7 +232,7 @@ $(VENV)/.dev: $(VENV)/.made pyproject.toml locks/dev.txt
 
 .venv-fuzz/.ready: pyproject.toml
 	$(PYTHON) -m venv .venv-fuzz
-	.venv-fuzz/bin/python -m pip install --quiet --editable '.[fuzz,bench]'
+	.venv-fuzz/bin/python -m pip install --quiet --editable '.[fuzz,bench,update]'
 	@touch $@
 
 # The node in C: the host port over BearSSL and over Mbed TLS, and its C tests under the sanitizers (firmware/README.md).

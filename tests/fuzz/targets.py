@@ -11,7 +11,7 @@ import logging
 import struct
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from functools import cache, partial
 from io import BytesIO
@@ -21,6 +21,7 @@ from teds_provision.errors import NodeSilentError, TedsProvisionError
 from teds_provision.links.nfc.pieces import Piece, Requester, Responder
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.messages.frames import Command
+from teds_provision.protocol.messages.smp import SmpPacket, decode_packet
 
 CORPUS = Path(__file__).parent / "corpus"
 NOW = datetime(2026, 11, 21, tzinfo=UTC)
@@ -89,9 +90,9 @@ def check_teds(data: bytes) -> None:
         if decoded.verdict == "clean" and not findings:
             assert teds.decode(other).edition == edition
             assert teds.decode(other).verdict == "clean"
-    for field in decoded.fields:
-        teds.unpack_uuid(field.raw)
-        teds.read_key(field.raw)
+    for one in decoded.fields:
+        teds.unpack_uuid(one.raw)
+        teds.read_key(one.raw)
 
 
 def check_sheet(data: bytes) -> None:
@@ -286,13 +287,12 @@ def check_smp(data: bytes) -> None:
     The input is a packet, and pieces ``command u8 ‖ length u8 ‖ body`` that get a right header, of two sessions.
     """
     from teds_provision.protocol.messages.frames import CommandRefusedError
-    from teds_provision.protocol.messages.smp import LISTED, SmpPacket, decode_map, decode_packet
+    from teds_provision.protocol.messages.smp import LISTED, decode_map
     from teds_provision.protocol.tim.manage import ManageFilter
-    from tests.protocol.test_manage import Manager
 
     with suppress(ValueError):
         decode_map(data)
-    manager = Manager(on_trial=bool(data and data[-1] & 1))
+    manager = _NotingManager(on_trial=bool(data and data[-1] & 1))
     now = 0.0
     filtered = ManageFilter(manager, lambda: now, 2048, claimed=lambda: False, staged_elsewhere=lambda session: None)
 
@@ -312,6 +312,25 @@ def check_smp(data: bytes) -> None:
     for got in manager.got:
         assert got.command in LISTED
         decode_map(got.body)
+
+
+@dataclass
+class _NotingManager:
+    """A board's manager that notes what reached it, and answers with the body of the request."""
+
+    on_trial: bool
+    offered: bool = True
+    pending: bool = False
+    buffer: int = 1024
+    got: list[SmpPacket] = field(default_factory=list)
+
+    def manage(self, packet: bytes) -> bytes:
+        """Note a packet."""
+        self.got.append(decode_packet(packet))
+        return self.got[-1].reply(self.got[-1].body).encode()
+
+    def restart(self) -> None:
+        """Nothing restarts: no reply leaves."""
 
 
 def smp_seeds() -> list[bytes]:
@@ -365,8 +384,6 @@ class _AnsweringBoard:
 
     def reply(self, command: Command, doing: str) -> bytes:
         """Answer a packet with the next body, under the header that it is due."""
-        from teds_provision.protocol.messages.smp import decode_packet
-
         del doing
         self.requests += 1
         body = self._bodies.pop(0) if len(self._bodies) > 1 else (self._bodies or [b""])[0]
