@@ -6,9 +6,11 @@ their parts have no name worth knowing.
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,6 +23,21 @@ LATE_IMPORTS = {
     "__main__.py": 2,  # Ctrl-C while Python imports the command line ends with 130 as later
 }
 """Imports of our own inside functions, by file."""
+
+_WIRED = "a part of the daemon, wired up once in daemon.py: each argument is another part or a setting"
+MANY_PARAMETERS = {
+    "client.py provision": "the members of the request body, as keywords of the public client",
+    "ncap/nodes/provisioning.py begin": "the members of that request body",
+    "node/nfc/server.py __init__": "the tag's pace and sizes, each set by itself in tests of a link",
+    "ncap/dynamic_membership.py __init__": _WIRED,
+    "ncap/measurement_supervisor.py __init__": _WIRED,
+    "ncap/nodes/link_watch.py __init__": _WIRED,
+    "steps/sign.py sign": "what a signature depends on, which each caller has from another place",
+    "steps/write.py _conclude": "what one durable write of the store holds",
+    "measure/topic_actuators.py __init__": "the session, the streams' clock and lock, and the two ways of an answer",
+    "measure/capture.py capture_at": "a command's arguments, as each function of that name has them",
+}
+"""Functions of more than eight parameters, and why; those of a command are its options."""
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +65,28 @@ def test_imports_of_our_own_stand_on_top(house: ModuleType, modules: dict[str, o
     found = Counter(place.rpartition(":")[0] for place in house.late_imports(modules))
     more = [f"{file}: {count}" for file, count in found.items() if count > LATE_IMPORTS.get(file, 0)]
     assert not more, "import on top, through the room if it must load late (CONTRIBUTING.md, The house)"
+
+
+def many_parameters(tree: ast.AST) -> Iterator[str]:
+    """Yield the functions of more than eight parameters that are no commands."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+            names = [parameter.arg for parameter in every if parameter.arg not in ("self", "cls")]
+            is_command = any("command(" in ast.unparse(part) for part in node.decorator_list)
+            if len(names) > 8 and not is_command:
+                yield node.name
+
+
+def test_more_than_eight_parameters_have_a_reason(modules: dict[str, Any]) -> None:
+    folder = ROOT / "teds_provision"
+    found = {
+        f"{module.path.relative_to(folder)} {name}"
+        for module in modules.values()
+        for name in many_parameters(module.tree)
+    }
+    assert found - MANY_PARAMETERS.keys() == set(), "hand over one object that has a name, or state the reason above"
+    assert MANY_PARAMETERS.keys() - found == set(), "they have fewer now"
 
 
 def test_scripts_of_the_page_import_each_other_one_way(house: ModuleType) -> None:
