@@ -101,9 +101,11 @@ def _lines(result: Mapping[str, Any], summary: RecordingSummary, recording: Reco
 def _span(channel: Mapping[str, Any], facts: ChannelFacts | None) -> str:
     if channel["lowest"] is None or facts is None:
         return ""
-    low, unit = measure_view.in_peoples_units(channel["lowest"], facts)
-    high, _ = measure_view.in_peoples_units(channel["highest"], facts)
-    return f", {low:.6g} to {high:.6g} {unit}".rstrip()
+    low, unit = measure_view.value_text(channel["lowest"], facts)
+    high, _ = measure_view.value_text(channel["highest"], facts)
+    plain = [f"{measure_view.in_peoples_units(channel[end], facts)[0]:.6g}" for end in ("lowest", "highest")]
+    # at the end of a full turn 360 is 0; as the upper end of a span it is 360, unless all values are at that end
+    return f", {low} to {high if low != plain[0] else plain[1]} {unit}".rstrip()
 
 
 def _local(text: str) -> str:

@@ -298,6 +298,8 @@ def _agree(
     again: bool,
 ) -> AgreeResult:
     new = who.state == NodeState.FACTORY
+    if not new and newcomer is None and station.pins.entry(node.uuid) is None:  # to whitelist it would be of no use
+        require_own_ca(station, node.uuid, who.state, who.security_teds)
     with station.reading():
         returning = _may_return(station, who)
         entry = newcomer

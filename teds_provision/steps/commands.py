@@ -18,6 +18,7 @@ from teds_provision.errors import (
     NodeRefusedError,
     NodeSilentError,
     NotFoundError,
+    NotWhitelistedError,
     PolicyError,
     TedsProvisionError,
     UnprovenError,
@@ -299,7 +300,11 @@ def agree_at(
     from another station; it raises for a no.
     """
     uuid = station.nodes.resolve(node)
-    station.policy.require_whitelisted(uuid)
+    try:
+        station.policy.require_whitelisted(uuid)
+    except NotWhitelistedError:  # if another owner's CA refuses a take-over, to whitelist the node is of no use
+        if dry_run or not rotate:
+            raise
     if dry_run:
         held = tuple(f"{record.state} key of epoch {record.epoch}" for record in station.keys.keys_of(uuid))
         return AgreeReport(uuid, None, ("rotate" if rotate else "keep") if held else "agree on a first key", held)

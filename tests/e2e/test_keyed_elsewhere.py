@@ -43,6 +43,7 @@ def test_another_owners_node_comes_by_backup_by_ca_file_by_handover_or_by_a_rese
 
     # the rival cannot have it, whatever it tries, and each refusal says so at once, with the three ways out
     no_step_is_shown_as_done(rival, node)
+    assert "another owner's CA" in rival.refuses("agree", node.uuid, "--rotate", "--yes", *links, code=6)["message"]
     rival.ask("identify", "--add", *links)
     for words in (["provision", "-p", ANGLE, "--yes"], ["agree", node.uuid, "--rotate", "--yes"]):
         said = rival.refuses(*words, *links, code=6)

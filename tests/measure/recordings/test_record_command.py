@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ import pytest
 from teds_provision.measure.blocks import ChannelFacts, ClockSet, NodeReport
 from teds_provision.measure.recordings.opening import open_recording
 from teds_provision.measure.sinks import Sink, open_sink
+from teds_provision.teds.units import parse_units
 from tests.cli.shell import call, unmeasured_environment
 from tests.measure.recordings.test_converting import recorded, told
 from tests.measure.sinks.parts import ANGLE, ARM, STATION, block
@@ -127,6 +130,18 @@ def test_wide_needs_a_file_of_text(tmp_path: Path) -> None:
     done = call(tmp_path / "home", "measure", "8d4d", "--to", str(tmp_path / "run.mcap"), "--wide")
     assert done.code == 2
     assert "--to FILE.csv" in done.err
+
+
+def test_an_angle_at_the_end_of_its_turn_spans_no_turn(tmp_path: Path) -> None:
+    path, turn = tmp_path / "run.csv", 2 * math.pi
+    angle = replace(ANGLE, units=parse_units("rad"), high=turn)
+    for values, span in (([turn - 1e-9] * 3, "0 to 0 °"), ([1.0, 2.0, turn - 1e-9], "57.2958 to 360 °")):
+        path.unlink(missing_ok=True)
+        sink = open_sink(str(path))
+        sink.open((angle,), STATION)
+        sink.write(block(value=[[value] for value in values]))
+        sink.close()
+        assert span in call(tmp_path / "home", "record", "info", str(path)).out
 
 
 def info_of(folder: Path, path: Path) -> dict[str, Any]:
