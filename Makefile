@@ -295,8 +295,13 @@ docs: $(VENV)/.dev
 	$(BIN)/python scripts/api.py build/site/python
 
 # Before a release: the gate, and what proves the same at greater length.
-test-all: test bench-short
-	$(BIN)/python -m pytest tests/release tests/plant/test_returned_pages.py tests/ncap/test_by_topics.py -m soak -rs
+test-all: test bench-short .venv-mujoco/.made
+	$(BIN)/python -m pytest tests/release tests/plant/test_returned_pages.py tests/ncap/test_by_topics.py tests/node/test_examples.py -m soak -rs
+
+.venv-mujoco/.made:
+	$(PYTHON) -m venv .venv-mujoco
+	.venv-mujoco/bin/python -m pip install --quiet mujoco
+	@touch $@
 
 # Each benchmark at its smallest size, so that none breaks unseen; the figures mean nothing.
 bench-short: $(VENV)/.dev
@@ -333,4 +338,4 @@ sbom: .venv-release/.ready $(VENV)/.run
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .venv-fuzz .venv-smp .venv-release .venv-versions .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) .venv-mujoco .venv-fuzz .venv-smp .venv-release .venv-versions .mypy_cache .ruff_cache .pytest_cache

@@ -1,12 +1,11 @@
-"""The examples of simulations: run where their packages are (they are no dependency of the project)."""
+"""The examples of simulations; ``make test-all`` runs one, with the newest MuJoCo (no dependency of the project)."""
 
 from __future__ import annotations
 
 import ast
-import importlib.util
 import json
+import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,9 @@ from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
+MUJOCO_PYTHON = Path(os.environ.get("MUJOCO_PYTHON", ROOT / ".venv-mujoco" / "bin" / "python"))
 UUID = bytes(10)
 
 
@@ -40,10 +41,10 @@ def test_examples_name_the_sensors_of_their_profile_and_are_short(example: str, 
     assert len(code) <= 24
 
 
-@pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="mujoco is not installed")
+@pytest.mark.soak
 def test_the_pendulum_swings_within_the_sensors_range() -> None:
     with subprocess.Popen(
-        [sys.executable, EXAMPLES / "mujoco_pendulum.py"], stdout=subprocess.PIPE, text=True
+        [MUJOCO_PYTHON, EXAMPLES / "mujoco_pendulum.py"], stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
         lines = [json.loads(process.stdout.readline()) for _ in range(50)]
