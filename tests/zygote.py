@@ -34,6 +34,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tests.pace import PATIENCE
+
 ROOT = Path(__file__).resolve().parents[1]
 # What the commands of the bench import late: foreign and heavy. Seen by comparing sys.modules before and after each.
 FOREIGN = (
@@ -198,7 +200,7 @@ class Zygote:
         finally:
             os.close(told)
             os.close(nothing)
-        assert _readable(status, 60), "the zygote does not answer"
+        assert _readable(status, PATIENCE), "the zygote does not answer"
         return Forked(int(os.read(status, 16)), status)
 
     def start(

@@ -56,7 +56,9 @@ _GAP = "  "
     "--fits", metavar="EXPR", help='Check datasheets: "angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz".'
 )
 @click.option("--format", "form", type=click.Choice(["table", "csv", "json"]), help="Default: table.")
-@click.option("--plant", "of_plant", is_flag=True, help="Show what the plant's stations report: holders, conflicts.")
+@click.option(
+    "--plant", "of_plant", is_flag=True, help="Show what the plant's stations report: holders, firmware, conflicts."
+)
 @pass_app
 def nodes(
     app: App,
@@ -154,8 +156,31 @@ def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) 
         written = f", datasheet {says['sequence']} by {says['written_by']}" if says["written_by"] else ""
         banned = f", revoked by {', '.join(says['revoked'])}" if says["revoked"] else ""
         held = f"held by {holders} (epoch {says['epoch']})" if says["holders"] else "no holder"
-        line = "  ".join(filter(None, (node["uuid"], shown(node["name"] or ""), f"{held}{written}{banned}")))
-        app.lines([line, *(f"  {conflict['name']}: {shown(conflict['why'])}" for conflict in node["conflicts"])])
+        told = f"{held}{written}, firmware {_reported(says['firmware'])}{banned}"
+        line = "  ".join(filter(None, (node["uuid"], shown(node["name"] or ""), told)))
+        app.lines([
+            line,
+            *(f"  {conflict['name']}: {shown(conflict['why'])}" for conflict in node["conflicts"]),
+            *(f"  also reported: firmware {_reported(seen)}" for seen in _others(says)),
+        ])  # fmt: skip
+
+
+def _reported(firmware: dict[str, Any] | None) -> str:
+    """Return the firmware that a station saw, by whom and when; None: no station reports any."""
+    if firmware is None:
+        return "not reported"
+    by = f"({firmware['by']}, {local_time(firmware['at'])})"
+    if firmware["version"] is None:
+        return shown(f"not reported {by}")
+    build = f"+{firmware['build']}" if firmware["build"] else ""
+    return shown(" ".join(filter(None, (firmware["text"], f"{firmware['version']}{build}", by))))
+
+
+def _others(says: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return earlier reports of other stations that differ from the newest."""
+    newest = says["firmware"] or {}
+    what = ("text", "version", "build", "image")
+    return [seen for seen in says["firmware_by"].values() if any(seen[name] != newest[name] for name in what)]
 
 
 _FIELDS = (

@@ -671,7 +671,13 @@ def log(app: App, node: str | None, name: str | None, since: str | None) -> None
 def _members(event: dict[str, Any]) -> str:
     hidden = ("act", "id", "at", "statement", "proof")
     shown = {name: value for name, value in event.items() if name not in hidden and value is not None}
-    return " ".join(f"{name}={str(value)[:20]}" for name, value in shown.items())
+    return " ".join(f"{name}={_short(value)}" for name, value in shown.items())
+
+
+def _short(value: object) -> str:
+    if isinstance(value, list):  # firmware: its text and version, without the digest of its image
+        return " ".join(map(str, value[:2]))
+    return str(value)[:20]
 
 
 # -- a person's word ---------------------------------------------------------------------------------------------------

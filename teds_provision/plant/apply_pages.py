@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 
 from teds_provision.errors import PolicyError, TedsProvisionError
 from teds_provision.handover import deny
+from teds_provision.plant.backlog import firmware_reports
 from teds_provision.protocol.fingerprints import is_whole, same_key
 from teds_provision.protocol.handover.revocation import open_revocation
 from teds_provision.protocol.handover.strict_json import load_exact
@@ -149,10 +150,32 @@ def row_of(page: Page) -> PageRow:
     return PageRow(page.number, page.hash, page.previous, page.created, page.home, *split(page.octets))
 
 
-def recount(station: Station, chain: Chain, roster: Roster) -> set[tuple[int, str]]:
+def fold_new_acts(station: Station, roster: Roster) -> int:
+    """Fold the pages here again if an earlier version, which skipped acts that this one knows, did so; return how many.
+
+    That version published nothing of these acts either: what this station keeps of them becomes events now.
+    """
+    if event.FORMS.keys() <= station.plant.folded_acts():
+        return 0
+    folded = 0
+    for chain in station.plant.pages.chains().values():
+        with station.transaction():
+            folded += len(recount(station, station.plant.pages.chain(chain.station), roster, again=True))
+    own = station.plant.pages.chain(station.fingerprint).chain
+    with station.transaction():
+        for act, uuid, members in list(firmware_reports(station)):
+            assert uuid is not None
+            claim = station.plant.claims.of_station(own, [uuid]).get(uuid)
+            if claim is None or Claim.from_json(claim).firmware is None:
+                station.plant.record_event(act, uuid, **members)
+        station.plant.put_folded_acts(event.FORMS)
+    return folded
+
+
+def recount(station: Station, chain: Chain, roster: Roster, *, again: bool = False) -> set[tuple[int, str]]:
     """Determine again which pages of a chain count, and fold them; from the first one if folded pages no longer count.
 
-    Returns the pages that were folded now.
+    Returns the pages that were folded now. ``again``: from the first one in any case.
     """
     names = station.plant.pages.names(chain.chain)
     counts = counting(names, last=_last(roster, chain.station), accepted=chain.accepted)
@@ -162,7 +185,7 @@ def recount(station: Station, chain: Chain, roster: Roster) -> set[tuple[int, st
     else:
         station.plant.alarms.end_about("two-histories", chain.station)
     folded = chain.folded
-    if folded[0] and folded not in counts.pages:
+    if folded[0] and (again or folded not in counts.pages):
         station.plant.claims.forget(chain.chain)
         folded = (0, "")
         for n, hash, _ in names:

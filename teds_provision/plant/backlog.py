@@ -16,6 +16,7 @@ from teds_provision.handover.pending import UNDONE, BundleNotes
 from teds_provision.protocol.datasheet import signature_good
 from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.handover.revocation import open_revocation
+from teds_provision.station.firmware import plant_event
 from teds_provision.station.station import Station
 from teds_provision.station.store import KeyRecord
 from teds_provision.teds.codec import security
@@ -38,6 +39,7 @@ def backlog(station: Station) -> Iterator[Told]:
     for shown in station.nodes.all_shown_keys():
         for epoch, sequence, digest in signed_here(station, shown.uuid):
             yield "signed", shown.uuid, {"epoch": epoch, "sequence": sequence, "teds_sha256": digest}
+    yield from firmware_reports(station)
     for ban in station.policy.revocations():
         try:
             own = open_revocation(ban.statement, lambda kid: station.point if kid == station.fingerprint else None)
@@ -64,6 +66,13 @@ def _handed(station: Station, keys: dict[bytes, KeyRecord]) -> Iterator[Told]:
                 yield "took", uuid, {**handed, "peer": row.peers[0]}
             elif row.direction == "out":
                 yield from (("gave", uuid, {**handed, "peer": peer}) for peer in row.peers)
+
+
+def firmware_reports(station: Station) -> Iterator[Told]:
+    """Firmware that nodes reported in a session, as it is kept here."""
+    for record in station.firmware_reports.all():
+        if (stated := plant_event(record)) is not None:
+            yield "firmware", record.uuid, {"runs": stated.members, "at": record.at}
 
 
 def signed_here(station: Station, uuid: bytes) -> Iterator[tuple[int, int, str]]:

@@ -11,6 +11,7 @@ from teds_provision.errors import NotFoundError, UsageError
 from teds_provision.plant.apply_pages import AT_ONCE, counted_places, heads_digest, merged_views, now, require_roster
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
+from teds_provision.protocol.plant.fold import FirmwareClaim
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Member, Roster
 from teds_provision.station.plant.alarms import Alarm
 from teds_provision.station.plant.pages import Chain
@@ -203,10 +204,29 @@ def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator
                     "sequence": newest[0] if newest is not None else None,
                     "written_by": newest[1] if newest is not None else None,
                     "profile": newest[2] if newest is not None else None,
+                    "firmware": _firmware_to_json(roster, seen.firmware[0]) if seen.firmware else None,
+                    "firmware_by": {
+                        roster.name_of(reported.station): _firmware_to_json(roster, reported)
+                        for reported in seen.firmware
+                    },
                     "revoked": [roster.name_of(statement.said.sender) for statement in seen.bans],
                 },
                 "conflicts": [{"name": conflict, "why": why} for conflict, why in seen.conflicts.items()],
             }
+
+
+def _firmware_to_json(roster: Roster, reported: FirmwareClaim) -> dict[str, Any]:
+    """Return what a node last reported to a station; all but ``by`` and ``at`` null: it reports no firmware."""
+    text, version, image = reported.runs or (None, None, None)
+    number, build = version.split("+") if version is not None else (None, None)
+    return {
+        "text": text,
+        "version": number,
+        "build": None if build is None else int(build),
+        "image": image,
+        "by": roster.name_of(reported.station),
+        "at": reported.at,
+    }
 
 
 def page_list(station: Station, of: str, most: int = 20) -> list[tuple[int, str, str]]:

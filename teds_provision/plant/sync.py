@@ -18,6 +18,7 @@ from teds_provision.plant import fetching, parcels, removed_members, returned
 from teds_provision.plant.apply_pages import (
     alarm,
     apply_claims,
+    fold_new_acts,
     merged_views,
     now,
     octets_of,
@@ -90,6 +91,8 @@ def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncRe
                 hint="A removed key cannot return: create a new station (init) and have it added.",
             )
         _own_head(station, post, roster, done, connected=connected)
+        if again := fold_new_acts(station, roster):
+            done.told.append(f"{counted(again, 'page')} read again: this version shows more of what pages say")
         while close_page(station, roster) is not None:
             pass
         _push(station, post, roster, done, connected=connected)
@@ -277,6 +280,8 @@ def _know_again(station: Station, page: Page) -> None:
     reached: dict[bytes, tuple[int, int]] = {}
     signed: set[bytes] = set()
     for event_read in map(event.read, page.events):
+        if isinstance(event_read, event.Event) and event_read.act == "firmware" and event_read.uuid is not None:
+            station.firmware_reports.make_hint(event_read.uuid)  # of the backup: this station saw a newer one since
         if (
             isinstance(event_read, event.Event)
             and event_read.uuid is not None

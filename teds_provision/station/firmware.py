@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 from teds_provision.errors import BadDataError, GarbledError, NotFoundError, StoreError
 from teds_provision.protocol.messages.firmware import FirmwareFlag, FirmwareReport
@@ -71,6 +71,30 @@ def same_firmware(one: FirmwareReport | None, other: FirmwareReport | None) -> b
     if one.image is not None and other.image is not None:
         return one.image == other.image
     return (one.text, release_of(one), one.image) == (other.text, release_of(other), other.image)
+
+
+class PlantFirmware(NamedTuple):
+    """What the plant hears of a node's firmware: text, version and digest; ``runs`` None: the node reports none."""
+
+    runs: tuple[str, str, str | None] | None
+
+    @property
+    def members(self) -> list[str | None] | None:
+        """``runs`` as an event has it."""
+        return None if self.runs is None else list(self.runs)
+
+
+def plant_event(record: FirmwareRecord | None) -> PlantFirmware | None:
+    """Return what the plant hears of a kept report, None for nothing.
+
+    Only a report of a session counts. An image on trial is left out: it may be gone after the next restart.
+    """
+    if record is None or not record.in_session:
+        return None
+    report = decoded_report(record.report)
+    if report is None:
+        return PlantFirmware(None)
+    return None if FirmwareFlag.ON_TRIAL in report.flags else PlantFirmware(report.stated)
 
 
 @dataclass

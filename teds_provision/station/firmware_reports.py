@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 from teds_provision.station.row_macs import MacRow, RowMacs, Values
@@ -32,21 +33,36 @@ class FirmwareReports:
         found = self._store.read(_record, "SELECT * FROM firmware ORDER BY uuid")
         return (record for record in found if self._counts(record))
 
-    def keep(self, uuid: bytes, report: bytes, *, in_session: bool, signed: bool = False) -> None:
-        """Keep a node's answer to About (empty: it reports none); only one in a session replaces one of a session.
+    def keep(self, uuid: bytes, report: bytes, *, in_session: bool, signed: bool = False) -> FirmwareRecord:
+        """Keep a node's answer to About (empty: it reports none), and return what is kept now.
 
-        ``signed``: its datasheet was signed under this firmware. An answer that is known is not written again.
+        Only one in a session replaces one of a session. ``signed``: its datasheet was signed under this firmware. An
+        answer that is known is not written again.
         """
         with self._store.together():
             before = self.get(uuid)
             if before is not None and before.in_session and not in_session:
-                return
+                return before
             known = before is not None and (before.report, before.in_session) == (report, in_session)
             at = before.at if before is not None and known else utc_now()
             kept = before.signed if before is not None else None
             record = FirmwareRecord(uuid, report, in_session, at, report if signed else kept)
             if record != before:
                 self._put(record)
+            return record
+
+    def renew(self, record: FirmwareRecord) -> FirmwareRecord:
+        """Note that a kept report holds since now: the node reported it again, after another station saw another."""
+        renewed = replace(record, at=utc_now())
+        self._put(renewed)
+        return renewed
+
+    def make_hint(self, uuid: bytes) -> None:
+        """Let the next report of a session replace a kept one in any case; until then it is shown as unverified."""
+        with self._store.together():
+            before = self.get(uuid)
+            if before is not None and before.in_session:
+                self._put(replace(before, in_session=False))
 
     def _put(self, record: FirmwareRecord) -> None:
         """Write a report with its MAC; without one, and so only a hint, as long as the vault is closed."""

@@ -18,6 +18,7 @@ from teds_provision.station.firmware import (
     FirmwareState,
     KnownFirmware,
     decoded_report,
+    plant_event,
     state_of,
 )
 from teds_provision.station.station import Station
@@ -116,6 +117,20 @@ def firmware_warning(known: KnownFirmware | None) -> str:
 
 
 def keep_firmware(station: Station, uuid: bytes, reading: FirmwareReading | None, *, signed: bool = False) -> None:
-    """Keep a node's answer. ``signed``: its datasheet was signed now, under this firmware."""
-    if reading is not None:
-        station.firmware_reports.keep(uuid, reading.payload, in_session=reading.sealed, signed=signed)
+    """Keep a node's answer. ``signed``: its datasheet was signed now, under this firmware.
+
+    The plant hears of a change that the node reported in a session; an unauthenticated answer is kept here alone.
+    """
+    if reading is None:
+        return
+    with station.transaction():
+        before = station.firmware_reports.get(uuid)
+        after = station.firmware_reports.keep(uuid, reading.payload, in_session=reading.sealed, signed=signed)
+        stated = plant_event(after)
+        if not reading.sealed or stated is None or station.plant.joined is None:
+            return
+        if stated == plant_event(before):
+            if not station.plant.reports_other_firmware(uuid, stated.runs, after.at):
+                return
+            after = station.firmware_reports.renew(after)  # the same again, and other firmware in between
+        station.plant.record_event("firmware", uuid, at=after.at, runs=stated.members)

@@ -234,12 +234,19 @@ def test_unknown_roles_are_passed_over_and_none_is_audit() -> None:
 
 def test_the_known_pages_are_read_with_every_event() -> None:
     acts = set()
-    for name in ("north 1", "west 1", "west 2", "south 1", "west 2, other history"):
+    for name in ("north 1", "west 1", "west 2", "south 1", "west 2, other history", *KAT["firmware"]["pages"]):
         read = page.open_page(octets_of(name), KAT["registry"], POINTS.get)
         events = [event.read(value) for value in read.events]
         assert all(isinstance(item, event.Event) for item in events)
         acts |= {item.act for item in events if isinstance(item, event.Event)}
     assert acts == set(event.FORMS)
+
+
+@pytest.mark.parametrize("runs", KAT["firmware"]["refused"], ids=str)
+def test_firmware_that_no_node_can_report_is_no_event(runs: object) -> None:
+    good = KAT["documents"]["west 3"]["payload"]["events"][0]
+    assert isinstance(event.read(good), event.Event)
+    assert event.read({**good, "runs": runs}) == "firmware: runs is not of its form"
 
 
 def test_a_page_is_its_members_and_of_its_registry() -> None:

@@ -15,7 +15,7 @@ from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.chain import counting
 from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.fold import LocalState
-from teds_provision.protocol.plant.roster import Place, open_roster
+from teds_provision.protocol.plant.roster import Place, Roster, open_roster
 from tests.plant.plants import NODES, NOW, Reader, Speaker, roster_of, shuffled, speaker
 from tests.plant.test_documents import CA, KAT, octets_of
 
@@ -23,6 +23,7 @@ NODE = SoftwareKey(77)
 PIN, OTHER = fingerprint(NODE.point), "ab" * 32
 DIGEST, DIGEST2 = "d1" * 32, "d2" * 32
 A = NODES[0]
+OLD, NEW = ["nrf/loadcell", "1.2.0+3", "a1" * 32], ["nrf/loadcell", "1.3.0+0", "a2" * 32]
 
 
 # -- the known answers -------------------------------------------------------------------------------------------------
@@ -58,6 +59,26 @@ def test_the_known_views_follow_from_their_pages(name: str) -> None:
     for _, station, digest, result, _ in given["signing_station"]:
         signer = KAT["keys"][station]["fingerprint"]
         assert reader.signing(signer, digest).result == result, (station, digest)
+
+
+@pytest.mark.parametrize("roster", KAT["firmware"]["views"])
+def test_the_known_firmware_follows_from_its_pages(roster: str) -> None:
+    reader = Reader(open_roster(octets_of(roster), CA.point), [])
+    for station, numbers in {"west": (1, 2, 3), "south": (1, 2), "north": (1, 2)}.items():
+        pages = [KAT["documents"][f"{station} {n}"]["payload"] for n in numbers]
+        signer = KAT["keys"][station]["fingerprint"]
+        gone = reader.roster.removed_one(signer)
+        for payload in pages:
+            for item in map(event.read, payload["events"]):
+                if (
+                    isinstance(item, event.Event)
+                    and item.act != "revoked"
+                    and (gone is None or payload["n"] <= gone.last[0])
+                ):
+                    reader._take(signer, (payload["n"], ""), item)
+    for digits, due in KAT["firmware"]["views"][roster].items():
+        seen = reader.view(bytes.fromhex(digits)).firmware
+        assert [[claim.station, claim.runs and list(claim.runs), claim.at] for claim in seen] == due
 
 
 def add_without_statements(reader: Reader, octets: bytes) -> None:
@@ -160,6 +181,7 @@ def anything(current: Speaker, chance: random.Random, speakers: list[Speaker]) -
                          "proof": NODE.sign(reset_message(uuid, epoch, challenge)).hex()}),
         ("named", uuid, {"name": chance.choice(["left", "right"])}),
         ("grouped", uuid, {"group": "hand", "member": chance.random() < 0.5}),
+        ("firmware", uuid, {"runs": chance.choice([None, OLD, NEW])}),
         ("revoked", uuid, {"statement": statement.statement}),
         ("lifted", None, {"of": event.hash_of_statement(statement.statement)}),
     ]  # fmt: skip
@@ -303,6 +325,40 @@ def test_a_keepers_name_goes_before_a_later_one(four: list[Speaker]) -> None:
     assert (seen.name, seen.groups) == ("by keeper", {"hand": False})
 
 
+def reported(current: Speaker, runs: list[str] | None, second: int) -> dict[str, Any]:
+    return current.event("firmware", A, second, runs=runs)
+
+
+def firmware_seen(roster: Roster, speakers: list[Speaker]) -> list[tuple[str, str | None]]:
+    """Station and version of each report, as they are shown."""
+    seen = Reader(roster, pages_of(speakers)).view(A).firmware
+    return [(roster.name_of(claim.station), claim.runs and claim.runs[1]) for claim in seen]
+
+
+def test_the_newest_report_of_a_nodes_firmware_is_shown_first_with_its_station(four: list[Speaker]) -> None:
+    keep, _, line, base = four
+    assert firmware_seen(roster_of(four), four) == []
+    line.page(reported(line, NEW, 50), reported(line, OLD, 40))  # its newest by place, whatever its clock says
+    base.page(reported(base, NEW, 45))
+    keep.page(reported(keep, None, 10))
+    assert firmware_seen(roster_of(four), four) == [("base", "1.3.0+0"), ("line", "1.2.0+3"), ("keep", None)]
+
+
+def test_what_a_stolen_station_saw_counts_to_its_last_page_and_after_all_others(four: list[Speaker]) -> None:
+    keep, keep2, line, base = four
+    last = line.page(reported(line, OLD, 4_000_000))
+    line.page(reported(line, NEW, 4_000_001))
+    base.page(reported(base, NEW, 10))
+    gone = roster_of([keep, keep2, base], [(line, last)], version=2)
+    assert firmware_seen(gone, four) == [("base", "1.3.0+0"), ("line", "1.2.0+3")]
+
+
+def test_an_auditor_reports_no_firmware(four: list[Speaker]) -> None:
+    audit = speaker("audit", "audit")
+    audit.page(reported(audit, NEW, 10))
+    assert firmware_seen(roster_of([*four, audit]), [*four, audit]) == []
+
+
 # -- liars -------------------------------------------------------------------------------------------------------------
 
 LIARS = ["line", "base", "sign", "audit", "line sign base", "stranger"]
@@ -318,6 +374,7 @@ def lies(liar: Speaker, victims: list[Speaker]) -> None:
         liar.event("vouched", A, teds_sha256=DIGEST2), liar.event("forgot", A, epoch=4_000_000_000),
         liar.event("written", A, epoch=4_000_000_000, sequence=4_000_000_000, teds_sha256=OTHER, profile="x",
                    profile_sha256=None, due=None),
+        liar.event("firmware", A, runs=NEW),
         liar.event("reset", A, epoch=4_000_000_000, challenge="00" * 32, proof="00" * 64, point=NODE.point.hex()),
         heads={victim.fingerprint: (999, "ee" * 32) for victim in victims},
     )  # fmt: skip

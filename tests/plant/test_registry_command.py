@@ -120,7 +120,8 @@ def test_three_stations_join_and_see_the_same(desk: Desk) -> None:
     assert node["uuid"] == UUID
     assert node["says"]["pinned_by"] == {"north": KEY}
     assert node["conflicts"] == []
-    assert UUID in desk.run("west", "nodes", "--plant", "8d4d").out
+    assert (node["says"]["firmware"], node["says"]["firmware_by"]) == (None, {})
+    assert f"{UUID}  no holder, firmware not reported" in desk.run("west", "nodes", "--plant", "8d4d").out
     assert desk.run("west", "registry", "log").out.count("pinned") == 1
     shown = desk.run("west", "registry", "status")
     assert "plant Augsburg" in shown.out
@@ -474,5 +475,5 @@ def test_a_node_on_which_stations_do_not_agree_says_so_itself(desk: Desk) -> Non
     assert [conflict["name"] for conflict in node["conflicts"]] == ["other pin"]
     assert "conflict     other pin: keepers pin" in desk.run("south", "nodes", UUID).out
     shown = desk.run("south", "nodes", "--plant", UUID).out
-    assert "no holder\n" in shown
+    assert "no holder, firmware not reported\n" in shown
     assert "1 conflict," in desk.run("south", "registry", "status").out

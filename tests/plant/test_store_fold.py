@@ -80,7 +80,12 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
     for speaker in speakers:
         for digest in (DIGEST, DIGEST2):
             found = rules.signing(CA.point, speaker.key.point, bytes.fromhex(digest))
-            assert found == oracle.signing(speaker.fingerprint, digest)
+            due_verdict = oracle.signing(speaker.fingerprint, digest)
+            assert found is not None
+            if due_verdict.why == "a page is missing":  # the oracle does not say whose
+                assert "are missing here" in found.why
+                found = found._replace(why=due_verdict.why)
+            assert found == due_verdict
     for speaker in speakers:  # said anew, nothing changes
         recount(station, station.plant.pages.chain(speaker.fingerprint), roster)
     assert merged_views(station, roster, NODES) == seen

@@ -84,6 +84,12 @@ class FirmwareReport:
         """The version as people write it, without the build: 1.2.3."""
         return ".".join(map(str, self.version))
 
+    @property
+    def stated(self) -> tuple[str, str, str | None]:
+        """Text, version with build and image digest in hex: what identifies the firmware; a plant's pages hold it."""
+        image = None if self.image is None else self.image.hex()
+        return self.text, f"{self.version_text}+{self.build}", image
+
     def encode(self) -> bytes:
         """Return the 42 to 90 octets: form ‖ flags ‖ major ‖ minor ‖ patch ‖ build ‖ image ‖ text."""
         head = _LAYOUT.pack(_FORM, self.flags & _FLAGS, *self.version, self.build, self.image or _NO_IMAGE)
@@ -104,6 +110,21 @@ class FirmwareReport:
             )
         named = None if image == _NO_IMAGE else image
         return cls(text, (major, minor, patch), build, named, FirmwareFlag(flags & _FLAGS))
+
+
+def is_stated(value: object) -> bool:
+    """Return True if a value read from JSON is of the form of :attr:`FirmwareReport.stated`."""
+    if not isinstance(value, list) or len(value) != len(("text", "version", "image")):
+        return False
+    text, version, image = value
+    if not isinstance(text, str) or not isinstance(version, str) or not isinstance(image, str | None):
+        return False
+    number, _, build = version.partition("+")
+    try:
+        read = FirmwareReport(text, parse_version(number), int(build), None if image is None else bytes.fromhex(image))
+    except ValueError:
+        return False
+    return read.stated == (text, version, image)
 
 
 def parse_version(text: str) -> Version:

@@ -7,14 +7,16 @@ and nothing of the order in which chains arrived: the greatest key, the last pin
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Final
+from typing import Any, Final
 
 from teds_provision.protocol.plant.event import Event, reset_proven
 
 Key = tuple[int, str]
 """Epoch and key id of a link key."""
+Runs = tuple[str, str, str | None]
+"""Text, version and image digest of a node's firmware."""
 _NOTHING: Final[tuple[object, ...]] = (None, [], {}, -1)
 
 
@@ -26,7 +28,8 @@ class Claim:
     fingerprint of the greatest key that it agreed; ``took``: epoch and key id of the greatest that it was given.
     ``written``: sequence, digest, epoch, profile, its digest and due of the greatest. ``gave``: bundle, peer, epoch,
     key id, mode of each. ``undone``: bundles. ``refused``: bundle, peer, why. ``resets``: fingerprint and epoch of each
-    reset that the node's key proved. ``name``, ``groups``: with the time of the event.
+    reset that the node's key proved. ``name``, ``groups``: with the time of the event. ``firmware``: what
+    the node last reported to it in a session (None: the node reports none), with the time of the event.
     """
 
     pin: tuple[str, str] | None = None
@@ -40,6 +43,7 @@ class Claim:
     resets: set[tuple[str, int]] = field(default_factory=set)
     name: tuple[str, str] | None = None
     groups: dict[str, tuple[bool, str]] = field(default_factory=dict)
+    firmware: tuple[Runs | None, str] | None = None
 
     def apply_event(self, event: Event) -> None:
         """Add the next event of the station's chain about this node.
@@ -82,6 +86,8 @@ class Claim:
                 self.name = said["name"], event.at
             case "grouped":
                 self.groups[said["group"]] = said["member"], event.at
+            case "firmware":
+                self.firmware = _runs(said["runs"]), event.at
 
     def key(self) -> Key | None:
         """Return the greatest key that it agreed or took."""
@@ -108,7 +114,17 @@ class Claim:
             setattr(claim, name, {tuple(item) for item in kept.get(name, ())})
         claim.undone = set(kept.get("undone", ()))
         claim.groups = {group: (member, at) for group, (member, at) in kept.get("groups", {}).items()}
+        if "firmware" in kept:
+            runs, at = kept["firmware"]
+            claim.firmware = _runs(runs), at
         return claim
+
+
+def _runs(stated: Sequence[Any] | None) -> Runs | None:
+    if stated is None:
+        return None
+    text, version, image = stated
+    return text, version, image
 
 
 def had_key(station: str, key: Key, claims: Mapping[str, Claim]) -> bool:

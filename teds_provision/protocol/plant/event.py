@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 from teds_provision.protocol.keys import fingerprint, reset_message, verify
+from teds_provision.protocol.messages.firmware import is_stated
 from teds_provision.protocol.plant.document import hash_of, is_form, is_name, is_number, is_text
 
 MOST_OCTETS: Final = 16 << 10
@@ -75,6 +76,7 @@ FORMS: Final[dict[str, dict[str, _Form]]] = {
     "lifted": {"of": _sha256},
     "named": {"name": is_name},
     "grouped": {"group": is_name, "member": lambda value: isinstance(value, bool)},
+    "firmware": {"runs": _or_none(is_stated)},
     "evidence": {"sha256": _sha256, "job": _job, "unit": _or_none(is_number), "verdict": is_text},
     "closed": {"job": _random_id},
     "alarm": {"code": is_text, "about": _or_none(_sha256), "n": is_number},

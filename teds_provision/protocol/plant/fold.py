@@ -13,7 +13,7 @@ from typing import Final
 
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.handover.revocation import Revocation
-from teds_provision.protocol.plant.claim import Claim, Key
+from teds_provision.protocol.plant.claim import Claim, Key, Runs
 from teds_provision.protocol.plant.roster import Roster
 
 TWO_KEYS: Final = "two keys"
@@ -51,6 +51,15 @@ class BanStatement:
 
 
 @dataclass(frozen=True)
+class FirmwareClaim:
+    """The firmware that a node last reported to a station in a session; ``runs`` None: it reports none."""
+
+    station: str
+    runs: Runs | None
+    at: str
+
+
+@dataclass(frozen=True)
 class MergedClaims:
     """The plant's view of a node; stations are fingerprints.
 
@@ -76,6 +85,8 @@ class MergedClaims:
     """Removed stations that agreed the last key that they had."""
     keeper_groups: Mapping[str, bool] = field(default_factory=dict)
     own_groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    firmware: tuple[FirmwareClaim, ...] = ()
+    """What each station last saw, the newest first; that of a lost or stolen station after all others'."""
 
 
 def merge_claims(
@@ -136,7 +147,19 @@ def merge_claims(
             for station, claim in counted.items()
             if claim.groups
         },
+        firmware=_firmware(roster, counted),
     )  # fmt: skip
+
+
+def _firmware(roster: Roster, claims: Mapping[str, Claim]) -> tuple[FirmwareClaim, ...]:
+    """Return the reports of a node's firmware in the order in which they are shown; no decision rests on them."""
+
+    def place(claim: FirmwareClaim) -> tuple[bool, str, str]:
+        gone = roster.removed_one(claim.station)
+        return gone is None or gone.why == "retired", claim.at, claim.station
+
+    found = [FirmwareClaim(station, *claim.firmware) for station, claim in claims.items() if claim.firmware is not None]
+    return tuple(sorted(found, key=place, reverse=True))
 
 
 def _resets(claims: Mapping[str, Claim], pinned: str | None) -> frozenset[tuple[str, int]]:

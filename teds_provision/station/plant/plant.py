@@ -152,7 +152,7 @@ class Plant:
                 "conflicts", "to_judge", "pages", "chains", "parcels", "shared",
             ):  # fmt: skip
                 self._store.execute(f"DELETE FROM {table}")
-            self._store.execute("DELETE FROM meta WHERE name IN ('plant-returned', 'plant-seen-heads')")
+            self._store.execute("DELETE FROM meta WHERE name IN ('plant-returned', 'plant-seen-heads', 'plant-acts')")
 
     def join(self, registry: str, url: str | None) -> None:
         """Take part in a registry (the vault opens); all that is kept of another one is forgotten."""
@@ -163,6 +163,8 @@ class Plant:
             before = None
         record = before or PlantRecord(registry)
         self.put_record(replace(record, left=None, url=url or record.url, mac=mac))
+        if before is None:
+            self.put_folded_acts(event.FORMS)
 
     @property
     def joined(self) -> PlantRecord | None:
@@ -256,11 +258,29 @@ class Plant:
     def record_event(self, act: str, uuid: bytes | None = None, **members: object) -> None:
         """Queue an event for the plant in the transaction of the act itself: both are on the disk, or neither.
 
-        Members as in ``protocol.plant.event.FORMS``. Nothing is written if no plant was joined.
+        Members as in ``protocol.plant.event.FORMS``, and ``at`` if it happened earlier. Nothing is written if no plant
+        was joined.
         """
         if self.joined is None:
             return
-        self.queue_event(event.made(act, secrets.token_hex(8), utc_now(), uuid, members))
+        at = str(members.pop("at", None) or utc_now())
+        self.queue_event(event.made(act, secrets.token_hex(8), at, uuid, members))
+
+    def reports_other_firmware(self, uuid: bytes, runs: claim.Runs | None, since: str) -> bool:
+        """Return True if a member saw another firmware on a node since then, by the pages that count.
+
+        A time that is still to come is ignored: nothing that is reported now could take its place.
+        """
+        held = self.roster
+        if held is None:
+            return False
+        said = self.claims.of_nodes([uuid]).get(uuid, {})
+        return any(
+            seen is not None and seen[0] != runs and since <= seen[1] <= utc_now()
+            for station, text in said.items()
+            if held.roles_of(station) - {"audit"} and held.member(station) is not None
+            for seen in (claim.Claim.from_json(text).firmware,)
+        )
 
     def record_name(self, uuid: bytes, name: object) -> None:
         """Report a node's name, if it is valid in a plant: 1 to 100 printable characters."""
@@ -339,6 +359,15 @@ class Plant:
     def put_returned_state(self, digest: str) -> None:
         """Keep that digest: while it stays the same, there is nothing to take and nothing to hand in."""
         self._store.execute("INSERT OR REPLACE INTO meta VALUES('plant-returned', ?)", (digest,))
+
+    def folded_acts(self) -> frozenset[str]:
+        """Return the acts that were known when the pages here were folded; a version before them noted none."""
+        row = self._store.one("SELECT value FROM meta WHERE name = 'plant-acts'")
+        return frozenset(json.loads(row[0])) if row is not None else frozenset()
+
+    def put_folded_acts(self, acts: Iterable[str]) -> None:
+        """Keep which acts the fold of the pages here knows."""
+        self._store.execute("INSERT OR REPLACE INTO meta VALUES('plant-acts', ?)", (json.dumps(sorted(acts)),))
 
     def doors(self) -> list[str]:
         """Return what the database allowed and should not, at the last sync that looked."""

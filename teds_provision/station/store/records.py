@@ -134,7 +134,8 @@ class FirmwareRecord:
     """What a node last reported of its firmware.
 
     ``report`` is the payload of the reply to About, empty if the node reports none; ``at`` is when this very report
-    first came. ``signed`` is the report under which its datasheet was last signed here, None if none was.
+    first came, or came again after another station had seen other firmware.
+    ``signed`` is the report under which its datasheet was last signed here, None if none was.
     """
 
     uuid: bytes

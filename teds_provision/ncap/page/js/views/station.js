@@ -151,7 +151,15 @@ const short8 = (uuid) => `node ${uuid.slice(0, 8)}`;
 function heldBy(says) {
   const who = Object.values(says.holders).flat();
   const held = who.length ? `held by ${who.join(", ")} (epoch ${says.epoch})` : "no holder";
-  return says.written_by ? `${held}, datasheet ${says.sequence} by ${says.written_by}` : held;
+  const written = says.written_by ? `, datasheet ${says.sequence} by ${says.written_by}` : "";
+  return `${held}${written}, ${firmware(says.firmware)}`;
+}
+
+/** "firmware nrf/loadcell 1.3.0 (seen by south)"; null: no station reports any. */
+function firmware(told) {
+  if (!told) return "firmware not reported";
+  if (told.version === null) return `firmware not reported (asked by ${told.by})`;
+  return `firmware ${`${told.text} ${told.version}${told.build ? `+${told.build}` : ""}`.trim()} (seen by ${told.by})`;
 }
 
 function ago(seconds) {
