@@ -84,6 +84,28 @@ def test_the_reference_node_keeps_every_rule(
     assert not station.keys.held(board.uuid)
 
 
+class SlowLink(FaultyLink):
+    """A link on which every exchange takes a while, as over the air on a busy machine."""
+
+    seconds = 0.0
+
+    def exchange(self, frame: bytes) -> bytes:
+        self.board.seconds += self.seconds
+        return super().exchange(frame)
+
+
+@pytest.mark.parametrize("seconds", [1.1, 4.5])
+def test_a_slow_link_accuses_no_node_of_losing_its_claim(
+    station: Station, patch: pytest.MonkeyPatch, seconds: float
+) -> None:
+    board = nodes.made("measuring")
+    link = SlowLink(board)
+    link.seconds = seconds
+    report = nodes.checked(station, patch, board, over="measuring", line=link)
+    assert not nodes.failed(report)
+    assert "operate-expires" in names(report, "passed")
+
+
 def test_a_board_without_channel_teds_is_lent_some(station: Station, patch: pytest.MonkeyPatch) -> None:
     """With --factory too "operate-lease" was skipped, as a board in factory state has no datasheet."""
     board = nodes.made("measuring can blank")
