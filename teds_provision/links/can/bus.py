@@ -70,6 +70,8 @@ class SentFrames:
 
 
 _SEND_SECONDS: Final = 1.0
+_QUEUE_PAUSE: Final = 0.0002
+"""Seconds until a full queue is tried again: Linux holds 10 frames for a CAN interface, and raises ENOBUFS beyond."""
 _OPENINGS: Final = 5
 _SOCKETCAND_PORT: Final = 29536
 _RECEIVE_BUFFER: Final = 4 << 20
@@ -164,10 +166,15 @@ class Bus:
             is_fd=frame.fd,
             bitrate_switch=frame.fd,
         )
-        try:
-            self._bus.send(message, timeout=_SEND_SECONDS)
-        except (can.CanError, OSError, ValueError) as error:
-            self._failed("does not take a frame", error)
+        until = time.monotonic() + _SEND_SECONDS
+        while True:
+            try:
+                self._bus.send(message, timeout=_SEND_SECONDS)
+                return
+            except (can.CanError, OSError, ValueError) as error:
+                if _number(error) != errno.ENOBUFS or time.monotonic() >= until:
+                    self._failed("does not take a frame", error)
+            time.sleep(_QUEUE_PAUSE)
 
     def receive(self, seconds: float) -> Frame | None:
         """Return the next data frame that another sent, None when there is none; raises LinkError (also bus-off).

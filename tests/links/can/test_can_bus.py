@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import socket
+from typing import Any
 
 import can
 import pytest
+from can.interfaces.virtual import VirtualBus
 
 from teds_provision.errors import LinkError, UsageError
+from teds_provision.links.can import bus as bus_module
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.interface_keys import known_keys
 from teds_provision.links.can.spec import parse_spec
@@ -32,6 +36,55 @@ def test_hears_extended_data_frames_alone() -> None:
         other.send(can.Message(arbitration_id=1, is_error_frame=True, data=bytes(8)))
         other.send(can.Message(arbitration_id=0x18DAF121, data=b"b"))
     assert [bus.receive(0.1) for _ in range(4)] == [None, None, None, Frame(0x18DAF121, b"b")]
+    bus.close()
+
+
+class ShortQueueBus(VirtualBus):
+    """An interface with a queue of ten frames, as SocketCAN's; full until it has refused a frame ``refusals`` times."""
+
+    def __init__(self, channel: str, refusals: int = 3, **options: Any) -> None:
+        super().__init__(channel, **options)
+        self._refusals, self._refused, self._queued = refusals, 0, 0
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if self._queued == 10:
+            self._refused += 1
+            if self._refused <= self._refusals:
+                try:
+                    raise OSError(errno.ENOBUFS, "No buffer space available")
+                except OSError as error:
+                    raise can.CanOperationError(f"Failed to transmit: {error.strerror}", error.errno) from error
+            self._refused, self._queued = 0, 9
+        self._queued += 1
+        super().send(msg, timeout)
+
+
+@pytest.fixture
+def short_queue(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(can.interfaces.BACKENDS, "short_queue", (__name__, "ShortQueueBus"))
+    monkeypatch.setattr(can.util, "VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "short_queue"}))
+
+
+@pytest.mark.usefixtures("short_queue")
+def test_a_full_queue_is_waited_for_and_keeps_the_order() -> None:
+    sent = [Frame(0x18DA21F1, bytes([number])) for number in range(40)]
+    bus = Bus(parse_spec("short_queue:long-message"))
+    with can.Bus(interface="virtual", channel="long-message") as other:
+        for frame in sent:
+            bus.send(frame)
+        heard = [other.recv(PATIENCE) for _ in sent]
+    bus.close()
+    assert [bytes(message.data) for message in heard if message is not None] == [frame.data for frame in sent]
+
+
+@pytest.mark.usefixtures("short_queue")
+def test_a_queue_that_stays_full_is_a_link_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bus_module, "_SEND_SECONDS", 0.01)
+    bus = Bus(parse_spec("short_queue:nobody?refusals=1000000"))
+    for number in range(10):
+        bus.send(Frame(0x18DA21F1, bytes([number])))
+    with pytest.raises(LinkError, match="No buffer space"):
+        bus.send(Frame(0x18DA21F1, b"one more"))
     bus.close()
 
 
