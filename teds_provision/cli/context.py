@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from teds_provision import client
     from teds_provision.cli import console
+    from teds_provision.client import Client
     from teds_provision.station.station import Station
     from teds_provision.teds.certificate import ChooseItem
 else:
@@ -274,6 +275,10 @@ class App:
         station.released = self._released
         self.closing(station.close)
         return station
+
+    def running_service(self, *, timeout: float) -> Client | None:
+        """Return a client of the running `ncap` of this home, None if there is none."""
+        return client.connect(home=self.home, timeout=timeout) if (self.home / SOCKET).exists() else None
 
     def _released(self, uuid: bytes, command: str) -> AbstractContextManager[object]:
         """Have the running `ncap` of this home let a node go that it measures."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ from teds_provision.cli.table import COMMANDS
 from teds_provision.errors import BadDataError, TedsProvisionError, UsageError
 from teds_provision.files import SHARED, require_new, write_new
 from teds_provision.limits import load_toml
+from teds_provision.sanitize import sanitize
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -86,7 +88,7 @@ def doctor(
     code = doctor_room.checks.exit_code(found)
     counts = {word: sum(finding.result == word for finding in findings) for word in _STYLES}
     if report is None:
-        app.emit({"checks": checks, **counts}, lambda console: _print(console, findings))
+        _show(app, findings, {"checks": checks, **counts})
     else:
         document = doctor_room.report.build_report(system, findings, _settings(app), with_uuids=with_uuids)
         _give_report(app, document, report, {"checks": checks, **counts})
@@ -128,6 +130,20 @@ def _bad_value(app: App, root: click.Context, values: Mapping[str, Any]) -> str:
     return ""
 
 
+def _show(app: App, findings: list[Finding], result: Mapping[str, Any]) -> None:
+    """Print the findings: with colours and folded in a terminal, else one plain line each, and one for the cure."""
+    if app.json or sys.stdout.isatty():
+        app.emit(dict(result), lambda console: _print(console, findings))
+        return
+    width = max(len(finding.name) for finding in findings)
+    lines = []
+    for finding in findings:
+        lines.append(f"{finding.result:<8} {finding.name:<{width}}  {finding.why}")
+        if finding.fix and finding.result != "ok":
+            lines.append(f"  → {finding.fix}")
+    app.lines([sanitize(line) for line in lines])
+
+
 def _print(console: Console, findings: list[Finding]) -> None:
     from rich.padding import Padding
     from rich.text import Text
@@ -138,9 +154,7 @@ def _print(console: Console, findings: list[Finding]) -> None:
         line.append(f" {finding.name:<{width}}  {finding.why}", style="not bold default")
         console.print(line)
         if finding.fix and finding.result != "ok":
-            console.print(
-                Padding(Text(f"→ {finding.fix}"), (0, 0, 0, 9)) if console.is_terminal else f"  → {finding.fix}"
-            )
+            console.print(Padding(Text(f"→ {finding.fix}"), (0, 0, 0, 9)))
 
 
 # Which keys config.toml may have: the options of every command, by the names that the command line gives them.

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import client, doctor, measure, steps
-from teds_provision.cli.context import SOCKET, App
-from teds_provision.cli.rendering import count_of, print_table, shown
+from teds_provision import doctor, measure, steps
+from teds_provision.cli.context import App
+from teds_provision.cli.rendering import count_of, shown
 from teds_provision.errors import LinkError, NotFoundError, TedsProvisionError
 from teds_provision.links import LinkSettings
+from teds_provision.sanitize import sanitize
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from teds_provision.measure.link_survey import LinkSurvey
     from teds_provision.station.station import Station
 
@@ -42,7 +42,10 @@ def start(app: App, ctx: click.Context) -> None:
             {"what": finding.why, "fix": finding.fix} for finding in waiting if finding.result == "warning"
         ]
         found["next"] = _next(found)
-    app.emit(found, lambda console: _print(console, found))
+    if app.json:
+        app.emit(found)
+    else:
+        app.lines([sanitize(line) for line in _lines(found)])
 
 
 def _named(ctx: click.Context) -> LinkSettings:
@@ -103,10 +106,11 @@ def _node(station: Station, place: str, address: int, who: Any) -> dict[str, Any
 
 def _of_service(app: App, station: Station) -> dict[str, Any] | None:
     """Return what a running `ncap` of this home sees, which watches its links all the time; None if none runs."""
-    if not (app.home / SOCKET).exists():
+    service = app.running_service(timeout=5)
+    if service is None:
         return None
     try:
-        with client.connect(home=app.home, timeout=5) as running:
+        with service as running:
             status, nodes = running.status(), running.nodes()
     except (LinkError, OSError, TedsProvisionError):
         return None
@@ -173,37 +177,37 @@ def _next(found: dict[str, Any]) -> str:
     return "teds-provision doctor"
 
 
-def _print(console: Console, found: dict[str, Any]) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
+def _lines(found: dict[str, Any]) -> Iterator[str]:
     station = found["station"]
     if station is None:
-        console.print("No station yet.", markup=False)
+        yield "No station yet."
     else:
-        told = f"Station {shown(station['name'])}, key {station['fingerprint'][:16]}, {count_of(found['known'])} known"
-        console.print(told, markup=False)
+        yield f"Station {shown(station['name'])}, key {station['fingerprint'][:16]}, {count_of(found['known'])} known"
     if "ncap" in found:
-        console.print(f"ncap is running: {found['ncap']['url'] or 'without a page'}", markup=False)
-    for link in found["links"]:
-        console.print(f"  {_link_line(link)}", markup=False)
+        yield f"ncap is running: {found['ncap']['url'] or 'without a page'}"
+    yield from (f"  {_link_line(link)}" for link in found["links"])
     if not found["links"]:
-        console.print("  No reader is plugged in, and no bus is configured.", markup=False)
+        yield "  No reader is plugged in, and no bus is configured."
     if found["nodes"]:
-        table = Table("uuid", "name", "link", "state", "verdict", box=None, pad_edge=False)
-        for node in found["nodes"][:_SHOWN]:
-            listed = node["verdict"] or ("not verified" if node["whitelisted"] else "not whitelisted")
-            cells = (node["uuid"], shown(node["name"]), node["link"], node["state"], listed)
-            table.add_row(*(escape(str(cell or "")) for cell in cells))
-        print_table(console, table)
+        yield from _table(found["nodes"][:_SHOWN])
         if len(found["nodes"]) > _SHOWN:
-            console.print(f"  … and {len(found['nodes']) - _SHOWN} more", markup=False)
+            yield f"  … and {len(found['nodes']) - _SHOWN} more"
     for problem in found["problems"]:
-        console.print(f"! {problem['what']}", markup=False)
+        yield f"! {problem['what']}"
         if problem["fix"]:
-            console.print(f"  → {problem['fix']}", markup=False)
-    console.print(f"Next: {found['next']}", markup=False)
-    console.print("All commands: teds-provision --help", markup=False)
+            yield f"  → {problem['fix']}"
+    yield f"Next: {found['next']}"
+    yield "All commands: teds-provision --help"
+
+
+def _table(nodes: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield a line per node, in columns; not by rich, whose import takes longer than all the rest of this screen."""
+    rows = [("uuid", "name", "link", "state", "verdict")]
+    for node in nodes:
+        listed = node["verdict"] or ("not verified" if node["whitelisted"] else "not whitelisted")
+        rows.append((node["uuid"], shown(node["name"] or ""), node["link"], node["state"], listed))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
 
 
 def _link_line(link: dict[str, Any]) -> str:

@@ -1,6 +1,6 @@
 """The doctor's checks of readers and buses: from sysfs and the file system, opening only what was requested.
 
-Known readers are those of nfcpy 1.0.4 (nfc/clf/device.py). A partial path such as ``usb`` hides why a reader does not
+A partial path such as ``usb`` hides why a reader does not
 open, so each one is checked separately.
 """
 
@@ -23,19 +23,9 @@ from teds_provision.links import nfc as nfc_room
 from teds_provision.links.ble.ble_errors import POWER_HINT
 from teds_provision.links.ble.bluez import AdapterFacts, adapters
 from teds_provision.links.ble.spec import BleSpec, parse_spec
+from teds_provision.links.nfc.usb_listing import READERS, usb_ids
 from teds_provision.links.ports import free_port
 
-READERS: Final = {
-    (0x054C, 0x0193): "Sony PN531",
-    (0x04CC, 0x0531): "Philips PN531",
-    (0x04CC, 0x2533): "NXP PN533",
-    (0x04E6, 0x5591): "SCM SCL3711",
-    (0x04E6, 0x5593): "SCM SCL3712",
-    (0x054C, 0x02E1): "Sony RC-S330/360/370",
-    (0x054C, 0x06C1): "Sony RC-S380/S",
-    (0x054C, 0x06C3): "Sony RC-S380/P",
-    (0x072F, 0x2200): "ACS ACR122U",
-}
 _ARPHRD_CAN: Final = 280  # linux/if_arp.h
 _IFF_UP: Final = 1
 _SENSES: Final = 8
@@ -50,7 +40,7 @@ def readers(system: System) -> Iterator[Finding]:
     """
     found = False
     for device in sorted(system.at("/sys/bus/usb/devices").glob("*")):
-        ids = _ids(device)
+        ids = usb_ids(device)
         if ids not in READERS:
             continue
         found = True
@@ -115,7 +105,7 @@ def pcsc(system: System) -> Iterator[Finding]:
         return
 
     try:
-        found = nfc_room.pcsc.contactless(nfc_room.pcsc.names())
+        found = nfc_room.pcsc_readers.contactless(nfc_room.pcsc_readers.names())
     except NoReaderError as failure:
         yield Finding("pc/sc", "failed" if asked else "skipped", failure.message, failure.hint if asked else "")
         return
@@ -292,14 +282,6 @@ def can(system: System) -> Iterator[Finding]:
         yield Finding("can", "warning", rivals.text, rivals.hint)
     else:
         yield Finding("can", "ok", f"{bus.spec.text} opens.")
-
-
-def _ids(device: Path) -> tuple[int, int]:
-    try:
-        vendor, product = (int((device / name).read_text(), 16) for name in ("idVendor", "idProduct"))
-    except (OSError, ValueError):
-        return 0, 0
-    return vendor, product
 
 
 def _shown(system: System, node: Path) -> str:

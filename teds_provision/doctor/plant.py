@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime, timedelta
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.lazy import install_command
-from teds_provision.protocol.plant.roster import WARN_BEFORE, Roster, open_roster
+from teds_provision.protocol import plant as documents
 from teds_provision.sanitize import counted
 from teds_provision.station.station import Station
 from teds_provision.station.store.database import has_store
+
+if TYPE_CHECKING:
+    from teds_provision.protocol.plant.roster import Roster
 
 _SYNC = "teds-provision registry sync"
 _LATE = timedelta(days=7)
@@ -28,7 +32,7 @@ def registry(system: System) -> Iterator[Finding]:
         row = plant.held_roster()
         if record is None or row is None or not station.identity.is_complete():
             return
-        now, roster = datetime.now(UTC), open_roster(row.octets, station.ca)
+        now, roster = datetime.now(UTC), documents.roster.open_roster(row.octets, station.ca)
         yield _roster(roster, now)
         if record.url is not None and record.url.startswith("postgres") and find_spec("psycopg") is None:
             yield Finding("registry", "failed", "psycopg is missing.", install_command("teds-provision[registry]"))
@@ -68,6 +72,6 @@ def _roster(roster: Roster, now: datetime) -> Finding:
     until = f"{roster.name}: roster {roster.version} holds until {roster.expires:%Y-%m-%d}."
     if now >= roster.expires:
         return Finding("registry", "failed", f"{until} It has expired.", "Where the CA key is: registry renew")
-    if now >= roster.expires - WARN_BEFORE:
+    if now >= roster.expires - documents.roster.WARN_BEFORE:
         return Finding("registry", "warning", until, "Where the CA key is: teds-provision registry renew")
     return Finding("registry", "ok", until)

@@ -73,7 +73,11 @@ def capabilities_at(place: str) -> Capabilities:
 
 def plugged_in() -> Iterator[str]:
     """Yield the place of each NFC reader that is plugged in; none of them is opened."""
-    return (f"nfc:{path}" for path in import_module("teds_provision.links.nfc.reader").plugged_in())
+    if import_module("teds_provision.links.nfc.usb_listing").may_have_reader():
+        paths = import_module("teds_provision.links.nfc.reader").plugged_in()
+    else:
+        paths = import_module("teds_provision.links.nfc.pcsc_readers").paths()
+    return (f"nfc:{path}" for path in paths)
 
 
 def require_known_place(place: str) -> None:

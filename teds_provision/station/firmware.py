@@ -8,14 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
+from teds_provision import teds
 from teds_provision.errors import BadDataError, GarbledError, NotFoundError, StoreError
 from teds_provision.protocol.messages.firmware import FirmwareFlag, FirmwareReport
-from teds_provision.station.station import Station
-from teds_provision.station.store.records import FirmwareRecord
-from teds_provision.teds.profile import default_folders, load_profile
-from teds_provision.teds.profile.firmware import FirmwareDemand
+
+if TYPE_CHECKING:
+    from teds_provision.station.station import Station
+    from teds_provision.station.store.records import FirmwareRecord
+    from teds_provision.teds.profile.firmware import FirmwareDemand
 
 CHANGED: Final = "firmware changed since calibration"
 FirmwareState = Literal["not-reported", "bad", "other", "outdated", "on-trial", "pending", "good", "unjudged"]
@@ -110,7 +112,8 @@ class FirmwareDemands:
             return None
         if profile not in self._read:
             try:
-                self._read[profile] = load_profile(profile, default_folders(self.home)).firmware
+                folders = teds.profile.default_folders(self.home)
+                self._read[profile] = teds.profile.load_profile(profile, folders).firmware
             except (NotFoundError, BadDataError, StoreError):
                 self._read[profile] = None
         return self._read[profile]

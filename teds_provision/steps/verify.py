@@ -6,16 +6,14 @@ import hashlib
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol
 
 from teds_provision.errors import BadDataError, BadDatasheetError, NotAuthenticError, TedsProvisionError, UnprovenError
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint, node_key_good
 from teds_provision.protocol.messages.identity import Identity
-from teds_provision.protocol.plant.signer import SignerVerdict
 from teds_provision.protocol.wire_agreement import other_key
-from teds_provision.station.plant.plant import SignerRules
 from teds_provision.station.station import Station
 from teds_provision.station.store import RevocationRecord, WhitelistEntry
 from teds_provision.steps.sign import known_image
@@ -23,6 +21,10 @@ from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.codec.security import NotCanonicalError, SecurityTeds
 from teds_provision.teds.image import SECURITY, Image
+
+if TYPE_CHECKING:
+    from teds_provision.protocol.plant.signer import SignerVerdict
+    from teds_provision.station.plant.plant import SignerRules
 
 # -- what it is judged by: a station's keys, pins and deny list, asked one by one or remembered for many ---------------
 

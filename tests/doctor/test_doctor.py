@@ -20,9 +20,9 @@ import teds_provision.links
 from teds_provision.doctor import checks
 from teds_provision.doctor import machine as doctor_machine
 from teds_provision.doctor.checks import CHECKS, Finding, System, examine, exit_code
-from teds_provision.doctor.links import READERS
 from teds_provision.doctor.station import holds_private_key
 from teds_provision.lazy import REQUIRED, install_command
+from teds_provision.links.nfc.usb_listing import READERS
 from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.station.node_keys import deferred
 from teds_provision.station.station import Station

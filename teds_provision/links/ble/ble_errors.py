@@ -42,11 +42,16 @@ def is_gone(error: BaseException) -> bool:
     return unknown or type(error).__name__ == "BleakDeviceNotFoundError" or "not found" in str(error)
 
 
+def no_system_bus() -> NoReaderError:
+    """Return the error for a machine without D-Bus."""
+    return NoReaderError("There is no D-Bus system bus, so Bluetooth is unavailable.", hint=SERVICE_HINT)
+
+
 def adapter_trouble(error: Exception, adapter: str) -> LinkError | None:
     """Return the error for unusable Bluetooth; None if the cause is the node or the air."""
     reason = getattr(getattr(error, "reason", None), "name", "")
     if isinstance(error, FileNotFoundError | ConnectionRefusedError | PermissionError):
-        return NoReaderError("There is no D-Bus system bus, so Bluetooth is unavailable.", hint=SERVICE_HINT)
+        return no_system_bus()
     if getattr(error, "dbus_error", "") in _NO_SERVICE:
         return NoReaderError("The Bluetooth service (bluetoothd) is not running.", hint=SERVICE_HINT)
     if reason == "POWERED_OFF" or "adapter-not-powered" in str(error):

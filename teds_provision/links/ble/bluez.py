@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-import asyncio
 from dataclasses import dataclass
-from typing import Any, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import NoReaderError
+from teds_provision.lazy import late
 from teds_provision.links.ble import ble_errors
 
+if TYPE_CHECKING:
+    import asyncio
+else:
+    asyncio = late("asyncio")  # a machine without D-Bus is not asked
+
 _SECONDS: Final = 5.0
+_SYSTEM_BUS: Final = "unix:path=/var/run/dbus/system_bus_socket"
 _ADAPTER, _DEVICE = "org.bluez.Adapter1", "org.bluez.Device1"
 
 
@@ -29,6 +36,9 @@ def adapters(bus_address: str | None = None) -> list[AdapterFacts]:
 
     Raises NoReaderError if there is no system bus, bluetoothd does not run, or the D-Bus library is not installed.
     """
+    kind, _, path = (bus_address or _SYSTEM_BUS).partition("=")
+    if kind == "unix:path" and not Path(path.partition(",")[0]).exists():
+        raise ble_errors.no_system_bus()
     try:
         import dbus_fast  # noqa: F401
     except ImportError:

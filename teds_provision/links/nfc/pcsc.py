@@ -13,52 +13,16 @@ from typing import Final
 
 from teds_provision.errors import NoReaderError, UsageError
 from teds_provision.links.nfc.nfcpy import QuietExchange, Type2TagCommandError, Type4ATag, nfc
+from teds_provision.links.nfc.pcsc_readers import PREFIX, contactless, context_of, names
 from teds_provision.links.nfc.pcsclite import GONE, SHARING_VIOLATION, PcscError, PcscLibrary, load
 from teds_provision.links.nfc.tag import FieldLostError, ReaderLostError, ReaderTag, Type2, Type4Ndef
 from teds_provision.links.ports import Trace
 
-PREFIX: Final = "pcsc"
 _STORAGE_CARD: Final = bytes.fromhex("A000000306")
 """Application identifier of PC/SC in the ATR of a card without a processor (PC/SC part 3, section 3.1.3.2.3)."""
 _UID: Final = bytes.fromhex("FFCA000000")
 _OK: Final = b"\x90\x00"
 _PRESENCE: Final = bytes.fromhex("00B0000002")
-
-
-def _context(library: PcscLibrary) -> int:
-    try:
-        return library.establish()
-    except PcscError as error:
-        raise NoReaderError(
-            f"The PC/SC service does not answer: {error}.",
-            hint="sudo apt install pcscd; sudo systemctl start pcscd.socket. Over ssh polkit may refuse; run as root.",
-        ) from error
-
-
-def names() -> list[str]:
-    """Return the names of all PC/SC readers; raises NoReaderError if the service or the library is missing."""
-    library = load()
-    context = _context(library)
-    try:
-        return library.readers(context)
-    except PcscError:
-        return []
-    finally:
-        with suppress(PcscError):
-            library.release(context)
-
-
-def names_if_any() -> list[str]:
-    """Return the same as :func:`names`, empty if there is no PC/SC here."""
-    try:
-        return contactless(names())
-    except NoReaderError:
-        return []
-
-
-def contactless(found: list[str]) -> list[str]:
-    """Without the slots for security modules that many readers have beside their antenna."""
-    return [name for name in found if " SAM " not in f" {name} "]
 
 
 class PcscReader:
@@ -69,7 +33,7 @@ class PcscReader:
         self._library = load()
         self.name = _chosen(path.partition(":")[2])
         self.again = f"{PREFIX}:{self.name}"
-        self._context: int | None = _context(self._library)
+        self._context: int | None = context_of(self._library)
         self._card: _Card | None = None
 
     def sense(self) -> ReaderTag | None:

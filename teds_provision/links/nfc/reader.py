@@ -10,7 +10,8 @@ from typing import Any
 
 from teds_provision.errors import NoReaderError, UsageError
 from teds_provision.links.nfc.nfcpy import Frontend, nfc
-from teds_provision.links.nfc.pcsc import PREFIX, PcscReader, names_if_any
+from teds_provision.links.nfc.pcsc import PcscReader
+from teds_provision.links.nfc.pcsc_readers import PREFIX, paths
 from teds_provision.links.nfc.tag import FieldLostError, ReaderLostError, ReaderTag, activate, translated
 from teds_provision.links.nfc.udp import ReaderDevice, address_of, frontend
 from teds_provision.links.ports import Trace
@@ -111,7 +112,7 @@ def plugged_in() -> list[str]:
         found = [f"usb:{int(bus):03}:{int(number):03}" for _, _, bus, number in _usb_readers("usb")]
     except NoReaderError:  # no libusb: a PC/SC reader needs none
         found = []
-    return found or [f"{PREFIX}:{name}" for name in names_if_any()]
+    return found or paths()
 
 
 def _the_only_one() -> str:

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import NoReaderError, UsageError
-from teds_provision.links.nfc import pcsc, pcsclite
+from teds_provision.links.nfc import pcsc, pcsc_readers, pcsclite
 from teds_provision.links.nfc.pcsclite import PcscError
 from teds_provision.links.nfc.reader import open_reader
 from tests.bench import PASSPHRASE, make_station
@@ -135,6 +135,12 @@ class Library:
         pass
 
 
+def put_in(monkeypatch: pytest.MonkeyPatch, readers: list[str] | None) -> None:
+    """Put a library with these readers in the place of the system's."""
+    for module in (pcsc, pcsc_readers):
+        monkeypatch.setattr(module, "load", lambda: Library(readers))
+
+
 @pytest.mark.parametrize(
     ("readers", "path", "error", "says"),
     [
@@ -147,13 +153,13 @@ class Library:
 def test_what_is_wrong_with_pc_sc_is_named(
     monkeypatch: pytest.MonkeyPatch, readers: list[str] | None, path: str, error: type[Exception], says: str
 ) -> None:
-    monkeypatch.setattr(pcsc, "load", lambda: Library(readers))
+    put_in(monkeypatch, readers)
     with pytest.raises(error, match=says):
         open_reader(path)
 
 
 def test_the_slot_of_a_security_module_is_no_reader_for_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pcsc, "load", lambda: Library(["ACS ACR1252 SAM Reader 01", "ACS ACR1252 PICC Reader 00"]))
+    put_in(monkeypatch, ["ACS ACR1252 SAM Reader 01", "ACS ACR1252 PICC Reader 00"])
     assert open_reader("pcsc").name == "ACS ACR1252 PICC Reader 00"
 
 
