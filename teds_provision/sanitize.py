@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 from teds_provision.lazy import late
@@ -41,3 +42,9 @@ def sanitize_json(text: str) -> str:
 def counted(number: int, noun: str, plural: str = "") -> str:
     """``1 entry``, ``2 entries``: a number with its noun; ``plural`` where an s is not enough."""
     return f"{number} {noun if number == 1 else plural or f'{noun}s'}"
+
+
+def by_name(name: str | None, uuid: str) -> tuple[object, ...]:
+    """Sort key of a node in lists for people: by name, ``arm 2`` before ``arm 10``; nodes without one last, by UUID."""
+    parts = re.split(r"(\d+)", (name or "").casefold())
+    return (not name, [int(part) if part.isdecimal() else part for part in parts], uuid)

@@ -62,7 +62,7 @@ OPERATIONS: Final = (
     Operation("GET", "/jobs", "List the jobs of the line.", answers.Jobs),
     Operation("GET", "/jobs/{id}", "Get how a job goes, by its id or its first digits.", answers.JobStatus),
     Operation("POST", "/discover", "Ask every link now.", answers.Found, bodies.Nothing),
-    Operation("GET", "/nodes", "List nodes, those that are present first.", answers.Nodes,
+    Operation("GET", "/nodes", "List nodes by name, those that are present first.", answers.Nodes,
               query={"limit": _integer(1, MOST_NODES), "offset": _integer(0, FURTHEST)}),
     Operation("GET", "/nodes/{uuid}", "Get a node, by UUID, prefix or name.", answers.Node),
     Operation("GET", "/nodes/{uuid}/past", "Get the last hour of a channel: least, greatest, count, invalid, lost.",

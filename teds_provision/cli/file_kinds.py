@@ -21,6 +21,8 @@ _PUBLIC, _PRIVATE, _X509 = "a public key (PEM)", "a private key (PEM)", "an X.50
 _REQUEST, _CERTIFICATE = "a station's certificate request", "a station's certificate"
 _MCAP, _PARQUET = "a recording (MCAP)", "a recording (Parquet)"
 _TEXT, _LINES, _TRACE = "a recording (text)", "a recording (JSON lines)", "a trace"
+_THING, _SHELL = "a Thing Description (JSON)", "an Asset Administration Shell (JSON)"
+_ROBOT = "a robot description (xacro, URDF)"
 _OTHERS: Final = ("a PDF", "a ZIP archive or an office document", "an empty file")
 
 _TEDS: Final = (_IMAGE, _TREE, _TEDS_XML, _PROFILE)
@@ -128,7 +130,7 @@ def _kind_of(path: Path) -> str | None:
 def _kind_of_text(text: str) -> str | None:
     if text.startswith("<"):
         root = re.search(r"<(?:[\w.-]+:)?([A-Za-z][\w.-]*)", re.sub(r"<[?!][^>]*>", "", text))
-        roots = {"whitelist": _WHITELIST, "teds-set": _TEDS_XML, "digitalCalibrationCertificate": _DCC}
+        roots = {"whitelist": _WHITELIST, "teds-set": _TEDS_XML, "digitalCalibrationCertificate": _DCC, "robot": _ROBOT}
         return roots.get(root[1]) if root else None
     if text.startswith("{"):
         named = re.search(r'"format"\s*:\s*"([a-z-]+)/', text[:4096])
@@ -136,6 +138,10 @@ def _kind_of_text(text: str) -> str | None:
             return _FORMATS.get(named[1])
         if text.startswith('{"event"'):
             return _LINES
+        if re.search(r'"@context"\s*:[^{}]*/wot/td/', text):
+            return _THING
+        if re.search(r'"(assetAdministrationShells|submodels)"\s*:\s*\[', text):
+            return _SHELL
         return _BUNDLE if '"recipients"' in text else _WHITELIST if '"whitelist"' in text[:64] else None
     if text.startswith("# teds-provision measurement"):
         return _TEXT

@@ -30,7 +30,7 @@ from teds_provision.cli.options import (
 )
 from teds_provision.cli.sample import ending, over_the_bus, where_met
 from teds_provision.cli.shape_options import measurement_options
-from teds_provision.errors import BadDataError, UsageError
+from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings
 from teds_provision.sanitize import counted
@@ -229,7 +229,16 @@ def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
         if not group.uuids:
             raise UsageError(f"Group {group.name!r} has no nodes.", hint=f"Add one: group add {quote(group.name)} UUID")
         return group.name, list(group.uuids)
-    return "", list(dict.fromkeys(station.nodes.resolve(text) for text in what))
+    try:
+        return "", list(dict.fromkeys(station.nodes.resolve(text) for text in what))
+    except NotFoundError as error:
+        if len(what) > 1:
+            raise
+        groups = ", ".join(quote(group.name) for group in station.groups.all()) or "none"
+        raise NotFoundError(
+            f"No node or group is known as {what[0]!r}.",
+            hint=f"Groups: {groups}. To make one: group create {quote(what[0])} UUID … Nodes: see nodes.",
+        ) from error
 
 
 def _carried_on(app: App, station: Station, asked: KeptMeasurement) -> KeptMeasurement:

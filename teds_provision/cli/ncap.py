@@ -34,10 +34,10 @@ from teds_provision.cli.options import (
     said_here,
     tracing,
 )
-from teds_provision.cli.rendering import by_name, count_of, shown
+from teds_provision.cli.rendering import count_of, shown
 from teds_provision.errors import NotFoundError, PolicyError, TedsProvisionError, UsageError
 from teds_provision.lazy import how_to_install, late
-from teds_provision.sanitize import counted
+from teds_provision.sanitize import by_name, counted
 from teds_provision.station.store.records import COMMAND, iso
 
 if TYPE_CHECKING:

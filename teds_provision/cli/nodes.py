@@ -18,7 +18,6 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import WholeNumber, command
 from teds_provision.cli.rendering import (
     FIRMWARE_CHANGED,
-    by_name,
     firmware_words,
     local_time,
     moment,
@@ -27,6 +26,7 @@ from teds_provision.cli.rendering import (
     shown,
 )
 from teds_provision.errors import BadDataError, NotFoundError, UsageError
+from teds_provision.sanitize import by_name
 from teds_provision.station.label import label_of, write_label
 from teds_provision.steps.inventory import PAGE, STATES, inventory, search
 

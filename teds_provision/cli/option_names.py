@@ -37,7 +37,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "label": frozenset({"output"}),
     "log": frozenset({"follow", "last", "today", "since", "act", "failed"}),
     "trace show": frozenset({"messages", "whole"}),
-    "show": frozenset({"format", "edition", "diff", "plot", "trust-dcc", "strict"}),
+    "show": frozenset({"format", "edition", "diff", "plot", "channel", "trust-dcc", "strict"}),
     "describe": frozenset({"as", "output"}),
     "record convert": frozenset({"wide", "file-units"}),
     "record show": frozenset({"channel", "limit"}),

@@ -35,12 +35,6 @@ def count_of(number: int) -> str:
     return f"{number} node{'' if number == 1 else 's'}"
 
 
-def by_name(name: str | None, uuid: str) -> tuple[object, ...]:
-    """Sort key of a node in lists for people: by name, ``arm 2`` before ``arm 10``; nodes without one last, by UUID."""
-    parts = re.split(r"(\d+)", (name or "").casefold())
-    return (not name, [int(part) if part.isdecimal() else part for part in parts], uuid)
-
-
 def first_lines(lines: list[str], most: int, count: int) -> list[str]:
     """Return the first lines of a list of so many, and how many more there are."""
     return [*lines[:most], f"  … and {count - most} more"] if count > most else lines

@@ -20,7 +20,7 @@ import click
 from teds_provision import teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.context import to_json as dumps
-from teds_provision.cli.options import FileToRead, command
+from teds_provision.cli.options import ChannelName, FileToRead, command
 from teds_provision.errors import BadDataError, UsageError
 from teds_provision.files import open_to_read, read_limited
 from teds_provision.lazy import late
@@ -82,6 +82,9 @@ _CERTIFICATE_HEAD: Final = 8192  # a licence may stand before the root
     "--plot", metavar="FILE", type=click.Path(path_type=Path), help="Plot the calibrations to this file, .png or .svg."
 )
 @click.option(
+    "--channel", type=ChannelName(), metavar="CHANNEL", help="With --plot: only this channel, by number or name."
+)
+@click.option(
     "--trust-dcc",
     type=FileToRead(),
     multiple=True,
@@ -97,6 +100,7 @@ def show(
     edition: str | None,
     diff: tuple[str, str] | None,
     plot: Path | None,
+    channel: int | str | None,
     trust_dcc: tuple[Path, ...],
     strict: bool,
 ) -> None:
@@ -111,6 +115,8 @@ def show(
             raise UsageError("--diff compares two files and cannot be combined with anything else.")
         _diff(app, *diff, as_json=form == "json")
         return
+    if channel is not None and plot is None:
+        raise UsageError("--channel works with --plot.", hint="Add --plot curve.svg")
     if not files:
         raise UsageError("No file given.", hint="Name a file, or - for standard input.")
     if app.json and not plain:
@@ -121,8 +127,12 @@ def show(
     if plot is not None:
         if len(shown) != 1:
             raise UsageError("--plot works with one file.", hint="Run show once per file.")
-        channels = teds.plot.plot_blocks(placed(shown[0].blocks), plot)
-        app.note(f"Plotted in {plot}: channel {', '.join(map(str, channels))}.")
+        blocks = placed(shown[0].blocks)
+        if isinstance(channel, str):
+            sheet = teds.sheet.Sheet.from_blocks(blocks)
+            channel = sheet.chosen(channel, sheet.uuid.hex()).number
+        channels = teds.plot.plot_blocks(blocks, plot, channel=channel)
+        app.note(f"Plotted in {plot}: channel{'s' if len(channels) > 1 else ''} {', '.join(map(str, channels))}.")
     _print_files(app, shown, form)
     if any(file.malformed for file in shown) or (strict and any(map(_has_errors, shown))):
         raise click.exceptions.Exit(_BAD_DATA)

@@ -60,7 +60,7 @@ def plot_blocks(
         which = f"channel {channel}" if channel is not None else "any channel"
         raise BadDataError(f"There is no calibration of {which} that can be drawn.")
     if len(panels) > MAXIMUM_PANELS:
-        raise UsageError(f"{len(panels)} channels do not fit one picture.", hint="Choose one channel.")
+        raise UsageError(f"{len(panels)} channels do not fit one picture.", hint="Choose one with --channel.")
     sheet = Sheet.from_blocks(blocks)
     title = "  ".join(part for part in (sheet.meta.name, sheet.uuid.hex()) if part)
     write_whole(path, _picture(panels, kind, title), mode=SHARED)

@@ -27,6 +27,9 @@ def folder(tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (there / "image.json").write_text(Image(UUID, load_profile("gripper").build(UUID).blocks).to_json())
     (there / "list.xml").write_text('<?xml version="1.0"?>\n<whitelist/>\n')
     (there / "bus.dbc").write_text('VERSION ""\nNS_ :\nBO_ 1 A: 8 B\n')
+    (there / "node.td.json").write_text('{\n "@context": ["https://www.w3.org/2022/wot/td/v1.1"]\n}\n')
+    (there / "node.aas.json").write_text('{"assetAdministrationShells": []}')
+    (there / "node.xacro").write_text('<?xml version="1.0"?>\n<robot xmlns:xacro="http://wiki.ros.org/xacro"/>\n')
     (there / "report.pdf").write_bytes(b"%PDF-1.7\n")
     pem = call(home, "--json", "init").json["public_key"]
     (there / "station.pem").write_text(pem)
@@ -38,6 +41,9 @@ def folder(tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("words", "code", "kind"),
     [
         (["show", "angle.csv"], 8, "angle.csv is a calibration (CSV)."),
+        (["show", "node.td.json"], 8, "node.td.json is a Thing Description (JSON)."),
+        (["show", "node.aas.json"], 8, "node.aas.json is an Asset Administration Shell (JSON)."),
+        (["show", "node.xacro"], 8, "node.xacro is a robot description (xacro, URDF)."),
         (["verify", "list.xml"], 8, "list.xml is a whitelist."),
         (["whitelist", "import", "image.json"], 8, "image.json is a TEDS image."),
         (["import-keys", "station.pem"], 8, "station.pem is a public key (PEM)."),

@@ -254,6 +254,10 @@ def test_a_calibration_is_drawn(show, tmp_path, image):
     assert show(VECTORS / "x07_name.hex", "--plot", picture)[0] == 8
     assert show(image, "--plot", tmp_path / "curve.gif")[0] == 2
     assert show(image, image, "--plot", picture)[0] == 2
+    for channel in ("1", "angle"):
+        assert show(image, "--plot", picture, "--channel", channel)[0] == 0
+    assert show(image, "--plot", picture, "--channel", "torque")[0] == 8
+    assert show(image, "--channel", "1")[0] == 2
 
 
 # -- formats -------------------------------------------------------------------------------------------------------

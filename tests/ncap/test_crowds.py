@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 
 from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
+from teds_provision.station.station import Station
 from tests.cli.shell import PROGRAM
 from tests.e2e.desk import ANGLE
 from tests.measure.hall import Hall, events
@@ -29,6 +31,19 @@ class Silence:
     def event(self, *_words: Any, **_facts: Any) -> None: ...
 
     def last(self, *_words: Any) -> None: ...
+
+
+def test_nodes_are_listed_by_name_those_that_are_there_first(prepared: Path, tmp_path: Path) -> None:
+    shutil.copytree(prepared / "bench", tmp_path / "bench")
+    silence: Any = Silence()
+    names = {"a1" * 10: "arm 10", "b2" * 10: "", "c3" * 10: "arm 2", "d4" * 10: "Arm 1", "e5" * 10: "zebra"}
+    with Station.inspect(tmp_path / "bench") as station:
+        for uuid, name in names.items():
+            station.nodes.remember(bytes.fromhex(uuid), name=name)
+        listed = NodeDirectory(station, silence)
+        listed.refresh()
+        listed.note("e5" * 10, "came", present=True)
+        assert [node["name"] or None for node in listed.nodes()] == ["zebra", "Arm 1", "arm 2", "arm 10", None]
 
 
 def test_nodes_that_left_and_are_not_known_are_forgotten_but_the_latest() -> None:

@@ -13,12 +13,14 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import Any, Final
 
 from teds_provision.api.operations import MOST_NODES
 from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.sinks import for_readers
+from teds_provision.sanitize import by_name
 from teds_provision.station.overview import Search
 from teds_provision.station.shown_units import shown_units, units_of_profile
 from teds_provision.station.station import Station
@@ -28,6 +30,8 @@ from teds_provision.steps.readings import NodeVerdict
 from teds_provision.teds.sheet import Channel, Sheet
 
 _log = logging.getLogger(__name__)
+_order: Final = lru_cache(maxsize=32_768)(by_name)
+"""Sort keys of ten thousand nodes, for each page of a list, cost half a second."""
 _READ_NOW: Final = "read now"
 MOST_GONE: Final = 200
 """Number of nodes that left and are not in the store, kept to be shown: in transparent mode they can be invented."""
@@ -209,10 +213,10 @@ class NodeDirectory:
     # -- for the API -------------------------------------------------------------------------------------------------
 
     def uuids(self) -> list[str]:
-        """Every node of the store or on a link, those that are there first."""
+        """Every node of the store or on a link: those that are there first, each part by name."""
         with self._lock:
             known = set(self._rows) | {uuid for uuid, seen in self._seen.items() if seen.present or seen.looked}
-            return sorted(known, key=lambda uuid: (not self.seen(uuid).present, uuid))
+            return sorted(known, key=lambda uuid: (not self.seen(uuid).present, _order(self.name(uuid), uuid)))
 
     def name(self, uuid: str) -> str:
         """Return the name of a node in the store, "" if it has none."""

@@ -44,7 +44,7 @@ def read_json(text: str | bytes) -> list[TedsBlock]:
     """Read a JSON document of this format; raises BadDataError naming what is wrong."""
     data = load_json(text, "the JSON document")
     if not isinstance(data, dict) or data.get("format") != FORMAT or not isinstance(data.get("teds"), list):
-        raise BadDataError(f'This JSON is no list of TEDS: "format" is not "{FORMAT}" or "teds" is not a list.')
+        raise BadDataError(f'This JSON contains no TEDS: "format" is not "{FORMAT}" or "teds" is not a list.')
     check_count(len(data["teds"]), LIMITS.teds_of_a_file, "TEDS")
     return [_block(entry, number) for number, entry in enumerate(data["teds"], 1)]
 
