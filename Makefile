@@ -242,12 +242,12 @@ firmware:
 	@$(PYTHON) -m tests.vectors.c_arrays build/vectors-c
 	$(MAKE) --no-print-directory -C firmware -j$$(nproc) all psa check
 
-# Every faulty node in C, each found by its rule, builds of other sizes and options, each with every rule, and updates whose
-# power fails at every step of flash.
+# Every faulty node in C, each found by its rule, builds of other sizes and options, each with every rule, and updates that are
+# interrupted at every exchange and at every step of flash.
 firmware-faults: $(VENV)/.dev
 	@sh scripts/install-test-packages
 	$(BIN)/python -m pytest -q -n $(WORKERS) -m 'soak or not soak' tests/firmware/test_faults.py tests/firmware/test_options.py \
-	  tests/firmware/test_host_updates.py
+	  tests/firmware/test_host_updates.py tests/firmware/test_update_interruptions.py
 
 # Every test of whole runs whose needs the node in C meets, with it on the desk (tests/firmware/c_node.py).
 OF_C := tests/e2e tests/cli/test_handover.py tests/cli/test_life.py tests/cli/test_messages.py tests/check/test_node_check_cli.py
