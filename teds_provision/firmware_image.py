@@ -186,4 +186,8 @@ def _imgtool(module: str) -> Any:
     try:
         return import_module(f"imgtool.{module}")
     except ModuleNotFoundError as error:
-        raise NotFoundError("A firmware image needs the package imgtool.", hint=how_to_install("update")) from error
+        first: BaseException = error  # imgtool is there, and what it needs is not: cbor2, then cbor in its place
+        while isinstance(first.__context__, ModuleNotFoundError):
+            first = first.__context__
+        missing = (getattr(first, "name", None) or "imgtool").partition(".")[0]
+        raise NotFoundError(f"A firmware image needs the package {missing}.", hint=how_to_install("update")) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from pathlib import Path
 
 import pytest
@@ -95,3 +96,12 @@ def test_what_is_no_key_and_no_file_is_named(tmp_path: Path, owner: Path) -> Non
     wrong.write_bytes(b"no image")
     with pytest.raises(BadDataError, match=r"wrong\.bin: This is not a whole MCUboot image"):
         load_firmware_image(wrong, owner)
+
+
+@pytest.mark.parametrize("package", ["imgtool", "cbor2"])
+def test_the_package_that_is_missing_is_named(owner: Path, monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "imgtool"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(NotFoundError, match=f"needs the package {package}\\."):
+        read_firmware_image(b"")

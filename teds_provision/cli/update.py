@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, Final
 
 import click
@@ -24,7 +25,7 @@ from teds_provision.cli.options import (
     yes_option,
 )
 from teds_provision.cli.rendering import reporter_for
-from teds_provision.errors import NotFoundError, TedsProvisionError, UsageError, WrongImageError
+from teds_provision.errors import NotFoundError, UsageError, WrongImageError
 from teds_provision.links import LinkSettings
 from teds_provision.talk.progress import NodeReporter, Reporter, SilentReporter
 
@@ -88,6 +89,7 @@ def update(
     """
     if bool(uuids) == (match is not None):
         raise UsageError("update needs UUIDs or --match EXPR.", hint="Name the boards, or select them; not both.")
+    _require_image_last(uuids, image)
     firmware = firmware_image.load_firmware_image(image, key)
     station = app.station()
     boards = _matching(station, match) if match is not None else [station.nodes.resolve(uuid) for uuid in uuids]
@@ -101,10 +103,23 @@ def update(
     if dry_run:
         for plan in planned:
             _tell_plan(app, plan, order)
+        if len(boards) > 1:
+            _tell_planned_totals(app, planned, ended)
         _conclude(app, ended)
         return
     orders = _asked(app, planned, order, yes=yes, ended=ended)
     _update(app, station, links, orders, ended, parallel)
+
+
+def _require_image_last(uuids: Sequence[str], image: Path) -> None:
+    """Raise UsageError if a file stands where a board is expected, and the last argument is no file."""
+    files = [uuid for uuid in uuids if Path(uuid).is_file()]
+    if files and not image.exists():
+        boards = " ".join(quote(word) for word in (*(uuid for uuid in uuids if uuid not in files), str(image)))
+        raise UsageError(
+            f"{files[0]} is a file, and {image} is none: the image comes last.",
+            hint=f"teds-provision update {boards} {quote(files[0])}",
+        )
 
 
 def _matching(station: Station, expression: str) -> list[bytes]:
@@ -130,16 +145,13 @@ def _look(
     planned: list[UpdatePlan] = []
     refused: list[BoardUpdate] = []
     for uuid in boards:
-        began = time.monotonic()
         of = NodeReporter(reporter, uuid.hex()) if len(boards) > 1 else reporter
-        try:
-            planned.append(steps.update.plan_update(station, links, uuid, order, of))
-        except TedsProvisionError as error:
-            ended = steps.update.BoardUpdate(
-                uuid, steps.update.result_of(error), None, 0, time.monotonic() - began, error
-            )
-            refused.append(ended)
-            _tell(app, ended, order)
+        plan = steps.update.plan_or_refusal(station, links, uuid, order, of)
+        if isinstance(plan, steps.update.BoardUpdate):
+            refused.append(plan)
+            _tell(app, plan, order)
+        else:
+            planned.append(plan)
     return planned, refused
 
 
@@ -256,6 +268,20 @@ def _tell_totals(app: App, ended: Sequence[BoardUpdate], seconds: float) -> None
     app.emit({"totals": totals | {"seconds": round(seconds, 3)}}, f"{words or 'nothing to do'} in {seconds:.1f} s")
 
 
+def _tell_planned_totals(app: App, planned: Sequence[UpdatePlan], ended: Sequence[BoardUpdate]) -> None:
+    """Print what a dry run found, of all boards."""
+    counted = Counter(board.result for board in ended) + Counter(_planned(plan) for plan in planned)
+    totals = {name: counted[name] for name in ("planned", *steps.update.RESULTS)}
+    octets, seconds = sum(plan.octets for plan in planned), sum(plan.seconds for plan in planned)
+    words = ", ".join(f"{count} {name}" for name, count in totals.items() if count)
+    told = {"totals": totals | {"octets": octets, "seconds": round(seconds, 1)}}
+    app.emit(told, f"{words}; {octets} octets, about {seconds:.0f} s one board after the other")
+
+
+def _planned(plan: UpdatePlan) -> str:
+    return "already" if plan.stage == "nothing" else "planned"
+
+
 def _tell_plan(app: App, plan: UpdatePlan, order: UpdateOrder) -> None:
     told = {
         "uuid": plan.uuid.hex(),
@@ -286,7 +312,7 @@ def _plan_text(plan: UpdatePlan, order: UpdateOrder) -> str:
         lines.append(f"  now: {before}, {plan.report.text or 'no name'}")
     if plan.octets:
         slow = "; this link is slow, keep the board where it is" if plan.octets / plan.seconds < _SLOW else ""
-        lines.append(f"  {plan.octets} octets, about {plan.seconds:.0f} s{slow}")
+        lines.append(f"  {plan.octets} octets, about {plan.seconds:.0f} s if nothing else uses the link{slow}")
     lines += [f"  interrupts the measurement by {holder}" for holder in plan.interrupts]
     if plan.question:
         lines.append(f"  {plan.question}")

@@ -110,12 +110,29 @@ def plan_update(
 
     Raises NoUpdateError, DowngradeError, PolicyError (other image on trial, claimed actuator), LinkError.
     """
-    port = _port_of(station, links, uuid)
+    planned = plan_or_refusal(station, links, uuid, order, reporter)
+    if isinstance(planned, BoardUpdate):
+        assert planned.error is not None
+        raise planned.error
+    return planned
+
+
+def plan_or_refusal(
+    station: Station, links: LinkSettings, uuid: bytes, order: UpdateOrder, reporter: Reporter
+) -> UpdatePlan | BoardUpdate:
+    """Return the plan of :func:`plan_update`, or how the update ends here, with the version that was read first."""
+    began, looked = time.monotonic(), None
     try:
-        avoid_measuring_source(station, port, uuid)
-        return _Update(station, port, links.timeout, uuid, order, reporter).plan()
-    finally:
-        port.close()
+        port = _port_of(station, links, uuid)
+        try:
+            avoid_measuring_source(station, port, uuid)
+            looked = _Update(station, port, links.timeout, uuid, order, reporter)
+            return looked.plan()
+        finally:
+            port.close()
+    except TedsProvisionError as error:
+        before = looked.before if looked is not None else None
+        return BoardUpdate(uuid, result_of(error), before, 0, time.monotonic() - began, error)
 
 
 def update_boards(
@@ -205,6 +222,11 @@ class _Update:
         self._point = b""
 
     # -- what others call ------------------------------------------------------------------------------------------
+
+    @property
+    def before(self) -> str | None:
+        """Version that ran when the board was looked at, None if it was not."""
+        return self._before
 
     def plan(self) -> UpdatePlan:
         """Return what :meth:`run` would do."""

@@ -163,6 +163,18 @@ def test_many_boards_at_once_and_one_that_takes_no_firmware(desk: Desk, owner: O
     station.run(
         "provision", "--all", *PROVISIONED, "--yes", *over
     )  # 6: the type wants a calibration, which is no matter
+    planned = station.run("--json", "update", "--match", f"type:{ANGLE}", owner.new, "--dry-run", *over)
+    assert planned.code == 6, planned
+    *plans, last = map(json.loads, planned.out.splitlines())
+    assert sorted(plan.get("plan", plan.get("result")) for plan in plans) == ["refused", "upload", "upload", "upload"]
+    octets = owner.new.stat().st_size
+    assert {name: count for name, count in last["totals"].items() if name != "seconds" and count} == {
+        "planned": 3, "refused": 1, "octets": 3 * octets,
+    }  # fmt: skip
+    shown = station.run("update", boards[0].uuid, boards[1].uuid, owner.new, "--dry-run", *over)
+    assert f"2 planned; {2 * octets} octets, about " in shown.out
+    older = station.run("--json", "update", boards[0].uuid, owner.image("0.9.0"), "--yes", *over)
+    assert (older.code, json.loads(older.out.splitlines()[0])["from"]) == (6, "1.0.0"), "it was read"
     lines, totals = update(station, "--match", f"type:{ANGLE}", owner.new, "--parallel", "3", code=6)
     results = {line["uuid"]: line["result"] for line in lines}
     assert results == {**{node.uuid: "updated" for node in boards}, plain.uuid: "refused"}
@@ -174,6 +186,8 @@ def test_many_boards_at_once_and_one_that_takes_no_firmware(desk: Desk, owner: O
         station.refuses("update", "--match", "name:nothing*", owner.new, "--yes", *over, code=3)["code"] == "not-found"
     )
     assert station.refuses("update", owner.new, "--yes", *over, code=2)["code"] == "usage"
+    swapped = station.refuses("update", owner.new, boards[0].uuid, "--yes", *over, code=2)
+    assert swapped["hint"] == f"teds-provision update {boards[0].uuid} {owner.new}"
     shown = station.run("update", boards[0].uuid, owner.new, "--yes", *over)
     assert "already" in shown.out
     asked = station.run("update", boards[0].uuid, owner.image("1.9.0"), *over)

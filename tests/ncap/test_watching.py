@@ -18,11 +18,14 @@ from teds_provision.measure.blocks import NodeReport
 from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor, RunningMeasurement
 from teds_provision.ncap.nodes import link_watch
 from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
+from teds_provision.ncap.nodes.inspection import look
 from teds_provision.ncap.nodes.link_watch import MOST_KNOWN, LinkWatch
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
 from teds_provision.station.store import KeptMeasurement
-from tests.bench import make_station
+from teds_provision.talk.conversation import Conversation
+from tests.bench import MemoryLink, contact, make_station
 from tests.pace import until
+from tests.steps.test_firmware import FirmwareBoard
 
 
 class Silence:
@@ -31,6 +34,24 @@ class Silence:
     def event(self, *_words: Any, **_facts: Any) -> None: ...
 
     def last(self, *_words: Any) -> None: ...
+
+
+def test_the_firmware_of_a_board_without_a_key_here_is_shown_as_unverified_and_not_stored(tmp_path: Path) -> None:
+    station, stranger = make_station(tmp_path / "home"), FirmwareBoard()
+    station.unlock()
+    with Conversation(contact(stranger, MemoryLink(stranger, via="can")), notice=lambda _notice: None) as node:
+        found = look(station, node)
+    assert found.firmware is not None
+    assert (found.firmware["version"], found.firmware["from"], found.firmware["state"]) == (
+        "1.2.0",
+        "plain",
+        "unjudged",
+    )
+    assert station.firmware_reports.get(stranger.uuid) is None
+    directory = NodeDirectory(station, Silence())  # type: ignore[arg-type]
+    directory.note(stranger.uuid.hex(), "verified", firmware=found.firmware)
+    assert directory.node(stranger.uuid.hex())["firmware"] == found.firmware
+    station.close()
 
 
 def sighting(number: int) -> Any:

@@ -51,6 +51,7 @@ class NodePresence:
     looked: float = 0.0
     problem: dict[str, str] | None = None
     power: dict[str, Any] | None = None
+    firmware: dict[str, Any] | None = None  # what it reported in no session; what is stored goes before it
     measurement: str | None = None
     report: dict[str, Any] | None = None
     busy: str = ""
@@ -317,7 +318,7 @@ class NodeDirectory:
                 "measurement": seen.measurement,
                 "measuring": seen.report,
                 "power": seen.power,
-                "firmware": row.get("firmware"),
+                "firmware": row.get("firmware") or seen.firmware,
             }
         called, unverified = self.called(uuid)
         out["unverified"] = unverified

@@ -13,9 +13,11 @@ from typing import Any, Final
 from teds_provision.errors import BadDataError, NodeRefusedError, TedsProvisionError
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.operation.commands import POWER, PowerReply
+from teds_provision.station.firmware import firmware_of
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now
 from teds_provision.steps.agree import session_if_keyed
+from teds_provision.steps.firmware import read_firmware
 from teds_provision.steps.identify import IdentifiedNode, identify
 from teds_provision.steps.readings import NodeVerdict, is_keyed, keep
 from teds_provision.steps.teds_read import list_blocks, read_block, read_identity, read_image
@@ -34,12 +36,14 @@ STRANGERS_SECONDS: Final = 60.0
 class NodeInspection:
     """Result of an inspection. ``sheet`` is that of a node whose datasheet is not stored here, else None.
 
-    A ``judged`` that came in no session is shown beside the node's reading, and changes no row.
+    A ``judged`` that came in no session is shown beside the node's reading, and changes no row. ``firmware`` is what a
+    node reported in no session, marked so; it is not stored.
     """
 
     judged: NodeVerdict
     sheet: Sheet | None = None
     power: dict[str, Any] | None = None
+    firmware: dict[str, Any] | None = None
 
 
 def look(station: Station, node: Conversation) -> NodeInspection:
@@ -87,9 +91,12 @@ def _stranger(station: Station, node: Conversation, who: IdentifiedNode) -> Node
         blocks[block] = octets
     image = Image(node.uuid, blocks)
     why = "the node does not open a session with any key held here" if is_keyed(station, node.uuid) else ""
+    reported = firmware_of(station, node.uuid, read_firmware(node, once=True))
     checks = (*verify_image(station, image, known=freshness_floor_of(station, node.uuid, None)), session_check("", why))
     return NodeInspection(
-        NodeVerdict(Verification(node.uuid, checks), "plain", utc_now(), "ncap"), Sheet.from_image(image)
+        NodeVerdict(Verification(node.uuid, checks), "plain", utc_now(), "ncap"),
+        Sheet.from_image(image),
+        firmware=None if reported is None else reported.to_json(),
     )
 
 

@@ -427,6 +427,7 @@ class LinkWatch:
             heard=found.judged.to_json() if found.judged.origin == "plain" else None,
             looked=time.time(),
             power=found.power,
+            firmware=found.firmware,
             problem=None,
         )
         if found.judged.origin == "kept" and not node.contact.link.capabilities.tapped:
