@@ -61,7 +61,7 @@ def run(copy: Path, *words: object) -> subprocess.CompletedProcess[str]:
         env=clean_environment(PYTHONPATH=str(copy)),
         capture_output=True,
         text=True,
-        timeout=280,
+        timeout=500,
         check=False,
     )
 

@@ -224,6 +224,7 @@ class PlantWatch:
                     if self._listener is None:
                         return
                 self._listener.listen()
+                self._wake.set()  # for what was pushed before it
                 swept = 0.0
                 while not self._stop.is_set():
                     if time.monotonic() - swept >= EVERY:  # also finds out whether the connection is there

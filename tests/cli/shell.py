@@ -17,6 +17,7 @@ from typing import Any
 
 from teds_provision.cli.main import run
 from tests.bench import PASSPHRASE
+from tests.pace import PATIENCE
 from tests.zygote import FIRST_FD, Forked, Zygote, forkable
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -78,7 +79,7 @@ def python(code: str, *words: str, **variables: str) -> Outcome:
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         check=True,
         env=unmeasured_environment() | variables,
     )

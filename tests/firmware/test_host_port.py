@@ -155,10 +155,10 @@ def test_an_actuator_is_set_held_and_goes_safe(desk: Desk, station: Station, nod
     def state() -> set[str]:
         return set(station.ask("mode", node.uuid, *rival)["channels"][0]["state"])
 
-    until(lambda: state() == {"actuator", "claimed by other"}, seconds=30)
+    until(lambda: state() == {"actuator", "claimed by other"})
     held.process.kill()  # nobody goes on: the dead-man runs out
     held.end()
-    until(lambda: state() == {"actuator", "safe", "stopped"}, seconds=30)
+    until(lambda: state() == {"actuator", "safe", "stopped"})
 
 
 def test_its_identity_key_may_lie_in_psa_and_never_leave_it(desk: Desk, station: Station, node: CNode) -> None:

@@ -169,7 +169,7 @@ def test_a_node_that_is_listed_again_does_not_wait_for_the_next_try(hall: Hall) 
         until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured")
         decide(hall, DECISIONS["unlisted"])
         # 1, 2 and 4 s are over
-        until(lambda: "again in 8 s" in (asked.node(uuid)["measuring"] or {}).get("why", ""), seconds=30.0)
+        until(lambda: "again in 8 s" in (asked.node(uuid)["measuring"] or {}).get("why", ""))
         units = [channel["shown"]["unit"] for channel in asked.node(uuid)["channels"]]
         hall.station.ask("whitelist", "add", uuid, "--fingerprint", entry["fingerprint"])
         listed = time.monotonic()
