@@ -2,7 +2,7 @@
 
 Untrusted input is checked cheaply (octets, tags, brackets, depth) before anything is built from it, so that no file
 costs more than 10 s and 300 MB. Every check raises BadDataError that names the excess and the limit. This module is
-below every room and imports nothing of ours but the errors.
+below every room and imports nothing of ours but the errors and the decoder of JSON.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from functools import cache
 from typing import Any, Final
 
 from teds_provision.errors import BadDataError
+from teds_provision.json_decoder import strict_decoder
 
 
 @dataclass(frozen=True)
@@ -173,26 +174,7 @@ def _parsed(text: str | bytes) -> Any:
 
 @cache
 def _decoder() -> json.JSONDecoder:
-    return json.JSONDecoder(object_pairs_hook=_unique, parse_int=_integer)
-
-
-class _DuplicateNameError(ValueError):
-    """Two members of one object have the same name."""
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    members = dict(pairs)
-    if len(members) != len(pairs):
-        seen: set[str] = set()
-        again = next(name for name, _ in pairs if name in seen or seen.add(name))  # type: ignore[func-returns-value]
-        raise _DuplicateNameError(f'an object names "{again[:40]}" twice')
-    return members
-
-
-def _integer(digits: str) -> int:
-    if len(digits) > LIMITS.integer_digits:
-        raise ValueError(f"it holds an integer of {len(digits)} digits; at most {LIMITS.integer_digits} are read")
-    return int(digits)
+    return strict_decoder(constants=True, digits=LIMITS.integer_digits)
 
 
 def _upper(what: str) -> str:

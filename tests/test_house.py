@@ -104,3 +104,14 @@ def test_the_c_library_has_a_header_for_each_source_and_no_more_circles(house: M
     assert len(ring) <= 11
     assert not ring & {"octets", "clock", "ndef", "isotp", "security_teds", "t4t"}
     assert house.c_shared_names() == [], "a backtrace tells which file it was"
+
+
+def test_json_of_strangers_is_decoded_in_one_place(modules: dict[str, Any]) -> None:
+    """A second decoder would take equal names, or refuse them in a way of its own."""
+    own = {
+        name
+        for name, module in modules.items()
+        for node in ast.walk(module.tree)
+        if "object_pairs_hook" in (getattr(node, "arg", ""), getattr(node, "value", ""))
+    }
+    assert own == {"teds_provision.json_decoder"}

@@ -26,6 +26,7 @@ from typing import (
     is_typeddict,
 )
 
+from teds_provision.json_decoder import DuplicateNameError, strict_decoder
 from teds_provision.shapes.metadata import Meta
 
 Schema = dict[str, Any]
@@ -108,10 +109,12 @@ def read(shape: type[Shape], octets: bytes) -> Shape:
     """
     try:
         text = octets.decode()
-        value = json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant) if text else {}
+        if text.startswith("\ufeff"):
+            raise ValueError("a byte order mark is no JSON")
+        value = _DECODER.decode(text) if text else {}
         json.dumps(value, ensure_ascii=False).encode()
-    except BadRequestError:
-        raise
+    except DuplicateNameError as error:
+        raise BadRequestError(f"Member {error.name[:64]!r} appears twice.", "Send each member once.") from error
     except (ValueError, RecursionError) as error:
         raise BadRequestError("The request body is not valid JSON.", "") from error
     if not isinstance(value, dict):
@@ -120,17 +123,7 @@ def read(shape: type[Shape], octets: bytes) -> Shape:
     return shape(**{name: member for name, member in found.items() if member is not None})
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    members = dict(pairs)
-    if len(members) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise BadRequestError(f"Member {twice[:64]!r} appears twice.", "Send each member once.")
-    return members
-
-
-def _no_constant(name: str) -> Any:
-    raise ValueError(name)
+_DECODER: Final = strict_decoder()
 
 
 def fit(schema: Schema, value: Any, where: str = "") -> Any:

@@ -18,6 +18,7 @@ from typing import Any
 from uuid import UUID
 
 from teds_provision.errors import BadDataError
+from teds_provision.json_decoder import DuplicateNameError, strict_decoder
 
 _TO_URL = bytes.maketrans(b"+/", b"-_")
 # The two characters of plain base64 and the padding become one that no alphabet holds.
@@ -169,7 +170,7 @@ def _failing_as(what: str) -> Iterator[None]:
     except RecursionError as error:
         raise BadDataError(f"{what} is nested too deeply.") from error
     except ValueError as error:
-        detail = error.args[0] if isinstance(error, _DuplicateNameError) else "it is damaged or something else"
+        detail = _TWICE if isinstance(error, DuplicateNameError) else "it is damaged or something else"
         raise BadDataError(f"{what} is not the JSON that it should be: {detail}.") from error
 
 
@@ -208,7 +209,7 @@ class _Walk:
                 raise ValueError("a member has no name")
             key = self._value()
             if key in members:
-                raise _DuplicateNameError(_TWICE)
+                raise DuplicateNameError(key)
             if self.next() != ":":
                 raise ValueError("a member has no value")
             self._at += 1
@@ -270,27 +271,8 @@ class _Walk:
         return True
 
 
-class _DuplicateNameError(ValueError):
-    """Two members of one object have the same name."""
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    members = dict(pairs)
-    if len(members) != len(pairs):
-        raise _DuplicateNameError(_TWICE)
-    return members
-
-
-def _refuse_constant(name: str) -> Any:
-    raise ValueError(f"{name} is not JSON")
-
-
-def _refuse_fraction(number: str) -> Any:
-    raise ValueError(f"{number[:20]} is no whole number")
-
-
-_DECODER = json.JSONDecoder(object_pairs_hook=_unique, parse_constant=_refuse_constant)
-_EXACT = json.JSONDecoder(object_pairs_hook=_unique, parse_constant=_refuse_constant, parse_float=_refuse_fraction)
+_DECODER = strict_decoder()
+_EXACT = strict_decoder(fractions=False)
 
 
 # Reading the members of a signed payload: each with its type, its range and its own complaint.
