@@ -22,6 +22,7 @@ from teds_provision.station.store import TrustRecord
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.firmware import keep_firmware, read_firmware
 from teds_provision.steps.identify import identify
+from teds_provision.steps.inventory import inventory
 from tests.bench import talk
 from tests.cli.shell import call
 from tests.plant.handing import keyed
@@ -215,6 +216,27 @@ def test_nodes_plant_prints_it_beside_the_holder(plants: Plant, later: Callable[
     assert any(line.startswith(without.uuid.hex()) and "firmware not reported (north, " in line for line in lines)
     log = call(south.home, "registry", "log", board.uuid.hex()).out
     assert "south 2  firmware  uuid=" + board.uuid.hex() + " runs=nrf/loadcell 1.3.0+0" in log, log
+
+
+def test_a_key_that_is_handed_over_brings_no_firmware(plants: Plant) -> None:
+    """What the giver read proves nothing here: the plant shows it, the receiver's own list and verdicts do not."""
+    south = plants.member("south", "base")
+    board = board_with(plants.north, OLD)
+    look(plants.north, board)
+    shared_with(plants, south)
+    plants.round()
+    assert south.keys.held(board.uuid)
+    assert south.firmware_reports.get(board.uuid) is None
+    (known,) = inventory(south, [board.uuid])
+    assert known["firmware"] is None
+    assert version(south, board) == ("1.2.0", "north")
+    look(south, board)
+    (known,) = inventory(south, [board.uuid])
+    assert (known["firmware"]["version"], known["firmware"]["from"], known["firmware"]["changed"]) == (
+        "1.2.0",
+        "session",
+        False,
+    )
 
 
 # -- stations that leave, and versions --------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ import pytest
 from teds_provision.errors import (
     BoardLostError,
     DowngradeError,
+    NodeRefusedError,
     NodeSilentError,
     NotAuthenticError,
     PolicyError,
@@ -27,7 +28,10 @@ from teds_provision.protocol.messages.frames import Function, Reason, refusal, s
 from teds_provision.protocol.messages.smp import UPLOAD, SmpPacket, decode_packet
 from teds_provision.station.firmware import firmware_of
 from teds_provision.station.station import Station
+from teds_provision.steps.agree import reset_node
+from teds_provision.steps.identify import identify
 from teds_provision.steps.update import UpdateOrder, plan_update
+from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import SECURITY
 from tests.bench import PASSPHRASE
@@ -139,6 +143,33 @@ def test_another_image_on_trial_or_pending_is_left_alone(bench: UpdateBench, own
     assert (done.result, type(done.error)) == ("refused", PolicyError)
     assert bench.runs == ("1.0.5", True, False)
     assert bench.update(other).result == "updated", "the update that it belongs to goes on"
+
+
+def test_a_board_on_trial_is_not_decommissioned_before_it_has_ended(bench: UpdateBench, owner: Owner) -> None:
+    """It could forget its key under one image and have it again under the other."""
+    slots = bench.node._slots
+    assert slots is not None
+    slots.write(0, owner.new.octets)
+    assert slots.start_next(owner.new.digest)
+    bench.node.restart()
+    assert bench.runs == ("1.1.0", True, False)
+    flash = bench.node.tim.flash
+    bench.station.unlock()
+
+    def reset() -> None:
+        with Conversation(bench.contact(), notice=lambda _notice: None) as node:
+            reset_node(bench.station, node, identify(bench.station, node))
+
+    with pytest.raises(NodeRefusedError) as refused:
+        reset()
+    assert refused.value.reason == Reason.BUSY
+    assert bench.node.tim.flash == flash
+    assert bench.station.keys.held(bench.uuid)
+    bench.node.restart()
+    assert bench.runs == ("1.0.0", False, False)
+    reset()
+    assert bench.node.in_factory_state()
+    assert bench.station.firmware_reports.get(bench.uuid) is None, "the next owner's board is another one"
 
 
 def test_a_board_that_never_returns_is_lost_and_the_same_call_goes_on_later(bench: UpdateBench, owner: Owner) -> None:

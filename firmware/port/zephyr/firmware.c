@@ -196,6 +196,10 @@ static void port_about(void *user, teds_firmware *out)
     defined(CONFIG_MCUMGR_GRP_IMG_ALLOW_CONFIRM_NON_ACTIVE_IMAGE_ANY)
 #error "CONFIG_TEDS_MANAGE: turn RESET_BOOT_MODE, DIRECT_UPLOAD and ALLOW_CONFIRM_NON_ACTIVE_IMAGE_... of mcumgr off"
 #endif
+/* Else an image may reach into the trailer of its slot, and the boot loader cannot swap it. */
+#if !defined(CONFIG_MCUMGR_GRP_IMG_TOO_LARGE_SYSBUILD) && !defined(CONFIG_MCUMGR_GRP_IMG_TOO_LARGE_BOOTLOADER_INFO)
+#error "CONFIG_TEDS_MANAGE: set CONFIG_MCUMGR_GRP_IMG_TOO_LARGE_SYSBUILD=y (or _BOOTLOADER_INFO): leave the slot's trailer free"
+#endif
 #if CONFIG_UPDATEABLE_IMAGE_NUMBER != 1
 #error "CONFIG_TEDS_MANAGE: one image (CONFIG_UPDATEABLE_IMAGE_NUMBER=1)"
 #endif
