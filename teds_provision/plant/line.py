@@ -19,7 +19,7 @@ from teds_provision.plant.sign_requests import Office, SignatureOrder, by_office
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.protocol.plant.evidence import FAILED, PASSED, BoardFacts, EvidenceClaim, blocks_of
+from teds_provision.protocol.plant.evidence import FAILED, PASSED, BoardFacts, EvidenceClaim, blocks_of, firmware_facts
 from teds_provision.protocol.plant.job import WORTH, Job
 from teds_provision.station.label import label_of, read_label, write_label
 from teds_provision.station.plant.line import EvidenceRow, UnitRow
@@ -461,10 +461,19 @@ class LineUnit:
             heads=heads_digest(station) if station.plant.joined is not None else None,
             certificates=certificates,
             origin=origin,
+            firmware=_firmware_in_session(node),
         )
         claim, finished = EvidenceClaim(uuid, teds, facts), utc_now()
         document = sign_evidence(node, credentials, claim, operator=self.run.operator, finished=finished)
         self.run.keep(document, claim, finished, self)
+
+
+def _firmware_in_session(node: Conversation) -> tuple[str, str, str, int] | None:
+    """Return what the board reported in the session that is open, None for nothing; asks no further question."""
+    if not node.sealed or node.reported_firmware is None:
+        return None
+    session, report = node.reported_firmware
+    return None if report is None or session != node.open_counter else firmware_facts(report)
 
 
 def _named_in(image: Image | None, shown: SecurityTeds) -> tuple[tuple[tuple[int, str], ...], str | None]:

@@ -17,14 +17,20 @@ from securesystemslib.signer import SSlibKey
 
 from teds_provision.errors import BadDataError, NodeSilentError, NotAuthenticError, TedsProvisionError
 from teds_provision.plant.evidence import sign_evidence
+from teds_provision.plant.line import _firmware_in_session
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
+from teds_provision.protocol.messages.firmware import FirmwareReport
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.evidence import EvidenceClaim
 from teds_provision.station.station import Station
+from teds_provision.steps.agree import require_session
+from teds_provision.steps.firmware import read_firmware
+from teds_provision.steps.identify import identify
 from teds_provision.teds.image import SECURITY
 from teds_provision.teds.origin import Origin
 from tests.bench import Board, MemoryLink, make_station, talk
 from tests.cli.shell import call
+from tests.steps.test_firmware import GOOD, FirmwareBoard
 
 from .proofs import evidence_of, facts_of, run, signed_anew
 
@@ -256,11 +262,32 @@ def test_evidence_names_the_certificates_and_the_origin_of_the_datasheet(station
     assert "the origin of the facts is not that of the Origin TEDS (130)" in faults(station, invented)
 
 
+@pytest.mark.parametrize("report", [GOOD, FirmwareReport("bare", (0, 9, 0)), None], ids=["image", "no-image", "none"])
+def test_evidence_states_the_firmware_of_its_session(station: Station, report: FirmwareReport | None) -> None:
+    board = FirmwareBoard(report=report)
+    run(station, board)
+    with talk(board) as node:
+        identify(station, node)
+        read_firmware(node)
+        assert _firmware_in_session(node) is None, "what is said in no session is no fact"
+        require_session(station, node)
+        read_firmware(node)
+        said = _firmware_in_session(node)
+    due = None if report is None else (report.text, f"{report.version_text}+{report.build}", "02" * 32, 0)
+    if report is not None and report.image is None:
+        due = ("bare", "0.9.0+0", "0" * 64, 0)
+    assert said == due
+    document = evidence_of(station, board, certificates=(), firmware=said)
+    facts = codec.read(document).facts
+    assert (facts.firmware, faults(station, document)) == (due, [])
+    assert facts.to_json()["firmware"] == (None if due is None else list(due))
+
+
 def test_evidence_of_older_versions_has_neither_certificates_nor_origin(station: Station, board: Board) -> None:
     document = evidence_of(station, board)
     facts = codec.read(document).facts
     assert (facts.certificates, facts.origin, faults(station, document)) == (None, None, [])
-    assert not {"certificates", "origin"} & set(facts.to_json())
+    assert not {"certificates", "origin", "firmware"} & set(facts.to_json())
 
 
 @pytest.mark.parametrize(
@@ -272,6 +299,12 @@ def test_evidence_of_older_versions_has_neither_certificates_nor_origin(station:
         {"certificates": "none"},
         {"certificates": [], "origin": "kind=usb\nname=x\n"},
         {"certificates": [], "origin": 1},
+        {"firmware": []},
+        {"firmware": ["x", "1.0.0+0", "0" * 64]},
+        {"firmware": ["x", "1.0.0", "0" * 64, 0]},
+        {"firmware": ["x", "1.0.0+0", "00", 0]},
+        {"firmware": ["x", "1.0.0+0", "0" * 64, 256]},
+        {"firmware": {"text": "x"}},
     ],
 )
 def test_certificates_and_origin_of_another_form_are_no_evidence(

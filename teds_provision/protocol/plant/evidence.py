@@ -35,6 +35,7 @@ from teds_provision.protocol.keys import (
     public_key,
     verify,
 )
+from teds_provision.protocol.messages.firmware import FirmwareReport, is_stated
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.origin import ORIGIN, origin_from_text
@@ -61,6 +62,10 @@ _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 _TIME: Final = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
 
 
+NO_IMAGE: Final = "0" * 64
+"""Of a board whose firmware names no image digest."""
+
+
 @dataclass(frozen=True)
 class BoardFacts:
     """The facts that a board signs beside its datasheet: maker, job, components, and each step.
@@ -69,7 +74,9 @@ class BoardFacts:
     ``unit`` are None outside a job, ``heads`` (first 16 digits, number of chains) if no registry was joined. ``steps``:
     name, result, milliseconds. Times are ``2026-01-31T12:00:00Z``. ``certificates`` are channel and SHA-256 of the
     calibration certificates that the datasheet names, ``origin`` is the text of its Origin TEDS; evidence of older
-    versions has neither, and ``certificates`` is None.
+    versions has neither, and ``certificates`` is None. ``firmware`` is what the board reported in the session of verify
+    (text, version with build, image digest or zeros in hex, flags), None if it reported none, () if the evidence is of
+    a version that did not state it.
     """
 
     station: str
@@ -89,10 +96,13 @@ class BoardFacts:
     heads: tuple[str, int] | None = None
     certificates: tuple[tuple[int, str], ...] | None = None
     origin: str | None = None
+    firmware: tuple[str, str, str, int] | tuple[()] | None = ()
 
     def to_json(self) -> dict[str, Any]:
         """Member ``facts`` of the predicate."""
         found = self._all_json()
+        if self.firmware == ():
+            del found["firmware"]
         if self.certificates is None:
             del found["certificates"], found["origin"]
             return found
@@ -100,7 +110,8 @@ class BoardFacts:
 
     def _all_json(self) -> dict[str, Any]:
         lists = {"blocks": [list(block) for block in self.blocks], "steps": [list(step) for step in self.steps]}
-        return {**vars(self), **lists, "heads": None if self.heads is None else list(self.heads)}
+        heads, firmware = self.heads and list(self.heads), self.firmware and list(self.firmware)
+        return {**vars(self), **lists, "heads": heads, "firmware": firmware}
 
     @property
     def failure(self) -> str | None:
@@ -425,6 +436,7 @@ def _facts(members: Members, raw: dict[str, Any]) -> BoardFacts:
         heads=None if heads is None else _heads(heads),
         certificates=_certificates(members),
         origin=_origin(members),
+        firmware=_firmware(raw),
     )
 
 
@@ -438,6 +450,25 @@ def _certificates(members: Members) -> tuple[tuple[int, str], ...] | None:
                 continue
         raise BadDataError("A certificate of the facts is not a channel and its SHA-256.")
     return tuple((channel, digest) for channel, digest in found)
+
+
+def _firmware(raw: Mapping[str, Any]) -> tuple[str, str, str, int] | tuple[()] | None:
+    if "firmware" not in raw:
+        return ()
+    match raw["firmware"]:
+        case None:
+            return None
+        case [str(text), str(version), str(image), int(flags)] if 0 <= flags <= 0xFF and is_stated(
+            [text, version, None if image == NO_IMAGE else image]
+        ):
+            return text, version, image, flags
+    raise BadDataError("The firmware of the facts is not text, version, image and flags.")
+
+
+def firmware_facts(report: FirmwareReport) -> tuple[str, str, str, int]:
+    """Return what the facts state of a board's firmware."""
+    text, version, image = report.stated
+    return text, version, image or NO_IMAGE, int(report.flags)
 
 
 def _origin(members: Members) -> str | None:
