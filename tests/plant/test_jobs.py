@@ -46,6 +46,7 @@ from teds_provision.teds.certificate import certificate_reference_of
 from teds_provision.teds.profile.load import files_digest, find_profile, shipped_profiles
 from tests.answers import Answers
 from tests.bench import PASSPHRASE, Board, MemoryLink, make_station, talk
+from tests.steps.test_firmware import GOOD, FirmwareBoard
 from tests.teds.certificates import ANGLE as CERTIFICATE
 
 from .owner import ALL, ANGLE, NOW, alone, job_of, join, member, roster_of
@@ -81,7 +82,7 @@ def units(line: LineRun) -> list[tuple[int, int, int]]:
 
 def test_each_board_gets_one_unit_and_leaves_evidence(owner: Station) -> None:
     line = line_of(owner, name="angle {unit:03} {uuid8}")
-    boards = [board(number) for number in range(3)]
+    boards = [board(0), board(1), FirmwareBoard(board(2).uuid)]
     for built_board in boards:
         assert build(line, built_board).verified.verdict == "authentic"
     assert units(line) == [(1, 1, 1), (2, 1, 1), (3, 1, 1)]
@@ -94,6 +95,7 @@ def test_each_board_gets_one_unit_and_leaves_evidence(owner: Station) -> None:
         found = codec.read(row.document)
         assert codec.faults(found, owner.identity.ca) == []
         assert [name for name, _, _ in found.facts.steps][-1] == "check"
+    assert [codec.read(row.document).facts.firmware for row in rows] == [None, None, codec.firmware_facts(GOOD)]
     known = owner.nodes.get(boards[1].uuid)
     assert known is not None
     assert known.name == "angle 002 8d4d9da6"
