@@ -258,6 +258,8 @@ def test_each_table_is_written_by_one_topic() -> None:
             continue
         for node in ast.walk(parsed(path)):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                unnamed = re.search(r"\b(?:INTO|UPDATE|DELETE FROM) $", node.value)  # of an f-string: any table
+                assert unnamed is None, f"{name_of(path)}:{node.lineno} names no table"
                 for table in re.findall(r"\b(?:INSERT(?: OR \w+)? INTO|UPDATE(?! SET)|DELETE FROM) (\w+)", node.value):
                     written.setdefault(table, set()).add(name_of(path))
     assert len(written) > 40

@@ -31,6 +31,10 @@ class Alarms:
     def __init__(self, store: Store) -> None:
         self._store = store
 
+    def forget_all(self) -> None:
+        """Remove every alarm."""
+        self._store.execute("DELETE FROM alarms")
+
     def all(self) -> list[Alarm]:
         """Return every alarm, oldest first."""
         return self._store.read(_alarm, f"SELECT {_ALARM} FROM alarms ORDER BY at, code, about, n")

@@ -81,8 +81,19 @@ class Claims:
         """Remove everything that was folded of a chain, to fold it again."""
         with self._store.together():
             self._store.execute("INSERT OR IGNORE INTO to_judge SELECT uuid FROM claims WHERE chain = ?", (chain,))
-            for table in ("claims", "event_ids", "digests", "statements"):
-                self._store.execute(f"DELETE FROM {table} WHERE chain = ?", (chain,))
+            self._store.execute("DELETE FROM claims WHERE chain = ?", (chain,))
+            self._store.execute("DELETE FROM event_ids WHERE chain = ?", (chain,))
+            self._store.execute("DELETE FROM digests WHERE chain = ?", (chain,))
+            self._store.execute("DELETE FROM statements WHERE chain = ?", (chain,))
+
+    def forget_all(self) -> None:
+        """Remove everything that was folded of any chain."""
+        self._store.execute("DELETE FROM event_ids")
+        self._store.execute("DELETE FROM claims")
+        self._store.execute("DELETE FROM digests")
+        self._store.execute("DELETE FROM statements")
+        self._store.execute("DELETE FROM conflicts")
+        self._store.execute("DELETE FROM to_judge")
 
     # -- digests of datasheets that were signed, or vouched for ------------------------------------------------------
 

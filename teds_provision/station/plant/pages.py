@@ -56,6 +56,12 @@ class Pages:
     def __init__(self, store: Store) -> None:
         self._store = store
 
+    def forget_all(self) -> None:
+        """Remove the chains of all stations, which nothing may refer to any more."""
+        self._store.execute("DELETE FROM heads")
+        self._store.execute("DELETE FROM pages")
+        self._store.execute("DELETE FROM chains")
+
     def chains(self) -> dict[str, Chain]:
         """Return every chain, by the fingerprint of its station."""
         return {chain.station: chain for chain in self._store.recall(_chain, f"SELECT {_CHAIN} FROM chains")}

@@ -42,6 +42,11 @@ class Parcels:
     def __init__(self, store: Store) -> None:
         self._store = store
 
+    def forget_all(self) -> None:
+        """Remove every parcel, and for whom copies were made."""
+        self._store.execute("DELETE FROM parcels")
+        self._store.execute("DELETE FROM shared")
+
     def all(self, direction: Direction, *states: ParcelState) -> list[ParcelRow]:
         """Return parcels without their documents, oldest first."""
         return self._store.read(

@@ -147,11 +147,13 @@ class Plant:
     def forget(self) -> None:
         """Take away everything of a registry: this station joins another one. Jobs, units and evidence stay."""
         with self._store.together():
-            for table in (
-                "plant", "rosters", "alarms", "outbox", "heads", "event_ids", "claims", "digests", "statements",
-                "conflicts", "to_judge", "pages", "chains", "parcels", "shared",
-            ):  # fmt: skip
-                self._store.execute(f"DELETE FROM {table}")
+            self.alarms.forget_all()
+            self.claims.forget_all()
+            self.pages.forget_all()
+            self.parcels.forget_all()
+            self._store.execute("DELETE FROM plant")
+            self._store.execute("DELETE FROM rosters")
+            self._store.execute("DELETE FROM outbox")
             self._store.execute("DELETE FROM meta WHERE name IN ('plant-returned', 'plant-seen-heads', 'plant-acts')")
 
     def join(self, registry: str, url: str | None) -> None:
