@@ -203,9 +203,10 @@ words: $(VENV)/.dev
 room: $(VENV)/.dev
 	$(BIN)/python -m pytest -n 2 --dist worksteal --hypothesis-profile gate -m '$(USUAL)' $$($(BIN)/python scripts/room.py $(ROOM))
 
-# The model of a key's life, by SPIN: the rules hold, each broken one is found.
-model: $(VENV)/.made
+# The models, by SPIN: the rules hold, each broken one is found. Then ten minutes of a key's life are replayed with the code.
+model: $(VENV)/.dev
 	$(BIN)/python model/check.py
+	$(BIN)/python -m tests.model.run
 
 # Stamps, not the files that are made: what was cut short is made anew.
 $(VENV)/.made:

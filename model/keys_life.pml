@@ -289,11 +289,12 @@ inline select_receiver(s) {
 	AIM(b)
 }
 
-/* No epoch goes back; and after a move only the station that the node went to may hand it back. */
+/* No epoch goes back, nor behind that of a key that is still pending here; and after a move only the station that the node went to may hand it back. */
 #ifdef BREAK_IMPORT_OLDER
 #define NOT_OLDER(s, n) true
 #else
-#define NOT_OLDER(s, n) (st[s].present_key == 0 || epoch_of[bundle[n].key] >= epoch_of[st[s].present_key])
+#define NOT_BEFORE(s, n, k) (k >= KEYS || !HOLDS(s, k) || epoch_of[bundle[n].key] >= epoch_of[(k < KEYS -> k : 0)])
+#define NOT_OLDER(s, n) (NOT_BEFORE(s, n, 1) && NOT_BEFORE(s, n, 2) && NOT_BEFORE(s, n, 3) && NOT_BEFORE(s, n, 4))
 #endif
 #define HANDED_BACK(s, n) (bundle[n].move && bundle[n].sender == bundle[st[s].tombstone].receiver)
 #ifdef BREAK_LIFTED

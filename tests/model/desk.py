@@ -1,0 +1,531 @@
+"""The model's steps on a desk: three real stations that one CA certified, and one real node.
+
+An agreement waits in a thread of its own wherever the model may have something else happen: before the key is stored,
+before Confirm leaves, and for its reply. A Confirm is kept and comes to the node when the model says so.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from datetime import timedelta
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any, Final, cast
+from unittest.mock import patch
+
+import pytest
+
+from teds_provision.backup.backup import backup
+from teds_provision.backup.restore import rebuild
+from teds_provision.backup.sealed_file import SealedFile
+from teds_provision.errors import TedsProvisionError
+from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
+from teds_provision.handover.outgoing import ExportOrder, ExportPlan, _announced, export_bundle, plan_export
+from teds_provision.handover.pending import close, undo
+from teds_provision.links import LINKS, Capabilities, Contact
+from teds_provision.protocol.handover.bundle import Mode
+from teds_provision.protocol.keys import fingerprint
+from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
+from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.protocol.wire_agreement import key_id
+from teds_provision.station import node_keys
+from teds_provision.station.station import Station
+from teds_provision.station.store import TrustRecord, WhitelistEntry
+from teds_provision.steps.agree import _agree_anew, agree, open_session, reset_node
+from teds_provision.steps.identify import identify
+from teds_provision.steps.teds_read import read_block
+from teds_provision.talk.conversation import Conversation
+from teds_provision.teds.image import SECURITY
+from teds_provision.vault import forget_vaults
+from teds_provision.vault.passphrase import THROWAWAY
+from tests.bench import PASSPHRASE, Board, make_station
+from tests.model.traces import NONE, Kind, State, Step, Trace
+from tests.pace import PATIENCE
+
+NAMES: Final = ("north", "south", "west")
+
+
+class CutError(BaseException):
+    """The station's power went: nothing catches it."""
+
+
+class SameHandoverError(Exception):
+    """The model has two copies where the code has one: the same keys to the same station are the same handover."""
+
+
+@dataclass
+class Link:
+    """The way from one station to the node; ``before`` sees each frame first and may raise CutError."""
+
+    board: Board
+    name: str
+    before: Callable[[bytes], None] = lambda frame: None
+    after: Callable[[bytes], None] = lambda frame: None
+    via: str = "nfc"
+
+    def exchange(self, frame: bytes) -> bytes:
+        self.before(frame)
+        reply = self.board.tim.handle(frame, link=self.name, tapped=True)
+        self.after(frame)
+        return reply
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return LINKS[self.via].capabilities
+
+    def close(self) -> None:
+        """A station that goes leaves the node as it is: a Confirm may still be on its way."""
+
+
+class _Stepwise:
+    """A station whose durable steps wait for their turn."""
+
+    def __init__(self, station: Station, pause: Callable[[str], None]) -> None:
+        self._station, self._pause = station, pause
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._station, name)
+
+    @contextmanager
+    def durable(self, command: str, *, more_follows: bool = False) -> Iterator[None]:
+        self._pause("store")
+        with self._station.durable(command, more_follows=more_follows):
+            yield
+
+
+class Agreement:
+    """One agreement, stopped at each point where the model has a step."""
+
+    def __init__(self, desk: Desk, station: int, *, reply_lost: bool) -> None:
+        self.desk, self.station, self.reply_lost = desk, station, reply_lost
+        self.at = ""
+        self.number = 0
+        self._go: SimpleQueue[bool] = SimpleQueue()
+        self._stopped: SimpleQueue[str] = SimpleQueue()
+        self._failure: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+        self._wait()
+
+    def go(self) -> None:
+        """Take the next step, to the next point."""
+        self._go.put(True)
+        self._wait()
+
+    def cut(self) -> None:
+        """End it where it is."""
+        if self.at != "ended":
+            self._go.put(False)
+            self._wait()
+        self._thread.join(PATIENCE)
+
+    def _wait(self) -> None:
+        self.at = self._stopped.get(timeout=PATIENCE)
+        if self._failure is not None:
+            raise self._failure
+
+    def _pause(self, where: str) -> None:
+        self._stopped.put(where)
+        if not self._go.get(timeout=PATIENCE):
+            raise CutError
+
+    def _run(self) -> None:
+        desk, station = self.desk, self.desk.stations[self.station]
+        try:
+            with desk.talk(self.station, Link(desk.board, NAMES[self.station], self._before, self._after)) as node:
+                entry = station.pins.entry(node.uuid)
+                assert entry is not None
+                stepwise = cast("Station", _Stepwise(station, self._pause))
+                _agree_anew(stepwise, node, entry, desk.ca, read_block(node, SECURITY))
+        except CutError:
+            pass
+        except BaseException as failure:  # noqa: BLE001  raised by the test
+            self._failure = failure
+        self._stopped.put("ended")
+
+    def _before(self, frame: bytes) -> None:
+        if not _is(frame, Function.CONFIRM):
+            return
+        self._pause("send")
+        self.desk.confirms[self.number] = NAMES[self.station], frame
+        self._pause("reply")
+        raise CutError  # it comes or not: an Open shows it
+
+    def _after(self, frame: bytes) -> None:
+        if not _is(frame, Function.REQUEST):
+            return
+        self.number = self.desk.note_request()
+        if self.reply_lost:
+            raise CutError
+
+
+def _is(frame: bytes, function: Function) -> bool:
+    """Return True if a frame is this command outside a session."""
+    return frame[2:4] == security_command(function).encode()[2:4]
+
+
+@dataclass
+class _Bundle:
+    """A bundle that left: its plan, then its octets, then its receipt."""
+
+    sender: int
+    receiver: int
+    mode: Mode
+    id: str
+    octets: bytes = b""
+    receipt: bytes = b""
+
+
+@dataclass
+class Desk:
+    """Three stations and a node, and what of the model's numbers is what here."""
+
+    folder: Path
+    stations: list[Station] = field(default_factory=list)
+    board: Board = field(default_factory=Board)
+    ca: bytes = b""
+    agreements: dict[int, Agreement] = field(default_factory=dict)
+    confirms: dict[int, tuple[str, bytes]] = field(default_factory=dict)
+    numbers: dict[str, int] = field(default_factory=dict)
+    bundles: list[_Bundle] = field(default_factory=list)
+    made: int = 0
+    saved: Path | None = None
+    saved_of: int = -1
+
+    @classmethod
+    def make(cls, folder: Path) -> Desk:
+        """Three stations under the CA of the first; each trusts the others and has the node's key pinned."""
+        desk = cls(folder)
+        desk.stations = [make_station(folder / name, name) for name in NAMES]
+        desk.ca = desk.stations[0].ca
+        for station in desk.stations:
+            for other in desk.stations:
+                station.identity.keep_certificate(desk.ca, other.point, desk.stations[0].identity.certify(other.point))
+                if other is not station:
+                    station.policy.trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
+            station.pins.put(WhitelistEntry(desk.board.uuid, fingerprint(desk.board.key.point), assurance="tap"))
+            station.nodes.remember(desk.board.uuid, point=desk.board.key.point)
+        return desk
+
+    def copy(self, folder: Path) -> Desk:
+        """Return the same desk in another folder: as long as nothing has happened on it."""
+        for name in NAMES:
+            shutil.copytree(self.folder / name, folder / name)
+        desk = Desk(folder, [Station.open(folder / name, ask=_ask) for name in NAMES], ca=self.ca)
+        desk.board = Board(key=self.board.key)
+        return desk
+
+    def leave(self) -> None:
+        """End every agreement and close the stations."""
+        for agreement in self.agreements.values():
+            agreement.cut()
+        for station in self.stations:
+            station.close()
+
+    # -- the model's steps -----------------------------------------------------------------------------------------
+
+    def take(self, step: Step) -> None:
+        """Take one step; raises TedsProvisionError, or AssertionError, if the code refuses it."""
+        _STEPS[step.kind](self, step)
+
+    def refuse(self, step: Step, state: State) -> bool:
+        """Try a step that the model does not permit in this state; return False for one that there is no way to try.
+
+        Raises AssertionError if the code takes it.
+        """
+        refusal = _REFUSALS.get(step.kind)
+        running = self.agreements.get(step.station)
+        if refusal is None or (running is not None and running.at != "ended"):
+            return False
+        return refusal(self, step, state)
+
+    def _refuse_request(self, step: Step, state: State) -> bool:
+        station = self.stations[step.station]
+        with self.talk(step.station) as node, pytest.raises(TedsProvisionError):
+            agree(station, node, identify(station, node), rotate=True)
+        return True
+
+    def _refuse_open(self, step: Step, state: State) -> bool:
+        assert self._opens(step.station) == (step.station in state.opens)
+        return True
+
+    def _refuse_export(self, step: Step, state: State) -> bool:
+        with pytest.raises(TedsProvisionError):
+            self._plan(step, "move" if step.kind == Kind.MOVE else "copy")
+        return True
+
+    def _refuse_import(self, step: Step, state: State) -> bool:
+        if step.aim >= len(self.bundles) or not self.bundles[step.aim].octets:
+            return False
+        assert not self._takes(step.station, self.bundles[step.aim])
+        return True
+
+    def _refuse_receipt(self, step: Step, state: State) -> bool:
+        if step.aim >= len(self.bundles) or not self.bundles[step.aim].receipt:
+            return False
+        with suppress(TedsProvisionError):
+            assert not close(self.stations[step.station], self.bundles[step.aim].receipt).fresh
+        return True
+
+    def _refuse_undo(self, step: Step, state: State) -> bool:
+        tombstone = self.stations[step.station].policy.tombstone(self.board.uuid)
+        if tombstone is None:
+            return False
+        with pytest.raises(TedsProvisionError):
+            self.take_back(step)
+        return True
+
+    def _refuse_proof(self, step: Step, state: State) -> bool:
+        station = self.stations[step.station]
+        with self.talk(step.station) as node, pytest.raises(TedsProvisionError):
+            reset_node(station, node, replace(identify(station, node), state=NodeState.FACTORY))
+        return True
+
+    def request(self, step: Step) -> None:
+        self.agreements[step.station] = Agreement(self, step.station, reply_lost=not step.aim)
+
+    def go_on(self, step: Step) -> None:
+        agreement = self.agreements.get(step.station)
+        assert agreement is not None
+        assert agreement.at == {Kind.STORE: "store", Kind.SEND_CONFIRM: "send"}[step.kind]
+        agreement.go()
+
+    def cut(self, step: Step) -> None:
+        agreement = self.agreements.pop(step.station, None)
+        if agreement is not None:
+            agreement.cut()
+
+    def confirm(self, step: Step) -> None:
+        link, frame = self.confirms[self.pending()]
+        assert decode_reply(self.board.tim.handle(frame, link=link, tapped=True)).ok
+
+    def lose_ram(self, step: Step) -> None:
+        for name in NAMES:
+            self.board.tim.link_lost(name)
+
+    def reset(self, step: Step) -> None:
+        self.board.tim.reset_by_hand()
+
+    def prove_reset(self, step: Step) -> None:
+        station = self.stations[step.station]
+        with self.talk(step.station) as node:
+            reset_node(station, node, identify(station, node))
+
+    def open(self, step: Step) -> None:
+        with self.talk(step.station) as node:
+            assert open_session(self.stations[step.station], node, word=True) is not None
+
+    def forget(self, step: Step) -> None:
+        """Open a session long after the Request whose key is still pending here."""
+        if self.pending() in self.held(step.station):
+            self.lose_ram(step)
+        with patch.object(node_keys, "CONFIRM_MAY_ARRIVE", timedelta(minutes=-1)):
+            self.open(step)
+
+    def move(self, step: Step) -> None:
+        """Have the move durable; its file comes with the next step."""
+        station, plan = self.stations[step.station], self._plan(step, "move")
+        with station.transaction():
+            _announced(station, plan, plan.id)
+        self.bundles.append(_Bundle(step.station, step.aim, "move", plan.id))
+
+    def make_file(self, step: Step) -> None:
+        """Run the same move again, which makes its file."""
+        station = self.stations[step.station]
+        bundle = next(made for made in reversed(self.bundles) if made.sender == step.station and made.mode == "move")
+        if not bundle.octets:
+            plan = self._plan(Step(Kind.MOVE, bundle.sender, bundle.receiver), "move")
+            assert plan.id == bundle.id
+            bundle.octets = self._sealed(station, plan)
+
+    def copy_key(self, step: Step) -> None:
+        plan = self._plan(step, "copy")
+        made = _Bundle(step.station, step.aim, "copy", plan.id, self._sealed(self.stations[step.station], plan))
+        self.bundles.append(made)
+
+    def take_back(self, step: Step) -> None:
+        station = self.stations[step.station]
+        tombstone = station.policy.tombstone(self.board.uuid)
+        assert tombstone is not None
+        row = station.handovers.get(tombstone.handover_id, "out")
+        assert row is not None
+        undo(station, row)
+
+    def bring_in(self, step: Step) -> None:
+        station, bundle = self.stations[step.station], self.bundles[step.aim]
+        plan = plan_import(station, bundle.octets)
+        if not isinstance(plan, ImportPlan) and self._is_double(bundle):
+            raise SameHandoverError
+        assert isinstance(plan, ImportPlan), "it was taken in before"
+        bundle.receipt = import_bundle(station, plan).receipt
+
+    def take_receipt(self, step: Step) -> None:
+        station, bundle = self.stations[step.station], self.bundles[step.aim]
+        row = station.handovers.get(bundle.id, "out")
+        assert row is not None
+        if row.state != "undone":  # then it is refused, and changes nothing
+            close(station, bundle.receipt)
+
+    def save(self, step: Step) -> None:
+        self.saved, self.saved_of = self.folder / "backup", step.station
+        backup(self.stations[step.station], self.saved, _ask, costs=THROWAWAY)
+
+    def restore(self, step: Step) -> None:
+        self.cut(step)
+        assert self.saved is not None
+        assert self.saved_of == step.station
+        self.stations[step.station].close()
+        forget_vaults()
+        home = self.folder / f"{NAMES[step.station]} again"
+        with SealedFile(self.saved).open_with_passphrase(PASSPHRASE) as content:
+            rebuild(home, content, _ask, costs=THROWAWAY)
+        self.stations[step.station] = Station.open(home, ask=_ask)
+
+    # -- what is there ---------------------------------------------------------------------------------------------
+
+    def compare(self, state: State, *, thorough: bool = False) -> None:
+        """Compare the desk with the model's state; ``thorough``: also what would succeed now, which spends the desk."""
+        assert (self._number_of(self.board.state.key), self.board.state.epoch) == (state.node, state.epoch), "the node"
+        assert self.pending() == state.ram, "the agreement in the node's RAM"
+        for number, (station, said) in enumerate(zip(self.stations, state.stations, strict=True)):
+            keys = station.keys.keys_of(self.board.uuid)
+            where = f"station {number}"
+            assert self.held(number) == said.held, f"{where}: the keys that it holds"
+            present = next((self.numbers[key.key_id] for key in keys if key.state == "active"), 0)
+            assert present == (said.present if said.present in said.held else 0), f"{where}: its active key"
+            tombstone = station.policy.tombstone(self.board.uuid)
+            gone = next(
+                (n for n, made in enumerate(self.bundles) if tombstone and made.id == tombstone.handover_id), NONE
+            )
+            assert gone == said.tombstone, f"{where}: the move by which it gave the node away"
+            assert (station.keys.rotation_due(self.board.uuid) is not None) == said.due, f"{where}: a rotation is due"
+            assert station.keys.holders(self.board.uuid) or not said.shared, f"{where}: who else has the key"
+        if thorough:
+            self._try_imports(state)
+            self._try_sessions(state)
+
+    def _try_imports(self, state: State) -> None:
+        for n, bundle in enumerate(self.bundles):
+            for s, said in enumerate(state.stations):
+                if bundle.octets and said.idle and not self._is_double(bundle):
+                    assert self._takes(s, bundle) == ((s, n) in state.takes), f"station {s} takes bundle {n} in"
+
+    def _try_sessions(self, state: State) -> None:
+        for s, said in enumerate(state.stations):
+            if said.idle:
+                assert self._opens(s) == (s in state.opens), f"station {s} opens a session"
+
+    def _is_double(self, bundle: _Bundle) -> bool:
+        return sum(other.id == bundle.id for other in self.bundles) > 1
+
+    def _takes(self, station: int, bundle: _Bundle) -> bool:
+        try:
+            return isinstance(plan_import(self.stations[station], bundle.octets), ImportPlan)
+        except TedsProvisionError:
+            return False
+
+    def _opens(self, station: int) -> bool:
+        try:
+            with self.talk(station) as node:
+                return open_session(self.stations[station], node, word=True) is not None
+        except TedsProvisionError:
+            return False
+
+    def held(self, station: int) -> frozenset[int]:
+        """The model's numbers of the keys that a station holds."""
+        return frozenset(self.numbers[key.key_id] for key in self.stations[station].keys.keys_of(self.board.uuid))
+
+    def pending(self) -> int:
+        """The model's number of the key that the node has in RAM, 0 for none."""
+        pending = self.board.tim._agreeing._pending
+        return 0 if pending is None else self._number_of(pending.agreement.key)
+
+    def note_request(self) -> int:
+        """Give the key of the Request that the node has just answered the model's next number."""
+        pending = self.board.tim._agreeing._pending
+        assert pending is not None
+        self.made += 1
+        self.numbers[key_id(pending.agreement.key).hex()] = self.made
+        return self.made
+
+    def _number_of(self, key: bytes | None) -> int:
+        return 0 if key is None else self.numbers[key_id(key).hex()]
+
+    def talk(self, station: int, link: Link | None = None) -> Conversation:
+        """A conversation of a station with the node, at the reader."""
+        identity = Identity.decode(self.board.tim.identity().encode())
+        contact = Contact(identity, link or Link(self.board, NAMES[station]), tag_uid=bytes(7))
+        return Conversation(contact, notice=lambda notice: None)
+
+    def _plan(self, step: Step, mode: Mode) -> ExportPlan:
+        order = ExportOrder((NAMES[step.aim],), (self.board.uuid,), mode)
+        return plan_export(self.stations[step.station], order)
+
+    def _sealed(self, station: Station, plan: ExportPlan) -> bytes:
+        path = self.folder / f"bundle {len(list(self.folder.glob('bundle *')))}"
+        export_bundle(station, plan, path)
+        return path.read_bytes()
+
+
+def _ask(prompt: str, confirm: bool) -> str:
+    return PASSPHRASE
+
+
+_STEPS: Final[dict[Kind, Callable[[Desk, Step], None]]] = {
+    Kind.CUT: Desk.cut,
+    Kind.REQUEST: Desk.request,
+    Kind.STORE: Desk.go_on,
+    Kind.SEND_CONFIRM: Desk.go_on,
+    Kind.END_CONFIRM: Desk.cut,
+    Kind.OPEN: Desk.open,
+    Kind.FORGET: Desk.forget,
+    Kind.MOVE: Desk.move,
+    Kind.FILE: Desk.make_file,
+    Kind.FILE_AGAIN: Desk.make_file,
+    Kind.UNDO: Desk.take_back,
+    Kind.COPY: Desk.copy_key,
+    Kind.IMPORT: Desk.bring_in,
+    Kind.RECEIPT: Desk.take_receipt,
+    Kind.BACKUP: Desk.save,
+    Kind.RESTORE: Desk.restore,
+    Kind.RESET: Desk.reset,
+    Kind.PROOF: Desk.prove_reset,
+    Kind.CONFIRM: Desk.confirm,
+    Kind.LOST_RAM: Desk.lose_ram,
+}
+_REFUSALS: Final[dict[Kind, Callable[[Desk, Step, State], bool]]] = {
+    Kind.REQUEST: Desk._refuse_request,
+    Kind.OPEN: Desk._refuse_open,
+    Kind.MOVE: Desk._refuse_export,
+    Kind.COPY: Desk._refuse_export,
+    Kind.IMPORT: Desk._refuse_import,
+    Kind.RECEIPT: Desk._refuse_receipt,
+    Kind.UNDO: Desk._refuse_undo,
+    Kind.PROOF: Desk._refuse_proof,
+}
+
+
+def replay(desk: Desk, trace: Trace, script: Sequence[Step] = ()) -> tuple[int, int]:
+    """Take every step of a trace, comparing after each; return how many were taken, and how many refusals were tried.
+
+    ``script`` has the steps that the trace was made from, if the model refused some of them (None in the trace).
+    """
+    taken = tried = 0
+    for at, (step, state) in enumerate(zip(trace.steps, trace.states, strict=True)):
+        try:
+            if step is None:
+                tried += desk.refuse(script[at], state)
+            else:
+                desk.take(step)
+                taken += 1
+            desk.compare(state, thorough=at == len(trace.steps) - 1)
+        except SameHandoverError:
+            break
+        except (AssertionError, TedsProvisionError) as difference:
+            way = ", ".join(str(step or f"(refused: {script[n]})") for n, step in enumerate(trace.steps[: at + 1]))
+            raise AssertionError(f"{way}\nThe model: {state}\n{difference}") from difference
+    return taken, tried
