@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
@@ -325,8 +325,15 @@ def _borne(node: Conversation, image: Image, shown: Mapping[int, str] | None) ->
     except (NodeRefusedError, BadDataError) as error:  # busy, a fault: the datasheet stands, and a person is told
         return HardwareCheck(found, warnings=(f"No reading was taken: {error.message}",))
     bad = [str(entry["channel"]) for entry in samples if not entry["valid"]]
-    warnings = (f"The reading of channel {', '.join(bad)} is invalid.",) if bad else ()
+    warnings = (invalid_readings(bad),) if bad else ()
     return HardwareCheck(found, samples, warnings)
+
+
+def invalid_readings(channels: Sequence[str]) -> str:
+    """Return the warning about channels whose reading was invalid."""
+    if len(channels) == 1:
+        return f"The reading of channel {channels[0]} is invalid."
+    return f"The readings of channels {', '.join(channels)} are invalid."
 
 
 def _bears(node: Conversation, channel: Channel, digest: bytes) -> bool | None:

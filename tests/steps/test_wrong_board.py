@@ -17,6 +17,7 @@ from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.operation.commands import OPERATION, ChannelState, OperationReply
 from teds_provision.station.station import Station
+from teds_provision.steps import board_type
 from teds_provision.steps.agree import require_session, reset_node
 from teds_provision.steps.batch import BatchRun, ProvisionRequest
 from teds_provision.steps.board_type import WrongBoardError, check_hardware, differences, operate
@@ -267,3 +268,8 @@ def test_a_row_of_a_sheet_waits_for_its_own_board(station: Station, angle: Virtu
     boards._note(right)
     assert (right.row, right.result) == (1, "passed")
     assert boards.totals().passed == 1
+
+
+def test_channels_without_a_valid_reading_are_counted_in_the_warning() -> None:
+    assert board_type.invalid_readings(["2"]) == "The reading of channel 2 is invalid."
+    assert board_type.invalid_readings(["2", "3"]) == "The readings of channels 2, 3 are invalid."
