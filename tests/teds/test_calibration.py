@@ -339,6 +339,14 @@ def test_one_file_may_hold_many_channels(tactile: Profile) -> None:
     assert len(shared) == 12
 
 
+def test_a_channel_that_the_type_has_not_is_answered_with_those_that_it_has(
+    magnetic: Profile, tactile: Profile
+) -> None:
+    for profile, has in ((magnetic, "has channel 1, not 40"), (tactile, "has channels 1 to 12, not 40")):
+        with pytest.raises(BadDataError, match=has):
+            read_calibrations("# channel: 40\n0,0\n65535,10\n", "x.csv", profile)
+
+
 def test_the_residual_of_a_fit_becomes_its_uncertainty_where_it_is_greater(tactile: Profile) -> None:
     text = "# channel: 1\n# method: linear\n# uncertainty: 0.01\n0,0\n1,1\n2,0\n"
     assert read_calibrations(text, "x.csv", tactile)[1].uncertainty == pytest.approx(2 / 3)

@@ -353,8 +353,7 @@ def _certified_channel(file: str, profile: Profile, number: int | None) -> Chann
         )
     channel = profile.channel(number)
     if channel is None:
-        many = len(profile.channels)
-        raise BadDataError(f"{profile.name} has {'channel 1' if many == 1 else f'channels 1 to {many}'}, not {number}.")
+        raise BadDataError(f"{profile.name} has {_numbers_of(profile)}, not {number}.")
     return channel
 
 
@@ -483,5 +482,10 @@ def _channels(order: CalibrationOrder, profile: Profile) -> list[ChannelProfile]
     low, high = int(match[1]), int(match[2] or match[1])
     found = [channel for channel in profile.channels if low <= channel.number <= high]
     if len(found) != high - low + 1:
-        raise order.wrong("channel", f"{profile.name} has the channels 1 to {len(profile.channels)}, not {value}.")
+        raise order.wrong("channel", f"{profile.name} has {_numbers_of(profile)}, not {value}.")
     return found
+
+
+def _numbers_of(profile: Profile) -> str:
+    many = len(profile.channels)
+    return "channel 1" if many == 1 else f"channels 1 to {many}"
