@@ -103,6 +103,8 @@ def test_the_c_library_has_a_header_for_each_source_and_no_more_circles(house: M
     ring = {name for group in house.circles(found) for name in group}
     assert len(ring) <= 11
     assert not ring & {"octets", "clock", "ndef", "isotp", "security_teds", "t4t"}
+    low = {"octets", "clock", "ndef", "isotp", "security_teds", "about", "manage"}
+    assert {name: found[name] - low for name in low if found[name] - low} == {}, "the lower ones know no upper one"
     assert house.c_shared_names() == [], "a backtrace tells which file it was"
 
 
