@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,14 +14,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.backup.chunks import CHUNK_OCTETS, ChunkReader, ChunkWriter
-from teds_provision.backup.sealed_file import SealedFile
+from teds_provision.backup.content import BackupHead
+from teds_provision.backup.sealed_file import SealedFile, Sealer, write
 from teds_provision.errors import BadDataError, NotAuthenticError, StoreError
 from teds_provision.station.station import Station
 from teds_provision.station.store import Draft
 from teds_provision.station.store import dump as rows
 from teds_provision.station.store.schema import SCHEMA_VERSION
 from teds_provision.teds.image import Image
+from teds_provision.vault.passphrase import THROWAWAY
 from tests.backup.backups import back_up, opened, opened_octets
+from tests.bench import PASSPHRASE
 
 
 def test_a_store_of_several_chunks_goes_out_and_comes_back(station: Station, tmp_path: Path) -> None:
@@ -165,3 +169,30 @@ def test_no_octets_make_a_dump_raise_anything_foreign(octets: bytes) -> None:
 def test_a_newer_schema_is_not_guessed_at() -> None:
     with pytest.raises(StoreError, match="knows up to"):
         rows.load(Octets(head({}, SCHEMA_VERSION + 1) + b"\xff\0\0\0\0"))
+
+
+class _OtherTime(BackupHead):
+    """A head that is not the one in the clear."""
+
+    def line(self, form: str) -> bytes:
+        return replace(BackupHead(**vars(self)), created="2030-01-01T00:00:00Z").line(form)
+
+
+def test_the_head_in_the_clear_is_that_of_the_content(station: Station, tmp_path: Path) -> None:
+    head = _OtherTime(station.id, station.point, "north", "2026-01-01T00:00:00Z", "file", "")
+    sealer = Sealer(passphrase=PASSPHRASE, costs=THROWAWAY)
+    with (tmp_path / "b").open("wb") as file:
+        key = write(file, head, (), station.vault.identity(), sealer)
+    with pytest.raises(NotAuthenticError, match="different station"):
+        SealedFile(tmp_path / "b").open_with_content_key(key)
+
+
+def test_nothing_follows_the_end_in_the_last_chunk_either() -> None:
+    out = io.BytesIO()
+    chunks = ChunkWriter(out, bytes(32), b"context")
+    chunks.write(b"the end, and more")
+    chunks.end()
+    reader = ChunkReader(io.BytesIO(out.getvalue()), bytes(32), b"context")
+    assert reader.read(7) == b"the end"
+    with pytest.raises(BadDataError, match="data after its end"):
+        reader.require_end()

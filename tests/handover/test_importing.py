@@ -167,3 +167,11 @@ def test_a_station_that_lost_the_node_to_a_rotation_does_not_agree_anew(pair: Pa
     with talk(pair.board) as node, pytest.raises((PolicyError, NodeRefusedError), match="knows none"):
         agree(pair.south, node, identify(pair.south, node))
     assert pair.board.state.epoch == 2
+
+
+def test_a_ninth_key_that_waits_for_its_proof_is_not_taken_in(pair: Pair) -> None:
+    path, _ = pair.export("copy")
+    for number in range(8):
+        pair.south.keys.add_pending(pair.board.uuid, key=bytes(16), key_id=bytes([number] * 8), epoch=1)
+    with pytest.raises(PolicyError, match="8 of its keys are already waiting for proof here"):
+        pair.take(path)

@@ -316,6 +316,41 @@ PATTERNS = (
         "len(blocks_of(shown)) != len(facts.blocks)",
         "tests/plant/test_evidence.py",
     ),
+    Pattern(
+        "a backup's head in the clear is that of its content",
+        "_content",
+        "(head.store, head.station, head.created) != (clear['store'], clear['station'], clear['created'])",
+        "False",
+        "tests/backup/test_backup_rows.py",
+    ),
+    Pattern(
+        "nothing follows a backup's end",
+        "ChunkReader.require_end",
+        "self._place != len(self._plain) or self._next()",
+        "self._next()",
+        "tests/backup/test_backup_rows.py",
+    ),
+    Pattern(
+        "eight keys at most wait for their proof",
+        "_Judge._stale_key",
+        "sum((state == 'pending' for state, _ in held.values())) >= MAX_PENDING",
+        "False",
+        "tests/handover/test_importing.py",
+    ),
+    Pattern(
+        "a clock before the roster is that of the roster",
+        "now_of",
+        "max(datetime.now(UTC), roster.created)",
+        "datetime.now(UTC)",
+        "tests/plant/test_jobs.py",
+    ),
+    Pattern(
+        "a folder keeps both pages of a fork",
+        "FolderTransport._put",
+        "there is not None and hash_of(there.strip()) == hash",
+        "there is not None",
+        "tests/plant/test_sync_files.py",
+    ),
     # measuring and the service
     Pattern(
         "a node that was moved is measured no more",

@@ -7,9 +7,9 @@ import json
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from datetime import datetime, timedelta, tzinfo
+from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -35,6 +35,7 @@ from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.job import CalibrationRule, Job, open_job, require_pattern, seal_job
+from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.plant.parcels import ParcelRow
 from teds_provision.station.station import Station
 from teds_provision.steps.board_type import WrongBoardError
@@ -516,3 +517,12 @@ def test_a_job_is_sent_to_those_that_it_is_for(tmp_path: Path) -> None:
     assert find_job(west, job.id[:8]).hash == job.hash
     assert list(FolderTransport(plant.stick).parcels(west.fingerprint)) == []
     plant.close()
+
+
+def test_a_clock_before_the_roster_counts_as_the_time_of_the_roster() -> None:
+    """A clock that was put back opens no job again."""
+
+    class _Roster:
+        created = datetime(2999, 1, 1, tzinfo=UTC)
+
+    assert jobs.now_of(cast("Roster", _Roster())) == _Roster.created

@@ -315,3 +315,11 @@ def test_syncs_at_once_in_one_home_write_every_event_once(plants: Plant) -> None
     assert alarms(plants.north) == []
     for station in homes:
         station.close()
+
+
+def test_a_page_of_another_history_lies_beside_the_first_one(tmp_path: Path) -> None:
+    """Two pages of one number are a fork, which readers have to see."""
+    folder, station = FolderTransport(tmp_path), "ab" * 32
+    for octets in (b"h.one.s", b"h.another.s", b"h.another.s"):
+        folder.append(station, 1, "", hash_of(octets), octets)
+    assert sorted(page.octets for page in folder.pages(station, 0)) == [b"h.another.s", b"h.one.s"]
