@@ -154,7 +154,7 @@ def verified(service: Service, uuid: str) -> dict[str, Any]:
         return dict(
             until(
                 lambda: next((n for n in asked.nodes() if n["uuid"] == uuid and n["verified"] and n["present"]), None),
-                uuid,
+                lambda: [n for n in asked.nodes() if n["uuid"] == uuid] or f"{uuid} is not known",
             )
         )
 
