@@ -38,5 +38,5 @@ def test_outdated_firmware_is_not_measured_until_it_is_updated(desk: Desk, tmp_p
     updated = station.run("--json", "update", node.uuid, new, "--yes", *over)
     assert updated.code == 0, updated
     until(lambda: ask.node(node.uuid)["measurement"], lambda: ask.node(node.uuid))
-    assert ask.node(node.uuid)["firmware"]["state"] == "good"
+    until(lambda: ask.node(node.uuid)["firmware"]["state"] == "good", lambda: ask.node(node.uuid)["firmware"])
     service.end()
