@@ -161,6 +161,7 @@ def recorded(file: Path) -> list[float]:
     return [datetime.fromisoformat(row[0]).timestamp() if "T" in row[0] else float(row[0]) for row in rows]
 
 
+@pytest.mark.realtime
 def test_kill_loses_a_fifth_of_a_second_at_most_and_a_start_carries_on(lab: Lab) -> None:
     lab.service.start()
     measurement = lab.measure(sinks=["cut.csv"])
