@@ -17,8 +17,8 @@ import os
 import selectors
 import socket
 import ssl
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Unpack
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         Sheet,
         SheetPlan,
         Status,
+        Update,
     )
     from teds_provision.api.bodies import Mode
     from teds_provision.shapes.measurement import MeasurementMembers
@@ -144,8 +145,12 @@ class Client:
     # -- requests ----------------------------------------------------------------------------------------------------
 
     def request(self, method: str, path: str, body: Any = None, *, if_match: str | None = None) -> Any:
-        """Send one request below /api/v1; return its JSON, or its text otherwise. Raises ApiError, LinkError."""
-        status, kind, octets = self._ask(method, path, None if body is None else json.dumps(body), if_match)
+        """Send one request below /api/v1; return its JSON, or its text otherwise. Raises ApiError, LinkError.
+
+        ``body`` is sent as JSON, octets as they are.
+        """
+        sent = body if body is None or isinstance(body, bytes) else json.dumps(body)
+        status, kind, octets = self._ask(method, path, sent, if_match)
         try:
             value = json.loads(octets) if kind.startswith("application/json") else octets.decode()
         except ValueError as error:
@@ -156,10 +161,12 @@ class Client:
         message = str(told.get("message") or f"The base station answered {status}.")
         raise ApiError(status, str(told.get("code", "failed")), message, str(told.get("hint", "")))
 
-    def _ask(self, method: str, path: str, body: str | None, if_match: str | None = None) -> tuple[int, str, bytes]:
+    def _ask(
+        self, method: str, path: str, body: str | bytes | None, if_match: str | None = None
+    ) -> tuple[int, str, bytes]:
         headers = {"Accept": "application/json"}
         if method not in ("GET", "HEAD"):
-            headers["Content-Type"] = "application/json"
+            headers["Content-Type"] = "application/octet-stream" if isinstance(body, bytes) else "application/json"
         if if_match is not None:
             headers["If-Match"] = if_match
         if self._token:
@@ -175,12 +182,15 @@ class Client:
                 ) from error
         return self._exchange(method, path, body, headers)
 
-    def _exchange(self, method: str, path: str, body: str | None, headers: dict[str, str]) -> tuple[int, str, bytes]:
+    def _exchange(
+        self, method: str, path: str, body: str | bytes | None, headers: dict[str, str]
+    ) -> tuple[int, str, bytes]:
         if self._connection is not None and _is_over(self._connection):
             self.close()
         if self._connection is None:
             self._connection = self._open()
-        self._connection.request(method, API + path, body, headers)
+        with suppress(BrokenPipeError, ConnectionResetError):  # it may answer before it has read all of a body
+            self._connection.request(method, API + path, body, headers)
         answer = self._connection.getresponse()
         self.etag = answer.getheader("ETag")
         return answer.status, answer.getheader("Content-Type", ""), answer.read()
@@ -350,6 +360,50 @@ class Client:
     def locate(self, node: str, seconds: int = 10) -> None:
         """Make a node blink or beep for so many seconds, at most 60; 0 stops it."""
         self.request("POST", f"/nodes/{quote(node, safe='')}/locate", {"seconds": seconds})
+
+    def update(
+        self,
+        image: bytes,
+        *nodes: str,
+        match: str | None = None,
+        dry_run: bool = False,
+        other_board: Sequence[str] = (),
+        allow_downgrade: bool = False,
+        parallel: int | None = None,
+        wait: int | None = None,
+    ) -> Update:
+        """Begin to update the firmware of nodes to an image (the content of its file); ``dry_run``: only the plan.
+
+        ``match`` selects nodes in place of naming them. ``other_board`` names those that get the image although it
+        names another board, or none: ask a person about each. Boards are updated ``parallel`` at a time, and a
+        restarted one is waited for ``wait`` seconds. Raises ApiError (423) while another update runs.
+        """
+        asked = {
+            "nodes": ",".join(nodes),
+            "match": match,
+            "dry_run": int(dry_run),
+            "other_board": ",".join(other_board),
+            "allow_downgrade": int(allow_downgrade),
+            "parallel": parallel,
+            "wait": wait,
+        }
+        words = urlencode({name: value for name, value in asked.items() if value})
+        found: Update = self.request("POST", f"/updates?{words}", image)
+        return found
+
+    def updates(self) -> list[Update]:
+        """Return the firmware updates that run or are over, the newest first."""
+        return list(self.request("GET", "/updates")["updates"])
+
+    def follow_update(self, update_id: str) -> Update:
+        """Return how an update goes."""
+        found: Update = self.request("GET", f"/updates/{quote(update_id, safe='')}")
+        return found
+
+    def cancel_update(self, update_id: str) -> Update:
+        """Begin no further board of an update; those that were begun are finished."""
+        found: Update = self.request("DELETE", f"/updates/{quote(update_id, safe='')}")
+        return found
 
     def release_actuator(self, node: str, channel: int) -> bool | None:
         """Release an actuator; return whether the node reports that it is safe, None without a report."""

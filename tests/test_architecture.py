@@ -45,7 +45,9 @@ ARROWS = {
     "measure": _BELOW_TALK | {"talk", "steps", "handover"},
     "client": {"api", "shapes"},
     "describe": _BELOW_TALK | {"talk", "steps", "handover", "measure", "api"},
-    "ncap": _BELOW_TALK | {"talk", "steps", "handover", "plant", "measure", "node", "client", "api", "describe"},
+    "ncap": _BELOW_TALK
+    | {"talk", "steps", "handover", "plant", "measure", "node", "client", "api", "describe"}
+    | {"firmware_image"},
     "check": _BELOW_TALK | {"talk", "steps"},
     "backup": {"station", "vault", "protocol", "teds"},
     "doctor": {"station", "links", "vault", "protocol", "teds"},

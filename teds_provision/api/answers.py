@@ -14,6 +14,7 @@ from teds_provision.shapes.metadata import Meta
 Uuid = Annotated[str, Meta(pattern="^[0-9a-f]{20}$", description="20 hex digits")]
 Time = Annotated[float, Meta(description="unix seconds")]
 _FirmwareOrigin = TypedDict("_FirmwareOrigin", {"from": Literal["session", "plain"]})
+_UpdateFrom = TypedDict("_UpdateFrom", {"from": Annotated[str, Meta(description="the version before")] | None})
 _Origin = TypedDict("_Origin", {"from": Literal["session", "kept", "plain"]})  # a keyword of Python
 
 
@@ -426,6 +427,68 @@ class Provisioning(TypedDict):
     steps: list[Step]
     error: Problem | None
     verdict: str | None
+
+
+class UpdateImage(TypedDict):
+    """The firmware image of an update, as its file says."""
+
+    version: str
+    digest: Annotated[str, Meta(description="MCUboot's, which boards report; not that of the file")]
+    board: Annotated[str, Meta(description="the board that it names (TLV 0x54A0)")] | None
+    octets: int
+    security_counter: int | None
+
+
+class UpdateBoard(_UpdateFrom):
+    """One board of an update: the plan first, then what it does, then how it ended."""
+
+    uuid: Uuid
+    to: str
+    state: Literal["planned", "waiting", "running", "ended", "skipped"]
+    board: Annotated[str, Meta(description="the board that it reports to be")] | None
+    plan: Annotated[Literal["upload", "restart", "prove", "nothing"], Meta(description="where it begins")] | None
+    octets: Annotated[int, Meta(description="to send; at the end, that were sent")]
+    seconds: Annotated[float, Meta(description="about how long they take; at the end, how long it took")]
+    interrupts: Annotated[list[str], Meta(description="measurements that pause")]
+    question: Annotated[str, Meta(description="what a person must answer first (other_board), empty for nothing")]
+    step: Literal["upload", "restart", "prove", "revert"] | None
+    written: Annotated[int, Meta(description="octets that are on the board")]
+    result: Literal["updated", "already", "reverted", "refused", "lost"] | None
+    error: Problem | None
+
+
+class UpdateTotals(TypedDict):
+    """Boards by result, and the seconds in all."""
+
+    updated: int
+    already: int
+    reverted: int
+    refused: int
+    lost: int
+    seconds: float
+
+
+class Update(TypedDict):
+    """A firmware update of many boards: a plan (``planned``, without id), one that runs, or one that is over."""
+
+    id: str | None
+    state: Annotated[
+        Literal["planned", "running", "done", "stopped"], Meta(description="stopped: not all boards were begun")
+    ]
+    owner: Annotated[str, Meta(description="who asked for it: page, api:TOKEN, ncap")]
+    began: Time
+    ended: Time | None
+    image: UpdateImage
+    allow_downgrade: bool
+    parallel: int
+    boards: list[UpdateBoard]
+    totals: UpdateTotals
+
+
+class Updates(TypedDict):
+    """The update that runs, and the last ones that are over."""
+
+    updates: list[Update]
 
 
 class AppliedValue(TypedDict):

@@ -19,6 +19,12 @@ LONGEST_TEXT: Final = 200
 LAST_CHANNEL: Final = 255
 MOST_POINTS: Final = 3600
 """Bins of the past of a channel in one answer."""
+LARGEST_IMAGE: Final = 4 << 20
+"""Octets of the largest firmware image."""
+MOST_AT_ONCE: Final = 24
+"""Boards that are updated at once, as with ``update --parallel``."""
+LONGEST_WAIT: Final = 3600
+"""Seconds for which a restarted board is waited for, as with ``update --wait``."""
 
 _TEXT: Final[Schema] = {"type": "string"}
 _DATASHEET_TAG: Final[Schema] = {
@@ -45,6 +51,7 @@ class Operation:
     document: bool = False  # whether it may answer a document that is no JSON
     header: dict[str, Schema] = field(default_factory=dict)  # optional headers of the request
     tag: str = ""  # the condition under which the answer has an ETag, "" for never
+    octets: int = 0  # of the body at most, if it is a file as it is and no JSON
 
 
 def _integer(least: int, most: int) -> Schema:
@@ -83,6 +90,23 @@ OPERATIONS: Final = (
     Operation("GET", "/nodes/{uuid}/channels/{number}", "Get a channel with its last value.", answers.Channel),
     Operation("PUT", "/nodes/{uuid}/channels/{number}", "Set an actuator and hold it, or let it go.", answers.Applied,
               bodies.SetPoint),
+    Operation("GET", "/updates", "List the firmware updates, the newest first.", answers.Updates),
+    Operation("POST", "/updates",
+              "Update the firmware of boards to the image in the body, or show the plan. One update runs at a time.",
+              answers.Update, status=202, octets=LARGEST_IMAGE,
+              query={
+                  "nodes": {"type": "string", "description": "UUIDs, prefixes or names, separated by commas"},
+                  "match": {"type": "string", "description": "in place of nodes: type:P, name:GLOB, group:G, …"},
+                  "dry_run": {"type": "string", "description": "1: answer the plan (200), change nothing"},
+                  "other_board": {"type": "string", "description": "the nodes of these, by commas, that get the image"
+                                  " although it names another board, or none: a person was asked about each"},
+                  "allow_downgrade": {"type": "string", "description": "1: install an older version, too"},
+                  "parallel": _integer(1, MOST_AT_ONCE),
+                  "wait": _integer(1, LONGEST_WAIT),
+              }),
+    Operation("GET", "/updates/{id}", "Follow an update.", answers.Update),
+    Operation("DELETE", "/updates/{id}", "Begin no further board of an update; those that were begun are finished.",
+              answers.Update),
     Operation("GET", "/groups", "List the measurement groups.", answers.Groups),
     Operation("POST", "/groups", "Create a group.", answers.Groups, bodies.NewGroup, status=201),
     Operation("PUT", "/groups/{name}", "Replace the members of a group.", answers.Groups, bodies.GroupMembers),
@@ -130,8 +154,8 @@ REFUSALS: Final = {
     "405": "method not allowed",
     "409": "frozen: being measured",
     "412": "changed: the datasheet is no longer the one that If-Match names",
-    "413": "body over 1 MiB",
-    "415": "a request that changes something must be JSON",
+    "413": "body over 1 MiB; a firmware image over 4 MiB",
+    "415": "a request that changes something must be JSON, a firmware image application/octet-stream",
     "421": "a foreign Host",
     "422": "bad-request: the body does not match its schema; other codes: guard, limits, policy, bad data",
     "423": "claimed by another station, or busy",
@@ -193,7 +217,7 @@ def _operation(operation: Operation, named: dict[str, Schema]) -> dict[str, Any]
             "ETag": {"description": f"Names the datasheet that the node has ({operation.tag}).", "schema": _TEXT}
         }
     if operation.status == 202:
-        responses["200"] = responses["202"]  # a waiting that was cancelled
+        responses["200"] = responses["202"]  # a waiting that was cancelled, a plan
     responses |= {key: {"$ref": f"#/components/responses/{key}"} for key in REFUSALS}
     words = "".join(part.strip("{}").title().replace("-", "") for part in operation.path.split("/"))
     found: dict[str, Any] = {
@@ -206,6 +230,9 @@ def _operation(operation: Operation, named: dict[str, Schema]) -> dict[str, Any]
         ],
         "responses": responses,
     }
+    if operation.octets:
+        image = {"type": "string", "format": "binary", "maxLength": operation.octets}
+        found["requestBody"] = {"required": True, "content": {"application/octet-stream": {"schema": image}}}
     if operation.body is not None:
         schema = schema_of(operation.body, named)
         found["requestBody"] = {"required": "required" in schema, "content": {"application/json": {"schema": schema}}}

@@ -25,7 +25,7 @@ from teds_provision.cli.options import (
     yes_option,
 )
 from teds_provision.cli.rendering import reporter_for
-from teds_provision.errors import NotFoundError, UsageError, WrongImageError
+from teds_provision.errors import UsageError, WrongImageError
 from teds_provision.links import LinkSettings
 from teds_provision.talk.progress import NodeReporter, Reporter, SilentReporter
 
@@ -92,7 +92,11 @@ def update(
     _require_image_last(uuids, image)
     firmware = firmware_image.load_firmware_image(image, key)
     station = app.station()
-    boards = _matching(station, match) if match is not None else [station.nodes.resolve(uuid) for uuid in uuids]
+    boards = (
+        measure.matching.known_nodes(station, match)
+        if match is not None
+        else [station.nodes.resolve(uuid) for uuid in uuids]
+    )
     boards = list(dict.fromkeys(boards))
     for uuid in boards:
         station.policy.require_whitelisted(uuid)
@@ -120,21 +124,6 @@ def _require_image_last(uuids: Sequence[str], image: Path) -> None:
             f"{files[0]} is a file, and {image} is none: the image comes last.",
             hint=f"teds-provision update {boards} {quote(files[0])}",
         )
-
-
-def _matching(station: Station, expression: str) -> list[bytes]:
-    match = measure.matching.NodeMatch.parse(expression)
-    match.require_groups(station)
-    found = [
-        record.uuid
-        for record in station.nodes.all()
-        if station.keys.held(record.uuid) and not match.why_not(station, record.uuid)
-    ]
-    if not found:
-        raise NotFoundError(
-            f"No node whose key this station holds matches {expression!r}.", hint="See the nodes: teds-provision nodes"
-        )
-    return found
 
 
 def _look(

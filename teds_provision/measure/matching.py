@@ -125,6 +125,22 @@ class NodeMatch:
         return next((fit.why.rstrip(".") for fit in judged), "its datasheet is unknown")
 
 
+def known_nodes(station: Station, expression: str) -> list[bytes]:
+    """Return the nodes whose key the station holds and that an expression selects; raises UsageError, NotFoundError."""
+    match = NodeMatch.parse(expression)
+    match.require_groups(station)
+    found = [
+        record.uuid
+        for record in station.nodes.all()
+        if station.keys.held(record.uuid) and not match.why_not(station, record.uuid)
+    ]
+    if not found:
+        raise NotFoundError(
+            f"No node whose key this station holds matches {expression!r}.", hint="See the nodes: teds-provision nodes"
+        )
+    return found
+
+
 @dataclass(frozen=True)
 class MatchSurvey:
     """Which known nodes an expression means now (UUIDs in hex), and why the others are not measured by it."""

@@ -35,6 +35,7 @@ from teds_provision.ncap.nodes.link_watch import LinkWatch
 from teds_provision.ncap.nodes.node_jobs import NodeJobs, NodeLocks
 from teds_provision.ncap.nodes.provisioning import AutoProvisioner, Provisioning
 from teds_provision.ncap.nodes.sheets import Sheets
+from teds_provision.ncap.nodes.updates import Updates
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.ncap.plant import PlantWatch
 from teds_provision.ncap.settings import Detection, Settings, own_source
@@ -109,6 +110,16 @@ class Daemon:
             self.measurements.is_measured,
             dead_man=settings.dead_man,
         )
+        self.updates = Updates(
+            station,
+            self.directory,
+            self.live,
+            self.node_locks,
+            bus_of=self.node_jobs.bus_of,
+            measured=lambda uuid: self.measurements.session(uuid, streaming=True),
+            lent=self.measurements.lent,
+            held=self.leases.held,
+        )
         self.virtuals = Virtuals(station, self.live)
         self.plant = PlantWatch(station, self.live, self._plant_changed)
         self.adopting = AutoProvisioner(
@@ -150,6 +161,7 @@ class Daemon:
             self.plant.start()
         if self.settings.measure is not None:
             self.measurements.match(self.settings.measure, rate=self.settings.rate, frozen=self.settings.frozen)
+        self.updates.start()
         try:
             yield
         finally:
@@ -158,6 +170,7 @@ class Daemon:
     def _end(self) -> None:
         """Actuators safe first, then claims released and files closed, then links, then the virtual nodes."""
         self._stop.set()
+        self.updates.stop()
         self.plant.stop()
         self.leases.end()
         self.measurements.stop()

@@ -57,6 +57,7 @@ _OF_THIS_PROCESS: Final = frozenset({_RUN, _ADOPTED, UnsignedNodes.text})
 """IDs of measurements that options of ``ncap run`` began: they end with it."""
 LETTING_GO: Final = 4.0  # seconds for a node's session to end in order; the caller waits 5
 ANSWERING: Final = 1.0  # seconds for a node that has another address now
+LONGEST_END: Final = 20.0  # the same, for who waits as long as it takes
 LONGEST_LOAN: Final = 900.0  # seconds after which a node is measured again, whatever its writer does
 
 
@@ -384,11 +385,11 @@ class MeasurementSupervisor:
 
     # -- nodes that a command of this home writes to -----------------------------------------------------------------
 
-    def lend_node(self, loan: NodeLoan) -> bool:
+    def lend_node(self, loan: NodeLoan, seconds: float = LETTING_GO) -> bool:
         """Release a node until :meth:`return_node`, so that a writer can use it; False if it is not measured.
 
         It may be lent to several at once, who take turns at the node. Raises NodeBusyError if its session did not end
-        in order within :data:`LETTING_GO` seconds; then it is measured on.
+        in order within ``seconds``; then it is measured on.
         """
         with self._lending:
             if loan.ended:
@@ -402,12 +403,41 @@ class MeasurementSupervisor:
                     f"Node {loan.uuid} is in a frozen measurement ({job.kept.id}).", hint="End the measurement first."
                 )
             self._loans.setdefault(loan.uuid, []).append(loan)
-            if job.suspend_node(bytes.fromhex(loan.uuid), loan.why, LETTING_GO):
+            if job.suspend_node(bytes.fromhex(loan.uuid), loan.why, seconds):
                 return True
         self.return_node(loan)
         raise NodeBusyError(
-            f"Node {loan.uuid} is being measured and was not released within {LETTING_GO:g} s.", hint="Try again."
+            f"Node {loan.uuid} is being measured and was not released within {seconds:g} s.", hint="Try again."
         )
+
+    @contextmanager
+    def lent(self, uuid: str, why: str) -> Iterator[bool]:
+        """Have a node to work on in this process for the block; True if a measurement let it go for that.
+
+        Raises as :meth:`lend_node` does, NodeBusyError if something else works on it.
+        """
+        loan = NodeLoan(uuid, why)
+        try:
+            was_measured = self.lend_node(loan, LONGEST_END)
+            with self._alone(uuid, why, was_measured=was_measured):
+                yield was_measured
+        finally:
+            self.return_node(loan)
+
+    @contextmanager
+    def _alone(self, uuid: str, why: str, *, was_measured: bool) -> Iterator[None]:
+        """Hold the lock of a lent node, unless its measurement keeps that for the time of the loan."""
+        try:
+            self._node_locks.acquire(uuid, why)
+        except FrozenError:
+            if not was_measured:
+                raise
+            yield
+            return
+        try:
+            yield
+        finally:
+            self._node_locks.release(uuid)
 
     def return_node(self, loan: NodeLoan) -> None:
         """Measure it again, unless another borrower still has it."""

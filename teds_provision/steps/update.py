@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
@@ -60,6 +60,8 @@ _RESTART_SECONDS: Final = 3.0
 Result = Literal["updated", "already", "reverted", "refused", "lost"]
 RESULTS: Final[tuple[Result, ...]] = ("updated", "already", "reverted", "refused", "lost")
 Stage = Literal["upload", "restart", "prove", "nothing"]
+Release = Callable[[bytes], AbstractContextManager[object]]
+"""``with release(uuid) as released:`` no measurement of this station has the node; true if one let it go for this."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,35 @@ def plan_or_refusal(
         return BoardUpdate(uuid, result_of(error), before, 0, time.monotonic() - began, error)
 
 
+def plan_at(
+    station: Station, port: Port, uuid: bytes, order: UpdateOrder, reporter: Reporter, *, timeout: float
+) -> UpdatePlan:
+    """Do what :func:`plan_update` does, over an open port; no other session of its source address is with the node."""
+    return _Update(station, port, timeout, uuid, order, reporter).plan()
+
+
+def plan_in(station: Station, node: Conversation, order: UpdateOrder) -> UpdatePlan:
+    """Do what :func:`plan_update` does, in the session that is open with the node, such as that of a measurement."""
+    return _Look(station, node.uuid, order).planned(node)
+
+
+def update_at(
+    station: Station,
+    port: Port,
+    uuid: bytes,
+    order: UpdateOrder,
+    reporter: Reporter,
+    *,
+    timeout: float,
+    release: Release | None = None,
+) -> BoardUpdate:
+    """Update one board over an open port; an error is part of the result.
+
+    ``release`` has the board for the update alone, see :data:`Release`; without it ``station.released`` does.
+    """
+    return _Update(station, port, timeout, uuid, order, reporter, release).run()
+
+
 def update_boards(
     station: Station,
     links: LinkSettings,
@@ -173,7 +204,7 @@ def _at_port(
 
     def one(ordered: tuple[bytes, UpdateOrder]) -> BoardUpdate:
         uuid, order = ordered
-        return _Update(station, port, timeout, uuid, order, reporter_of(uuid)).run()
+        return update_at(station, port, uuid, order, reporter_of(uuid), timeout=timeout)
 
     at_once = min(parallel, len(orders), port.capabilities.max_parallel)
     if at_once < 2:
@@ -199,6 +230,21 @@ def version_of(report: FirmwareReport) -> str:
     return version_text((*report.version, report.build))
 
 
+def require_free_actuators(node: Conversation) -> None:
+    """Raise PolicyError if an actuator of the board is claimed, in this session or another one: a restart ends that."""
+    try:
+        told = OperationReply.decode(node.request_idempotent(OPERATION, "to report its mode")).channels
+    except NodeRefusedError:
+        return  # it does not measure
+    claims = ChannelState.CLAIMED_HERE | ChannelState.CLAIMED_BY_OTHER
+    claimed = [number for number, (state, _) in told.items() if state & ChannelState.ACTUATOR and state & claims]
+    if claimed:
+        raise PolicyError(
+            f"Actuator {claimed[0]} of the board is in use; the restart would end that.",
+            hint="Release it first; mode UUID shows which station claims it.",
+        )
+
+
 @dataclass(frozen=True)
 class _BeforeRestart:
     """What must be unchanged after the restart: Security TEDS, identity, and c of the session (which must not be)."""
@@ -209,91 +255,35 @@ class _BeforeRestart:
     c: bytes | None
 
 
-class _Update:
-    """The update of one board over one port."""
+class _Look:
+    """What the update of one board looks at before it begins."""
 
-    def __init__(
-        self, station: Station, port: Port, timeout: float, uuid: bytes, order: UpdateOrder, reporter: Reporter
-    ) -> None:
-        self._station, self._port, self._timeout, self._uuid = station, port, timeout, uuid
-        self._order, self._reporter, self._digest = order, reporter, order.image.digest
+    def __init__(self, station: Station, uuid: bytes, order: UpdateOrder) -> None:
+        self._station, self._uuid, self._order = station, uuid, order
+        self._digest = order.image.digest
         self._before: str | None = None
-        self._octets = 0
-        self._point = b""
-
-    # -- what others call ------------------------------------------------------------------------------------------
 
     @property
     def before(self) -> str | None:
         """Version that ran when the board was looked at, None if it was not."""
         return self._before
 
-    def plan(self) -> UpdatePlan:
-        """Return what :meth:`run` would do."""
-        with self._station.node_lock(self._uuid), self._met(self._timeout) as node:
-            report, stage = self._look(node)
-            octets = len(self._order.image.octets) if stage == "upload" else 0
-            holder = self._station.measurements.holder(self._uuid)
-            return UpdatePlan(
-                self._uuid,
-                report,
-                stage,
-                octets,
-                _seconds(node, octets),
-                () if holder is None or stage == "nothing" else (holder,),
-                "" if stage == "nothing" else self._mismatch(report),
-            )
-
-    def run(self) -> BoardUpdate:
-        """Update the board; an error is part of the result."""
-        began, error = time.monotonic(), None
-        try:
-            with self._station.node_lock(self._uuid), self._station.released(self._uuid, "update") as released:
-                result = self._run(released=bool(released))
-        except TedsProvisionError as failure:
-            error = failure
-        except SessionLostError as lost:
-            error = lost.cause
-        if error is not None:
-            result = "reverted" if isinstance(error, RevertedError) else result_of(error)
-        done = BoardUpdate(self._uuid, result, self._before, self._octets, time.monotonic() - began, error)
-        if result != "already":
-            facts = {"from": self._before, "to": self._order.image.version_text, "image": self._digest.hex()}
-            with suppress(TedsProvisionError):  # a full disk must not hide what happened
-                self._station.audit(
-                    "update", self._uuid, result, **facts, **({} if error is None else {"why": error.message})
-                )
-        return done
-
-    # -- the steps -------------------------------------------------------------------------------------------------
-
-    def _run(self, *, released: bool) -> Result:
-        with self._met(self._timeout) as node:
-            require_not_measured(self._station, node, released=released)
-            report, stage = self._look(node)
-            if stage == "nothing":
-                self._keep(report)
-                return "already"
-            if stage != "prove":
-                if self._mismatch(report) and not self._order.other_board:
-                    raise WrongImageError(self._mismatch(report), hint="If it is right all the same: --other-board")
-                self._require_free_actuators(node)
-            before = self._note(node, as_kept=stage == "prove")
-            if stage != "prove" and before.identity.state == NodeState.PROVISIONED:
-                self._keep_as_signed(report)
-            manager = ImageManager(node)
-            if stage == "prove":
-                return self._proven(node, manager, before)
-            self._keep_address(node)
-            if stage == "upload":
-                self._upload(node, manager)
-            began = time.monotonic()
-            before = replace(before, c=node.open_counter)
-            manager.restart()
-        with self._restarted(before) as node:
-            self._reporter.finished(StepResult("restart", seconds=time.monotonic() - began))
-            manager = ImageManager(node)
-            return self._proven(node, manager, before)
+    def planned(self, node: Conversation) -> UpdatePlan:
+        """Return what an update would do, as the board reports itself in its open session."""
+        report, stage = self._look(node)
+        octets = len(self._order.image.octets) if stage == "upload" else 0
+        holder = self._station.measurements.holder(self._uuid)
+        if stage in ("upload", "restart"):
+            require_free_actuators(node)
+        return UpdatePlan(
+            self._uuid,
+            report,
+            stage,
+            octets,
+            _seconds(node, octets),
+            () if holder is None or stage == "nothing" else (holder,),
+            "" if stage == "nothing" else self._mismatch(report),
+        )
 
     def _look(self, node: Conversation) -> tuple[FirmwareReport, Stage]:
         """Return the board's report in the session, and where the update begins; raises if it may not."""
@@ -342,21 +332,83 @@ class _Update:
         named = f"names the board {board!r}" if board is not None else "does not name its board"
         return f"The image {named}; this board is {report.text or 'nameless'!r}."
 
-    def _require_free_actuators(self, node: Conversation) -> None:
+
+class _Update(_Look):
+    """The update of one board over one port."""
+
+    def __init__(
+        self,
+        station: Station,
+        port: Port,
+        timeout: float,
+        uuid: bytes,
+        order: UpdateOrder,
+        reporter: Reporter,
+        release: Release | None = None,
+    ) -> None:
+        super().__init__(station, uuid, order)
+        self._port, self._timeout, self._reporter = port, timeout, reporter
+        self._release: Release = release or (lambda uuid: station.released(uuid, "update"))
+        self._octets = 0
+        self._point = b""
+
+    # -- what others call ------------------------------------------------------------------------------------------
+
+    def plan(self) -> UpdatePlan:
+        """Return what :meth:`run` would do."""
+        with self._station.node_lock(self._uuid), self._met(self._timeout) as node:
+            return self.planned(node)
+
+    def run(self) -> BoardUpdate:
+        """Update the board; an error is part of the result."""
+        began, error = time.monotonic(), None
         try:
-            told = OperationReply.decode(node.request_idempotent(OPERATION, "to report its mode")).channels
-        except NodeRefusedError:
-            return  # it does not measure
-        claimed = [
-            number
-            for number, (state, _) in told.items()
-            if state & ChannelState.ACTUATOR and state & ChannelState.CLAIMED_BY_OTHER
-        ]
-        if claimed:
-            raise PolicyError(
-                f"Actuator {claimed[0]} of the board is in use; the restart would end that.",
-                hint="Release it first; mode UUID shows which station claims it.",
-            )
+            with self._station.node_lock(self._uuid), self._release(self._uuid) as released:
+                result = self._run(released=bool(released))
+        except TedsProvisionError as failure:
+            error = failure
+        except SessionLostError as lost:
+            error = lost.cause
+        if error is not None:
+            result = "reverted" if isinstance(error, RevertedError) else result_of(error)
+        done = BoardUpdate(self._uuid, result, self._before, self._octets, time.monotonic() - began, error)
+        if result != "already" and not isinstance(error, LinkClosedError):  # the same call goes on later
+            facts = {"from": self._before, "to": self._order.image.version_text, "image": self._digest.hex()}
+            with suppress(TedsProvisionError):  # a full disk must not hide what happened
+                self._station.audit(
+                    "update", self._uuid, result, **facts, **({} if error is None else {"why": error.message})
+                )
+        return done
+
+    # -- the steps -------------------------------------------------------------------------------------------------
+
+    def _run(self, *, released: bool) -> Result:
+        with self._met(self._timeout) as node:
+            require_not_measured(self._station, node, released=released)
+            report, stage = self._look(node)
+            if stage == "nothing":
+                self._keep(report)
+                return "already"
+            if stage != "prove":
+                if self._mismatch(report) and not self._order.other_board:
+                    raise WrongImageError(self._mismatch(report), hint="If it is right all the same: --other-board")
+                require_free_actuators(node)
+            before = self._note(node, as_kept=stage == "prove")
+            if stage != "prove" and before.identity.state == NodeState.PROVISIONED:
+                self._keep_as_signed(report)
+            manager = ImageManager(node)
+            if stage == "prove":
+                return self._proven(node, manager, before)
+            self._keep_address(node)
+            if stage == "upload":
+                self._upload(node, manager)
+            began = time.monotonic()
+            before = replace(before, c=node.open_counter)
+            manager.restart()
+        with self._restarted(before) as node:
+            self._reporter.finished(StepResult("restart", seconds=time.monotonic() - began))
+            manager = ImageManager(node)
+            return self._proven(node, manager, before)
 
     def _note(self, node: Conversation, *, as_kept: bool) -> _BeforeRestart:
         """Return what the board is before its restart; ``as_kept``: it has restarted, and the store knows it."""

@@ -40,7 +40,9 @@ class Answer:
 class Described(client.Client):
     """A client whose every answer must be what openapi.json says of it."""
 
-    def _ask(self, method: str, path: str, body: str | None, if_match: str | None = None) -> tuple[int, str, bytes]:
+    def _ask(
+        self, method: str, path: str, body: str | bytes | None, if_match: str | None = None
+    ) -> tuple[int, str, bytes]:
         status, kind, octets = super()._ask(method, path, body, if_match)
         described(method, path, status, kind, octets)
         return status, kind, octets

@@ -109,6 +109,11 @@ class ActuatorLeases:
         """Return an actuator's last set point, and whether it is known to be safe."""
         return self._last.get((uuid, channel))
 
+    def held(self, uuid: str) -> list[int]:
+        """Return the actuators of a node that requests hold now."""
+        with self._guard:
+            return sorted(number for (node, number), held in self._held.items() if node == uuid and not held.ended)
+
     def admits(self, command: SetPointCommand) -> bool:
         """Return False for a set point from a topic while a request holds its actuator. Reported once."""
         with self._guard:

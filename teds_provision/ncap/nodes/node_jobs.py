@@ -141,7 +141,7 @@ class NodeJobs:
 
         Raises FrozenError (it is measured), NodeBusyError, NoNodeError, and what the work raises.
         """
-        port = self._bus_of(uuid)
+        port = self.bus_of(uuid)
         if port is not None:
             with self._node_locks.hold(uuid, what), Conversation(self._find(port, uuid), notice=_quiet) as node:
                 try:
@@ -163,14 +163,15 @@ class NodeJobs:
 
     def contact(self, uuid: str) -> Contact | None:
         """Return a node that is on a bus now; None if it is not."""
-        port = self._bus_of(uuid)
+        port = self.bus_of(uuid)
         return None if port is None else self._find(port, uuid)
 
     def on_a_bus(self, uuid: str) -> bool:
         """Return True if a node is on a bus of this station now."""
-        return self._bus_of(uuid) is not None
+        return self.bus_of(uuid) is not None
 
-    def _bus_of(self, uuid: str) -> Port | None:
+    def bus_of(self, uuid: str) -> Port | None:
+        """Return the open port of the bus on which a node is now; None if it is on none."""
         seen = self._directory.seen(uuid)
         port = self._port_of(seen.place) if seen.present and seen.place else None
         return port if port is not None and port.capabilities.many else None

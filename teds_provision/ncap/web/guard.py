@@ -18,6 +18,7 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any, Final, Literal
 from urllib.parse import parse_qs
 
+from teds_provision.api.operations import API, LARGEST_IMAGE
 from teds_provision.errors import StoreError
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.tokens import Tokens
@@ -31,6 +32,8 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 CALLER: Final = "teds.caller"
 LARGEST_BODY: Final = 1 << 20
+_JSON, _OCTETS = "application/json", "application/octet-stream"
+_UPDATES: Final = f"{API}/updates"
 _WRONG_TOKENS: Final = 10
 _WRONG_WITHIN: Final = 60.0
 _SLOWED: Final = 1.0
@@ -145,7 +148,9 @@ class Guard:
             scope[CALLER] = await self._caller(scope, headers)
             ACTOR.set(scope[CALLER].actor)
             _require_form(scope, headers, scope[CALLER])
-            await self.app(scope, _limited(receive) if scope["type"] == "http" else receive, with_headers)
+            await self.app(
+                scope, _limited(receive, _largest(scope)) if scope["type"] == "http" else receive, with_headers
+            )
         except (RequestRefusedError, StoreError) as error:
             refusal = error if isinstance(error, RequestRefusedError) else _unreadable(error)
             if not begun:
@@ -248,9 +253,9 @@ def _require_form(scope: Scope, headers: Mapping[str, str], caller: Caller) -> N
     """Require JSON of limited size, and no read-only token, for a change."""
     if scope["type"] != "http":
         return
-    length = headers.get("content-length", "")
-    if length.isdecimal() and int(length) > LARGEST_BODY:
-        raise RequestRefusedError(413, "too-large", f"The request body may have at most {LARGEST_BODY} octets.")
+    length, most = headers.get("content-length", ""), _largest(scope)
+    if length.isdecimal() and int(length) > most:
+        raise _too_large(most)
     if scope["method"] in SAFE:
         return
     if caller.read_only:
@@ -258,13 +263,32 @@ def _require_form(scope: Scope, headers: Mapping[str, str], caller: Caller) -> N
             403, "read-only", f"Token {caller.name!r} is read-only.", "Use a token that was added without --read-only."
         )
     empty = scope["method"] == "DELETE" and length in ("", "0") and "transfer-encoding" not in headers
-    if not empty and headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+    kind = headers.get("content-type", "").partition(";")[0].strip().lower()
+    if _takes_image(scope):
+        if kind != _OCTETS:
+            raise RequestRefusedError(
+                415, "not-octets", "A firmware image is sent as it is.", f"Send Content-Type: {_OCTETS}."
+            )
+    elif not empty and kind != _JSON:
         raise RequestRefusedError(
-            415, "not-json", "Requests that change something must be JSON.", "Send Content-Type: application/json."
+            415, "not-json", "Requests that change something must be JSON.", f"Send Content-Type: {_JSON}."
         )
 
 
-def _limited(receive: Receive) -> Receive:
+def _takes_image(scope: Scope) -> bool:
+    """Return True if the body is a firmware image; a form cannot send its type, nor JSON's."""
+    return bool(scope["method"] == "POST" and scope["path"] == _UPDATES)
+
+
+def _largest(scope: Scope) -> int:
+    return LARGEST_IMAGE if _takes_image(scope) else LARGEST_BODY
+
+
+def _too_large(most: int) -> RequestRefusedError:
+    return RequestRefusedError(413, "too-large", f"The request body may have at most {most} octets.")
+
+
+def _limited(receive: Receive, most: int) -> Receive:
     """Return a body without a stated length, cut off at the limit."""
     taken = 0
 
@@ -272,8 +296,8 @@ def _limited(receive: Receive) -> Receive:
         nonlocal taken
         message = await receive()
         taken += len(message.get("body", b""))
-        if taken > LARGEST_BODY:
-            raise RequestRefusedError(413, "too-large", f"The request body may have at most {LARGEST_BODY} octets.")
+        if taken > most:
+            raise _too_large(most)
         return message
 
     return next_message

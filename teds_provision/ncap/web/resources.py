@@ -19,20 +19,25 @@ from teds_provision.api.operations import (
     FURTHEST,
     LAST_CHANNEL,
     LONGEST_TEXT,
+    LONGEST_WAIT,
+    MOST_AT_ONCE,
     MOST_ENTRIES,
     MOST_NODES,
     MOST_POINTS,
     document,
 )
 from teds_provision.errors import NotFoundError, PolicyError, TedsProvisionError, UsageError
+from teds_provision.measure.matching import known_nodes
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.measurement_supervisor import LONGEST_LOAN, NodeLoan
 from teds_provision.ncap.nodes.directory import for_reader
+from teds_provision.ncap.nodes.update_actions import UpdateRequest
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.answers import body_of, changing, moving, reading
 from teds_provision.ncap.web.guard import CALLER, Caller
 from teds_provision.station.store import AuditFilter, is_failure
 from teds_provision.station.store.records import iso
+from teds_provision.steps.update import WAIT_SECONDS
 from teds_provision.teds.profile import default_folders, list_profiles, listed
 
 Handler = Callable[[Request], Awaitable[Response]]
@@ -64,6 +69,8 @@ class Resources:
             Route("/nodes/{uuid}/provision", self.provision, methods=["GET", "POST"]),
             Route("/nodes/{uuid}/locate", self.locate, methods=["POST"]),
             Route("/nodes/{uuid}/channels/{number:int}", self.channel, methods=["GET", "PUT"]),
+            Route("/updates", self.updates, methods=["GET", "POST"]),
+            Route("/updates/{id}", self.update, methods=["GET", "DELETE"]),
             Route("/groups", self.groups, methods=["GET", "POST"]),
             Route("/groups/{name:path}", self.group, methods=["PUT", "DELETE"]),
             Route("/measurements", self.measurements, methods=["GET", "POST"]),
@@ -147,7 +154,7 @@ class Resources:
         text = words.get("text")
         if text is not None and len(text) > LONGEST_TEXT:
             raise UsageError(f"text may have at most {LONGEST_TEXT} characters.")
-        failed = words.get("failed", "0") not in ("0", "", "false")
+        failed = _says(request, "failed")
         since = _moment("since", words["since"]) if words.get("since") else None
         choice = AuditFilter(act=words.get("act") or None, failed=failed, text=text or None, before=before, since=since)
         return _shown(request, await reading(self._log, choice, limit, words.get("uuid")))
@@ -214,6 +221,8 @@ class Resources:
     async def lend_until_closed(self, request: Request) -> Response:
         """GET /nodes/UUID/let-go: a measured node is the caller's to write to until this answer ends.
 
+        One whose actuator is in use is not let go for an update: its restart would end that.
+
         Over the socket alone. A caller that dies closes it, and one that hangs has the node for a limited time.
         """
         caller: Caller = request.scope[CALLER]
@@ -224,10 +233,15 @@ class Resources:
         why = f"let go for {request.query_params.get('for', 'a command')[:40]}"
         loan = NodeLoan(uuid, why)
 
+        def let_go() -> bool:
+            if request.query_params.get("for") == "update":
+                self._daemon.updates.require_free(uuid)
+            return measuring.lend_node(loan)
+
         async def had() -> AsyncIterator[str]:
             try:
                 try:
-                    yield "let go\n" if await changing(measuring.lend_node, loan) else "not measured\n"
+                    yield "let go\n" if await changing(let_go) else "not measured\n"
                 except TedsProvisionError as error:
                     yield f"refused: {error.message}\n"
                     return
@@ -278,7 +292,7 @@ class Resources:
             text, kind, digest = await reading(sheets.document, uuid, form)
             disposition = {"content-disposition": f'attachment; filename="{uuid}.{form}"'}
             return Response(text, media_type=kind, headers={**disposition, **_tagged(digest)})
-        dry = request.query_params.get("dry_run", "0") not in ("0", "", "false")
+        dry = _says(request, "dry_run")
         content, accept, retype = body.content, body.accept_calibration, bool(body.retype)
         expected = _expected(request)
         if not dry:
@@ -338,6 +352,42 @@ class Resources:
         if body.value is None or body.hold == 0:
             return JSONResponse(await moving(self._daemon.leases.release_actuator, uuid, number))
         return JSONResponse(await moving(self._daemon.leases.put, uuid, number, body.value, body.unit, body.hold))
+
+    # -- firmware updates ---------------------------------------------------------------------------------------------
+
+    async def updates(self, request: Request) -> Response:
+        """GET, POST /updates: the last updates; a new one, or its plan."""
+        updates, caller = self._daemon.updates, request.scope[CALLER]
+        if request.method == "GET":
+            return _shown(request, {"updates": await asyncio.to_thread(updates.all)})
+        image = await request.body()
+        asked = await self._update_request(request)
+        if _says(request, "dry_run"):
+            return JSONResponse(await changing(updates.plan, image, asked, owner=caller.owner))
+        return JSONResponse(await changing(updates.begin, image, asked, owner=caller.owner), 202)
+
+    async def _update_request(self, request: Request) -> UpdateRequest:
+        nodes, match = _listed(request, "nodes"), request.query_params.get("match", "")
+        if bool(nodes) == bool(match):
+            raise UsageError("An update needs nodes or match.", hint="Name the boards, or select them; not both.")
+        if match:
+            station = self._daemon.station
+            uuids = [uuid.hex() for uuid in await changing(known_nodes, station, match)]
+        else:
+            uuids = [await asyncio.to_thread(self._daemon.known, text) for text in nodes]
+        other = [await asyncio.to_thread(self._daemon.known, text) for text in _listed(request, "other_board")]
+        return UpdateRequest(
+            tuple(dict.fromkeys(uuids)),
+            frozenset(other),
+            allow_downgrade=_says(request, "allow_downgrade"),
+            parallel=_integer(request, "parallel", 1, MOST_AT_ONCE),
+            wait=_integer(request, "wait", int(WAIT_SECONDS), LONGEST_WAIT),
+        )
+
+    async def update(self, request: Request) -> Response:
+        """GET, DELETE /updates/ID: how an update goes; begin no further board."""
+        work = self._daemon.updates.one if request.method == "GET" else self._daemon.updates.cancel
+        return _shown(request, await changing(work, request.path_params["id"]))
 
     # -- groups and measurements -------------------------------------------------------------------------------------
 
@@ -439,6 +489,19 @@ def _integer(request: Request, name: str, default: int, most: int, least: int = 
     if not (text.isascii() and text.isdecimal() and len(text) <= _DIGITS and least <= int(text) <= most):
         raise UsageError(f"{name} must be a whole number from {least} to {most}.")
     return int(text)
+
+
+def _says(request: Request, name: str) -> bool:
+    """Return True if a switch of the query is on."""
+    return request.query_params.get(name, "0") not in ("0", "", "false")
+
+
+def _listed(request: Request, name: str) -> list[str]:
+    """Return the words of a list in the query; raises UsageError for too many."""
+    words = [word.strip() for word in request.query_params.get(name, "").split(",") if word.strip()]
+    if len(words) > MOST_NODES:
+        raise UsageError(f"{name} may name at most {MOST_NODES} nodes.")
+    return words
 
 
 def _unix(request: Request, name: str) -> float | None:
