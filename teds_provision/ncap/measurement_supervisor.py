@@ -58,6 +58,7 @@ _OF_THIS_PROCESS: Final = frozenset({_RUN, _ADOPTED, UnsignedNodes.text})
 LETTING_GO: Final = 4.0  # seconds for a node's session to end in order; the caller waits 5
 ANSWERING: Final = 1.0  # seconds for a node that has another address now
 LONGEST_END: Final = 20.0  # the same, for who waits as long as it takes
+LONGEST_LOOK: Final = 120.0  # seconds that another look at a node may take
 LONGEST_LOAN: Final = 900.0  # seconds after which a node is measured again, whatever its writer does
 
 
@@ -428,7 +429,7 @@ class MeasurementSupervisor:
     def _alone(self, uuid: str, why: str, *, was_measured: bool) -> Iterator[None]:
         """Hold the lock of a lent node, unless its measurement keeps that for the time of the loan."""
         try:
-            self._node_locks.acquire(uuid, why)
+            self._node_locks.acquire(uuid, why, wait=LONGEST_LOOK)
         except FrozenError:
             if not was_measured:
                 raise

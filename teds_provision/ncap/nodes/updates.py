@@ -65,8 +65,9 @@ from teds_provision.talk.progress import SilentReporter, StepResult
 
 _log = logging.getLogger(__name__)
 _WAITED_FOR: Final = 60.0
-"""Seconds for which a board is waited for that is on no bus, as after a restart of the service."""
-_MEETING: Final = 10.0
+"""Seconds for which a board is waited for that is on no bus, as after a restart of the service, and for its answer."""
+_PLANNED_WITHIN: Final = 20.0
+"""Seconds for which the plan waits for a board's answer."""
 _LOOK: Final = 0.1
 _TOLD_EVERY: Final = 0.5
 """Seconds between two events about the upload to one board."""
@@ -238,7 +239,7 @@ class Updates:
             raise _on_no_bus(uuid)
         try:
             with self._node_locks.hold(uuid, "its update is planned"), self._slot(port):
-                plan = plan_at(self._station, port, node, order, SilentReporter(), timeout=_MEETING)
+                plan = plan_at(self._station, port, node, order, SilentReporter(), timeout=_PLANNED_WITHIN)
         except SessionLostError as lost:
             raise lost.cause from lost
         if plan.interrupts:  # of another process, which lets go of nothing
@@ -333,7 +334,7 @@ class Updates:
                     bytes.fromhex(uuid),
                     order,
                     _RowReporter(row, lambda: self._publish_progress(action, row), lambda: self._publish(action, row)),
-                    timeout=_MEETING,
+                    timeout=_WAITED_FOR,
                     release=self._alone,
                 )
         except TedsProvisionError as error:

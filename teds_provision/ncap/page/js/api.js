@@ -13,8 +13,9 @@ export class Refusal extends Error {
   }
 }
 
-async function ask(method, path, body, { signal, keepalive, match } = {}) {
-  const limit = AbortSignal.timeout(PATIENCE);
+async function ask(method, path, body, { signal, keepalive, match, patience = PATIENCE } = {}) {
+  const limit = AbortSignal.timeout(patience);
+  const kind = body instanceof ArrayBuffer ? "application/octet-stream" : "application/json";
   let answer;
   try {
     answer = await fetch(new URL(path, ROOT), {
@@ -22,8 +23,8 @@ async function ask(method, path, body, { signal, keepalive, match } = {}) {
       keepalive: keepalive ?? false,
       credentials: "same-origin",
       cache: "no-store",
-      headers: { ...(body !== undefined && { "Content-Type": "application/json" }), ...(match && { "If-Match": match }) },
-      body: body === undefined ? undefined : JSON.stringify(body),
+      headers: { ...(body !== undefined && { "Content-Type": kind }), ...(match && { "If-Match": match }) },
+      body: body === undefined || body instanceof ArrayBuffer ? body : JSON.stringify(body),
       signal: signal ? AbortSignal.any([signal, limit]) : limit,
     });
   } catch (error) {
@@ -41,6 +42,7 @@ const at = (...parts) => parts.map(encodeURIComponent).join("/");
 
 export const get = (path, options) => ask("GET", path, undefined, options);
 export const post = (path, body = {}, options) => ask("POST", path, body, options);
+export const send = (path, octets, options) => ask("POST", path, octets, options);
 export const change = (path, body, options) => ask("PUT", path, body, options);
 export const remove = (path) => ask("DELETE", path, {});
 
@@ -53,6 +55,7 @@ export const paths = {
   channel: (uuid, number) => `${at("nodes", uuid)}/channels/${number}`,
   group: (name) => at("groups", name),
   measurement: (id) => at("measurements", id),
+  update: (id) => at("updates", id),
   virtual: (uuid) => at("virtual", uuid),
 };
 

@@ -57,6 +57,7 @@ const PATHS = {
   battery: "M1.5 5h11v6h-11zM14.5 7v2",
   charge: "M9 1 4 9h4l-1 6 5-8H8Z",
   wave: "M1 9h3l2-6 3 11 2-5h4",
+  chip: "M4 4h8v8H4zM6 1v3M10 1v3M6 12v3M10 12v3M1 6h3M1 10h3M12 6h3M12 10h3",
   play: "M4 2.5v11L13 8Z",
   stop: "M4 4h8v8H4z",
   back: "M10 3 5 8l5 5",

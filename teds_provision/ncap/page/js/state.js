@@ -18,6 +18,7 @@ export const state = {
   groups: [],
   measurements: [],
   virtual: [],
+  updates: [], // of firmware, the newest first
   profiles: [],
   names: [],
   values: new Map(), // "uuid/channel" → {value, time, period}; SI, for its datasheet may come later than its values
@@ -155,6 +156,7 @@ const LISTS = {
     takeMeasurements((await get("measurements")).measurements, mine);
   },
   virtual: async () => (state.virtual = (await get("virtual")).virtual ?? []),
+  updates: async () => (state.updates = (await get("updates")).updates ?? []),
   profiles: async () => (state.profiles = (await get("profiles")).profiles ?? []),
   names: async () => (state.names = (await get("names")).names ?? []),
 };
@@ -242,7 +244,7 @@ export function take(message) {
   changed(event.event);
 }
 
-const everything = () => refresh("status", "nodes", "groups", "measurements", "virtual", "profiles");
+const everything = () => refresh("status", "nodes", "groups", "measurements", "virtual", "profiles", "updates");
 
 const TAKERS = {
   hello: everything,
@@ -278,6 +280,12 @@ const TAKERS = {
     }
     state.runs.set(event.uuid, { ...run, ...event, steps, heard: performance.now() });
     if (event.state === "done") refreshNode(event.uuid);
+  },
+  update: (event) => {
+    const update = state.updates.find((one) => one.id === event.id);
+    if (!update || update.state !== event.state) refresh("updates");
+    else if (event.board) update.boards = update.boards.map((one) => (one.uuid === event.uuid ? event.board : one));
+    if (event.board?.result) refreshNode(event.uuid);
   },
   actuator: (event) => {
     const channel = state.nodes.get(event.uuid)?.channels?.find((one) => one.number === event.channel);

@@ -21,8 +21,9 @@ export class Bulk {
     this.known = h("datalist", { id: "groups-known" });
     this.add = button("Add to group", { onclick: () => this.add.busy(() => this.added()) }, "plus");
     this.start = button("Measure", { onclick: () => this.start.busy(() => this.measured()) }, "play");
+    this.firmware = button("Update firmware", { onclick: () => (location.hash = "#/nodes/update") }, "chip");
     this.result = h("div", { class: "bulk-result", role: "status" });
-    this.bar = h("div", { class: "bulk panel", role: "group", "aria-label": "Selected nodes", hidden: true }, h("div", { class: "row" }, this.total, this.every), h("div", { class: "row" }, this.verify, this.start), h("div", { class: "row" }, this.group, this.known, this.add), this.result);
+    this.bar = h("div", { class: "bulk panel", role: "group", "aria-label": "Selected nodes", hidden: true }, h("div", { class: "row" }, this.total, this.every), h("div", { class: "row" }, this.verify, this.start, this.firmware), h("div", { class: "row" }, this.group, this.known, this.add), this.result);
   }
 
   get on() {
@@ -47,7 +48,7 @@ export class Bulk {
   choose(uuid, yes) {
     if (yes) this.chosen.add(uuid);
     else this.chosen.delete(uuid);
-    this.paint();
+    this.changed();
   }
 
   /** A node that the station does not know any more is chosen no longer; one that a filter hides is. */
@@ -56,7 +57,7 @@ export class Bulk {
     const hidden = this.chosen.size - this.shown().filter((node) => this.chosen.has(node.uuid)).length;
     text(this.total, `${count(this.chosen.size, "node")} selected${hidden ? `, ${hidden} of them not listed` : ""}`);
     const may = state.connection === "live" && state.status?.write !== false;
-    for (const act of [this.verify, this.add, this.start]) {
+    for (const act of [this.verify, this.add, this.start, this.firmware]) {
       if (act.getAttribute("aria-busy") !== "true") act.disabled = !this.chosen.size || (act !== this.verify && !may);
     }
     const names = state.groups.map((group) => group.name);

@@ -9,10 +9,12 @@ import { Filters } from "./filters.js";
 import { isLinkless, noLink } from "./links.js";
 import { NodePanel } from "./node.js";
 import { ProvisionTab } from "./provision.js";
+import { latest, progressOf, UpdatePanel } from "./update.js";
 
 const MARKED = 8000; // ms that a tapped node stays marked
 const SHOWN_VALUES = 3;
 const SEARCH_FROM = 7; // nodes
+const NEWS = 3600; // s for which an update that is over is linked from the list
 const DRAWN = 100; // cards that are drawn at once; a press draws as many more
 const order = (one, other) => Number(other.present ?? false) - Number(one.present ?? false) || byName(one, other);
 
@@ -20,17 +22,19 @@ export function nodesView(main, rest) {
   const filters = new Filters(() => ((drawn = DRAWN), paint()));
   const bulk = new Bulk(() => listed, () => paint());
   const total = h("p", { class: "total" });
+  const updating = h("a", { href: "#/nodes/update", hidden: true });
   const list = h("ul", { class: "cards" });
   const more = button("", { class: "quiet", hidden: true, onclick: () => ((drawn += DRAWN), paint()) });
   const none = h("div", {});
   const detail = h("div", { class: "detail" });
   const linkless = noLink();
-  const side = h("section", { class: "side", "aria-label": "Nodes" }, h("div", { class: "side-head" }, h("h2", {}, "Nodes"), total), linkless, filters.element, h("div", { class: "row tools-row" }, bulk.toggle), bulk.bar, list, more, h("p", { class: "side-foot" }, h("a", { href: "#/nodes/next/provision" }, icon("nfc"), " Provision the next tapped node")));
+  const side = h("section", { class: "side", "aria-label": "Nodes" }, h("div", { class: "side-head" }, h("h2", {}, "Nodes"), total), linkless, filters.element, h("div", { class: "row tools-row" }, bulk.toggle), bulk.bar, h("p", { class: "side-news" }, updating), list, more, h("p", { class: "side-foot" }, h("a", { href: "#/nodes/next/provision" }, icon("nfc"), " Provision the next tapped node")));
   main.append(side, none, detail);
   let drawn = DRAWN;
   let listed = []; // the nodes that fit the filters, in their order
   let panel = null;
   let next = null; // the form for whichever node is tapped next
+  let firmware = null; // the update of many boards
   let chosen = rest;
 
   let first = null; // UUID of the node on top: open where none is chosen
@@ -43,6 +47,7 @@ export function nodesView(main, rest) {
     filters.element.hidden = state.nodes.size < SEARCH_FROM && !filters.on;
     bulk.toggle.hidden = state.nodes.size < 2;
     bulk.paint();
+    news(latest());
     const strangers = state.status?.strangers ?? 0;
     const lacking = isLinkless();
     linkless.hidden = !lacking;
@@ -67,7 +72,31 @@ export function nodesView(main, rest) {
     }
   }
 
+  function news(update) {
+    updating.hidden = !update || (update.state !== "running" && now() - update.ended > NEWS);
+    if (!updating.hidden) text(updating, `Firmware update to ${update.image.version}: ${progressOf(update)}`);
+  }
+
+  function select() {
+    if (!bulk.on) bulk.turn(true);
+    location.hash = "#/nodes";
+    bulk.every.focus();
+  }
+
   function open() {
+    if (chosen[0] === "update") {
+      if (!firmware) {
+        panel?.end();
+        next?.end();
+        panel = next = null;
+        detail.replaceChildren();
+        firmware = new UpdatePanel(detail, () => (bulk.on ? [...bulk.chosen] : []), select);
+      }
+      firmware.paint();
+      return;
+    }
+    firmware?.end();
+    firmware = null;
     if (chosen[0] === "next") {
       if (!next) {
         panel?.end();
@@ -132,7 +161,7 @@ export function nodesView(main, rest) {
     }
   }
 
-  const ends = [on("nodes status measurements tap route connection groups", paint)];
+  const ends = [on("nodes status measurements tap route connection groups updates update", paint)];
   const ticking = setInterval(values, 250);
   const unmark = setInterval(() => state.tapped && paint(), 1000);
   paint();
@@ -149,6 +178,7 @@ export function nodesView(main, rest) {
       clearInterval(unmark);
       panel?.end();
       next?.end();
+      firmware?.end();
     },
   };
 }
