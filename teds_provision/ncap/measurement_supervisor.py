@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
@@ -58,6 +58,7 @@ _OF_THIS_PROCESS: Final = frozenset({_RUN, _ADOPTED, UnsignedNodes.text})
 LETTING_GO: Final = 4.0  # seconds for a node's session to end in order; the caller waits 5
 ANSWERING: Final = 1.0  # seconds for a node that has another address now
 LONGEST_END: Final = 20.0  # the same, for who waits as long as it takes
+_BEGINNING: Final = 0.2  # seconds between two looks whether a measurement that takes its nodes has begun
 LONGEST_LOOK: Final = 120.0  # seconds that another look at a node may take
 LONGEST_LOAN: Final = 900.0  # seconds after which a node is measured again, whatever its writer does
 
@@ -417,28 +418,27 @@ class MeasurementSupervisor:
 
         Raises as :meth:`lend_node` does, NodeBusyError if something else works on it.
         """
-        loan = NodeLoan(uuid, why)
-        try:
-            was_measured = self.lend_node(loan, LONGEST_END)
-            with self._alone(uuid, why, was_measured=was_measured):
-                yield was_measured
-        finally:
-            self.return_node(loan)
+        with ExitStack() as stack:
+            yield self._borrow(stack, uuid, why)
 
-    @contextmanager
-    def _alone(self, uuid: str, why: str, *, was_measured: bool) -> Iterator[None]:
-        """Hold the lock of a lent node, unless its measurement keeps that for the time of the loan."""
-        try:
-            self._node_locks.acquire(uuid, why, wait=LONGEST_LOOK)
-        except FrozenError:
-            if not was_measured:
-                raise
-            yield
-            return
-        try:
-            yield
-        finally:
-            self._node_locks.release(uuid)
+    def _borrow(self, stack: ExitStack, uuid: str, why: str) -> bool:
+        until = time.monotonic() + LONGEST_END
+        while True:
+            with ExitStack() as mine:
+                loan = NodeLoan(uuid, why)
+                mine.callback(self.return_node, loan)
+                was_measured = self.lend_node(loan, LONGEST_END)
+                try:
+                    self._node_locks.acquire(uuid, why, wait=LONGEST_LOOK)
+                    mine.callback(self._node_locks.release, uuid)
+                except FrozenError:  # its measurement keeps the lock for the time of the loan, or is about to begin
+                    if not was_measured and time.monotonic() >= until:
+                        raise
+                    if not was_measured:
+                        time.sleep(_BEGINNING)
+                        continue
+                stack.push(mine.pop_all())
+                return was_measured
 
     def return_node(self, loan: NodeLoan) -> None:
         """Measure it again, unless another borrower still has it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -303,23 +303,29 @@ def test_a_board_whose_actuator_is_in_use_is_refused(bench: Bench) -> None:
         asked.request("DELETE", f"/virtual/{hand}")
 
 
-@pytest.mark.parametrize("how", ["kill -9", "restart"])
+@pytest.mark.parametrize("how", ["kill -9", "restart, measured"])
 def test_the_same_update_goes_on_after_the_service_was_cut(bench: Bench, how: str) -> None:
-    version = {"kill -9": "2.0.0", "restart": "2.1.0"}[how]
-    begun = bench.update(bench.image(version, octets=60_000), *bench.boards)
+    version = {"kill -9": "2.0.0", "restart, measured": "2.1.0"}[how]
+    with measured(bench) if "measured" in how else nullcontext() as report:
+        begun = bench.update(bench.image(version, octets=60_000), *bench.boards)
 
-    def under_way() -> bool:
+        def under_way() -> bool:
+            with bench.service.client() as asked:
+                return asked.follow_update(begun["id"])["boards"][0]["written"] > 2000
+
+        until(under_way)
+        if how == "kill -9":
+            bench.service.kill()
+        else:
+            bench.service.end()
+        assert bench.kept
+        bench.start()
+        done = bench.ended(begun)
+        assert [row["result"] for row in done["boards"]] == ["updated", "updated"], done["boards"]
+        assert 0 < done["boards"][0]["octets"] < 60_000, "it went on at the offset of the board"
+        assert not bench.kept
         with bench.service.client() as asked:
-            return asked.follow_update(begun["id"])["boards"][0]["written"] > 2000
-
-    until(under_way)
-    bench.service.kill() if how == "kill -9" else bench.service.end()
-    assert bench.kept
-    bench.start()
-    done = bench.ended(begun)
-    assert [row["result"] for row in done["boards"]] == ["updated", "updated"], done["boards"]
-    assert 0 < done["boards"][0]["octets"] < 60_000, "it went on at the offset of the board"
-    assert not bench.kept
-    with bench.service.client() as asked:
-        outcomes = [entry["outcome"] for entry in asked.log() if entry["act"] == "update"]
-    assert outcomes[-4:] == ["begun", "updated", "updated", "ended"], "nothing is said of the cut"
+            outcomes = [entry["outcome"] for entry in asked.log() if entry["act"] == "update"]
+        assert outcomes[-4:] == ["begun", "updated", "updated", "ended"], "nothing is said of the cut"
+        if report is not None:
+            until(lambda: all(report(node)["state"] == "running" for node in bench.boards), "both are measured again")
