@@ -110,6 +110,9 @@ class App:
             self.note(told)
 
     def _print(self, human: Callable[[Console], None] | RenderableType) -> None:
+        if isinstance(human, str) and not sys.stdout.isatty():  # nothing that rich would be loaded for
+            print(sanitize(human))
+            return
         console = self.console()
         if callable(human):
             human(console)

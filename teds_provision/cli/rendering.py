@@ -7,7 +7,7 @@ import math
 import re
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
@@ -99,6 +99,15 @@ def print_json_list(name: str, entries: Iterable[dict[str, Any]]) -> None:
     out.flush()
     if failed is not None:
         raise click.exceptions.Exit(failed.exit_code)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows as lines with columns one below the other, for a pipe; rich takes longer to load than most commands.
+
+    The first row is the head.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
 
 
 def print_table(console: Console, table: Table) -> None:

@@ -11,7 +11,7 @@ import click
 
 from teds_provision import doctor, measure, steps
 from teds_provision.cli.context import App
-from teds_provision.cli.rendering import count_of, shown
+from teds_provision.cli.rendering import aligned, count_of, shown
 from teds_provision.errors import LinkError, NotFoundError, TedsProvisionError
 from teds_provision.links import LinkSettings
 from teds_provision.sanitize import sanitize
@@ -200,14 +200,13 @@ def _lines(found: dict[str, Any]) -> Iterator[str]:
     yield "All commands: teds-provision --help"
 
 
-def _table(nodes: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield a line per node, in columns; not by rich, whose import takes longer than all the rest of this screen."""
+def _table(nodes: list[dict[str, Any]]) -> list[str]:
+    """Return a line per node, in columns."""
     rows = [("uuid", "name", "link", "state", "verdict")]
     for node in nodes:
         listed = node["verdict"] or ("not verified" if node["whitelisted"] else "not whitelisted")
         rows.append((node["uuid"], shown(node["name"] or ""), node["link"], node["state"], listed))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
+    return aligned(rows)
 
 
 def _link_line(link: dict[str, Any]) -> str:

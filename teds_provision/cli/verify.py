@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ import click
 from teds_provision import steps
 from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import command, link_options, said_here
-from teds_provision.cli.rendering import firmware_words, print_table, reporter_for
+from teds_provision.cli.rendering import aligned, firmware_words, print_table, reporter_for
 from teds_provision.errors import UsageError
 from teds_provision.files import json_files
 from teds_provision.links import LinkSettings
@@ -57,15 +58,20 @@ def verify(
             raise UsageError("--accept-calibration applies to a single image.", hint="Verify that image by itself.")
         verify_many(app, what)
         return
-    done = steps.commands.verify_at(
-        app.station(),
-        links,
-        what[0],
-        reporter_for(app),
-        accept_calibration=accept_calibration,
-        accept_firmware=accept_firmware,
-        node=node,
-    )
+    station = app.station()
+    if not node and Path(what[0]).is_file():
+        image = steps.image_file.read_image_file(Path(what[0]))
+        done = steps.image_file.verify_image_alone(station, image, accept_calibration)
+    else:
+        done = steps.commands.verify_at(
+            station,
+            links,
+            what[0],
+            reporter_for(app),
+            accept_calibration=accept_calibration,
+            accept_firmware=accept_firmware,
+            node=node,
+        )
     verified = done.verified
     result: dict[str, Any] = {
         "uuid": verified.uuid.hex(),
@@ -78,7 +84,17 @@ def verify(
         result["firmware"] = done.firmware and done.firmware.to_json()
     for warning in done.warnings:
         app.warn(warning)
-    app.conclude(result, lambda console: _table(console, verified, result.get("firmware")), done.error)
+    if sys.stdout.isatty():
+        app.conclude(result, lambda console: _table(console, verified, result.get("firmware")), done.error)
+    else:
+        app.conclude(result, "\n".join(_lines(verified, result.get("firmware"))), done.error)
+
+
+def _lines(verified: Verification, firmware: Any) -> list[str]:
+    rows = [(check.name, check.result, check.why) for check in verified.checks]
+    runs = firmware_words(firmware)
+    verdict = f"{verified.uuid.hex()}: {verified.verdict}"
+    return [*aligned([("check", "result", "found"), *rows]), verdict, *([f"firmware: {runs}"] if runs else [])]
 
 
 def _table(console: Console, verified: Verification, firmware: Any) -> None:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, runtime_checkable
 
+from teds_provision.lazy import late
 from teds_provision.links.hints import BleAddress, Charging
 from teds_provision.protocol.messages.identity import Identity
+
+if TYPE_CHECKING:
+    import socket
+else:
+    socket = late("socket")  # most commands open none
 
 NoticeKind = Literal[
     "waiting", "foreign-tag", "reader-ready", "reader-lost", "node-left", "conflict", "unfinished", "retry", "pressed"
@@ -440,8 +445,8 @@ class LinkSettings:
 # Ports of this machine's own loopback: for simulated readers and buses, and for a page that is tried out.
 
 
-def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
+def free_port(kind: socket.SocketKind | None = None) -> int:
     """Return a port of 127.0.0.1 that is free now; another program may take it in the next moment."""
-    with socket.socket(socket.AF_INET, kind) as probe:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM if kind is None else kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -23,7 +23,7 @@ from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.operation.commands import ChannelState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
-from teds_provision.steps.build import guard
+from teds_provision.steps.calibration_guard import guard
 from teds_provision.steps.commands import NodeVisit, at_node
 from teds_provision.steps.sign import require_not_measured, sign
 from teds_provision.steps.verify_node import NodeVerification, verify_in_session, verify_node

@@ -36,7 +36,8 @@ from teds_provision.protocol.plant.signing import Answer, SignRequest, open_answ
 from teds_provision.station.plant.line import SignRequestRow, UnitRow
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry, utc_now
-from teds_provision.steps.build import check_name, guard
+from teds_provision.steps.build import check_name
+from teds_provision.steps.calibration_guard import guard
 from teds_provision.steps.sign import sign
 from teds_provision.teds.calibration.files import read_calibrations
 from teds_provision.teds.calibration.model import Calibration

@@ -45,11 +45,11 @@ from teds_provision.steps.build import (
     PreparedOrder,
     compose,
     for_several,
-    merged,
     named_for,
     prepare,
     propose,
 )
+from teds_provision.steps.calibration_guard import merged
 from teds_provision.steps.identify import IdentifiedNode, examine
 from teds_provision.steps.operator import Operator
 from teds_provision.steps.parallel import ParallelWork

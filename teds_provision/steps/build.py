@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import lru_cache
@@ -33,6 +33,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store import Draft, NodeRecord
 from teds_provision.steps.adoption import read_factory_datasheet
 from teds_provision.steps.board_type import Retype, differences, is_remembered, require_board_type, topic_warnings
+from teds_provision.steps.calibration_guard import guard, is_calibrated, merged
 from teds_provision.steps.sign import known_image, known_node_keys, unsigned_security
 from teds_provision.steps.teds_read import NodeSnapshot
 from teds_provision.steps.verify import FreshnessFloor, Verification, verify_image
@@ -59,7 +60,6 @@ if TYPE_CHECKING:
     from teds_provision.teds import calibration
     from teds_provision.teds import guard as guarding
     from teds_provision.teds.calibration import Calibration
-    from teds_provision.teds.guard import GuardFinding
     from teds_provision.teds.image import BlockId
     from teds_provision.teds.profile import BuiltDatasheet, Profile
 else:  # numpy: not for a datasheet without calibration
@@ -372,7 +372,7 @@ def certificate_brought(calibrations: Mapping[int, Calibration]) -> CertificateR
 
 def teds_calibrations(image: Image) -> dict[int, Calibration]:
     """Return the calibrations that an image holds, by channel."""
-    if not _is_calibrated(image):
+    if not is_calibrated(image):
         return {}
     return dict(Sheet.from_image(image).calibrations)
 
@@ -388,90 +388,6 @@ def own_name(station: Station, image: Image, before: str | None) -> str | None:
     except (BadDataError, NotFoundError):
         common = None
     return None if found == common else printable(found)
-
-
-def guard(
-    station: Station,
-    image: Image,
-    has: Image | None,
-    accepted: str | None,
-    calibrations: Mapping[int, Calibration] | None = None,
-    profile: Profile | None = None,
-    *,
-    record: bool = True,
-    expected: Collection[str] = (),
-) -> tuple[str, ...]:
-    """Refuse a calibration that would hurt (exit 6), unless a reason was given to accept it; return warnings.
-
-    That reason goes into the audit log, unless ``record`` is False (dry run). ``expected`` are codes of warnings about
-    what was ordered, which are suppressed.
-    """
-    if not _is_calibrated(image, has):
-        return ()
-    old = has.unsigned_blocks() if has is not None else None
-    findings = guarding.check_calibration(image.unsigned_blocks(), old, profile, calibrations=calibrations)
-    errors = [_finding_text(finding) for finding in findings if finding.severity == "error"]
-    if errors and accepted is None:
-        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-        raise PolicyError(
-            f"The calibration is refused: {errors[0]}{more}.",
-            hint='Fix it; or, if it is correct, give a reason: --accept-calibration "why".',
-        )
-    if errors and record:
-        station.audit("accept-calibration", image.uuid, "accepted", why=accepted, findings=errors)
-    return merged(
-        tuple(
-            _finding_text(finding)
-            for finding in findings
-            if finding.severity == "error" or finding.code not in expected
-        )
-    )
-
-
-def _is_calibrated(*images: Image | None) -> bool:
-    return any(code == AccessCode.CALIBRATION for image in images for _, code in image or ())
-
-
-def merged(warnings: Sequence[str]) -> tuple[str, ...]:
-    """Return warnings, with the same one for several channels in one line: ``Channels 1 to 12: …``."""
-    order: list[tuple[str, str]] = []
-    channels: dict[tuple[str, str], list[int]] = {}
-    for text in warnings:
-        head, number, rest = _of_channel(text)
-        if (head, rest) not in channels:
-            order.append((head, rest))
-        channels.setdefault((head, rest), [])
-        if number is not None and number not in channels[head, rest]:
-            channels[head, rest].append(number)
-    return tuple(_joined(head, channels[head, rest], rest) for head, rest in order)
-
-
-def _of_channel(text: str) -> tuple[str, int | None, str]:
-    """``Channel 3 (force): x`` → ("Channel", 3, ": x"); the name of the channel counts for nothing."""
-    head, _, rest = text.partition(" ")
-    digits = len(rest) - len(rest.lstrip("0123456789"))
-    if head.lower() != "channel" or not digits:
-        return text, None, ""
-    number, rest = int(rest[:digits]), rest[digits:]
-    if rest.startswith(" (") and ")" in rest:
-        rest = rest[rest.index(")") + 1 :]
-    return head, number, rest
-
-
-def _joined(head: str, numbers: list[int], rest: str) -> str:
-    if not numbers:
-        return head
-    if len(numbers) == 1:
-        return f"{head} {numbers[0]}{rest}"
-    whole = numbers == list(range(numbers[0], numbers[-1] + 1))
-    told = f"{numbers[0]} to {numbers[-1]}" if whole else ", ".join(map(str, numbers))
-    if rest.startswith(" has "):
-        rest = f" have {rest.removeprefix(' has ')}"
-    return f"{head}s {told}{rest}"
-
-
-def _finding_text(finding: GuardFinding) -> str:
-    return f"channel {finding.channel}: {finding.message}"
 
 
 def check_name(name: str | None) -> None:

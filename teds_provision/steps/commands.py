@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Literal
 
 from teds_provision.errors import (
     BadDataError,
@@ -24,7 +24,6 @@ from teds_provision.errors import (
     UnprovenError,
     UsageError,
 )
-from teds_provision.files import read_limited
 from teds_provision.links import LINKS, LinkSettings, Notice
 from teds_provision.links.ports import MultiStationLink
 from teds_provision.protocol.datasheet import SEQUENCE_WINDOW, SignedNodeKey
@@ -43,9 +42,11 @@ from teds_provision.steps.agree import (
     reset_node,
 )
 from teds_provision.steps.board_type import differences, is_remembered, shown_by
-from teds_provision.steps.build import guard, own_name, require_free_name
+from teds_provision.steps.build import own_name, require_free_name
+from teds_provision.steps.calibration_guard import guard
 from teds_provision.steps.firmware import keep_firmware, locate, read_firmware
 from teds_provision.steps.identify import IdentifiedNode, describe, identify
+from teds_provision.steps.image_file import VerifyReport, concluded, node_or_image, read_image_file, verify_image_alone
 from teds_provision.steps.operator import Operator
 from teds_provision.steps.parallel import ParallelWork
 from teds_provision.steps.provision import add_to_whitelist, key_board
@@ -55,10 +56,8 @@ from teds_provision.steps.teds_read import read_identity, read_image, take_snaps
 from teds_provision.steps.verify import (
     Verification,
     freshness_floor_of,
-    require_authentic,
     session_check,
     unproven,
-    verify_image,
 )
 from teds_provision.steps.verify_node import open_or_say_why, provenance_check, verify_at_node
 from teds_provision.steps.write import WriteResult, write
@@ -69,7 +68,6 @@ from teds_provision.teds.codec import security
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.image import SECURITY, BlockId, Image
 
-MAX_IMAGE_OCTETS: Final = 16 << 20
 Unlock = Literal["always", "if held", "never"]
 
 
@@ -115,40 +113,6 @@ def at_node(
         station.released(uuid, writes) if writes else nullcontext() as released,
     ):
         yield NodeVisit(station, node, identify(station, node), bool(released))
-
-
-def node_or_image(station: Station, text: str, *, node: bool = False) -> bytes | Image:
-    """Return the image of a file, or the UUID that ``text`` names; raises NotFoundError if it is neither.
-
-    If both match, the file wins unless ``node`` is true.
-    """
-    path = Path(text)
-    if node:
-        with suppress(NotFoundError):
-            return station.nodes.resolve(text)
-    if path.is_file():
-        return read_image_file(path)
-    try:
-        return station.nodes.resolve(text)
-    except NotFoundError:
-        if path.is_dir():
-            raise NotFoundError(f"{text} is a folder, and no node has that name.") from None
-        if path.exists():
-            raise NotFoundError(f"{text} is not a regular file, and no node has that name.") from None
-        if path.suffix or len(path.parts) > 1:
-            raise NotFoundError(f"There is no file {text}, and no node with that name.") from None
-        raise
-
-
-def read_image_file(path: Path) -> Image:
-    """Read an image file; raises NotFoundError, BadDataError (of KeyAgreement 1 too, by name)."""
-    try:
-        image = Image.from_json(read_limited(path, MAX_IMAGE_OCTETS, "image"))
-    except BadDataError as error:
-        raise BadDataError(
-            f"{path} is not a TEDS image: {error.message}", hint=error.hint or "Images come from build, sign and read."
-        ) from error
-    return security.require_our_wire(image)
 
 
 # -- identify: the node on the reader or those on the bus, once or as they come ----------------------------------------
@@ -402,16 +366,6 @@ def reset_at(station: Station, links: LinkSettings, uuid: bytes, reporter: Repor
         return reset_node(station, visit.node, visit.who)
 
 
-@dataclass(frozen=True)
-class VerifyReport:
-    """All checks of a node or an image, warnings, and the error that the verification ends with, None for none."""
-
-    verified: Verification
-    warnings: tuple[str, ...]
-    error: TedsProvisionError | None
-    firmware: KnownFirmware | None = None
-
-
 def verify_at(
     station: Station,
     links: LinkSettings,
@@ -427,31 +381,26 @@ def verify_at(
     ``accept_firmware``: the calibration holds with the firmware that runs now. ``error``: NotAuthenticError (4),
     UnprovenError (5), or PolicyError (6) for a calibration that would hurt.
     """
-    firmware: KnownFirmware | None = None
     found = node_or_image(station, what, node=node)
     if isinstance(found, Image):
-        image, verified = found, Verification(found.uuid, tuple(verify_image(station, found)), scope="image")
-    else:
-        in_session = False
-        try:
-            with at_node(station, links.after_agreeing(), found, reporter) as visit:
-                try:
-                    looked = verify_at_node(station, visit.node, visit.who)
-                    firmware = _firmware_at(station, visit.node, accept=accept_firmware)
-                finally:
-                    in_session = visit.node.sealed
-            image, verified = looked.image, looked.verified
-        except NodeRefusedError as refusal:  # outside a session anyone may have sent it: it decides nothing
-            if in_session or not station.keys.held(found) or station.policy.tombstone(found) is not None:
-                raise
-            station.audit("verify", found, "unproven", why=refusal.message)
-            why = refusal.message.removeprefix(HEARD).rstrip(".")
-            image, verified = Image(found, {}), Verification(found, (session_check("", why),))
+        return verify_image_alone(station, found, accept_calibration)
+    firmware: KnownFirmware | None = None
+    in_session = False
     try:
-        require_authentic(verified)
-        return VerifyReport(verified, guard(station, image, None, accept_calibration), None, firmware)
-    except TedsProvisionError as error:
-        return VerifyReport(verified, (), error, firmware)
+        with at_node(station, links.after_agreeing(), found, reporter) as visit:
+            try:
+                looked = verify_at_node(station, visit.node, visit.who)
+                firmware = _firmware_at(station, visit.node, accept=accept_firmware)
+            finally:
+                in_session = visit.node.sealed
+        image, verified = looked.image, looked.verified
+    except NodeRefusedError as refusal:  # outside a session anyone may have sent it: it decides nothing
+        if in_session or not station.keys.held(found) or station.policy.tombstone(found) is not None:
+            raise
+        station.audit("verify", found, "unproven", why=refusal.message)
+        why = refusal.message.removeprefix(HEARD).rstrip(".")
+        image, verified = Image(found, {}), Verification(found, (session_check("", why),))
+    return concluded(station, image, verified, accept_calibration, firmware)
 
 
 def _firmware_at(station: Station, node: Conversation, *, accept: bool) -> KnownFirmware | None:

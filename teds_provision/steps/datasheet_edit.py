@@ -14,7 +14,8 @@ from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.board_type import differences, require_board_type, topic_warnings
-from teds_provision.steps.build import guard, own_name, require_fit, teds_calibrations
+from teds_provision.steps.build import own_name, require_fit, teds_calibrations
+from teds_provision.steps.calibration_guard import guard
 from teds_provision.steps.sign import known_node_keys, require_not_measured, sign
 from teds_provision.steps.teds_read import NodeSnapshot, take_snapshot
 from teds_provision.steps.verify import Verification, require_authentic

@@ -35,12 +35,12 @@ from teds_provision.steps.build import (
     PreparedOrder,
     Proposal,
     certificate_brought,
-    merged,
     named_for,
     no_profile,
     prepare,
     propose,
 )
+from teds_provision.steps.calibration_guard import merged
 from teds_provision.steps.firmware import read_firmware, require_firmware
 from teds_provision.steps.identify import IdentifiedNode, identify
 from teds_provision.steps.operator import Operator

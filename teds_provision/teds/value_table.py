@@ -7,10 +7,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Final
-from xml.sax.saxutils import escape, quoteattr, unescape
+from typing import TYPE_CHECKING, Final
 
+from teds_provision.lazy import late
 from teds_provision.teds.codec.model import DecodedTeds
+
+if TYPE_CHECKING:
+    from xml.sax import saxutils
+else:
+    saxutils = late("xml.sax.saxutils")  # it loads urllib and http, and few datasheets have a value table
 
 MOST_ROWS: Final = 64
 _MOST_COMMENT: Final = 200
@@ -21,11 +26,11 @@ _ROW: Final = re.compile(r'<Value raw="(\d{1,19})">([^<>]{1,128})</Value>')
 def signal_xml(name: str, comment: str, rows: Mapping[int, str]) -> str:
     """Return the XML of a signal; "" if there is neither a comment nor a row."""
     kept = sorted(rows.items())[:MOST_ROWS]
-    values = "".join(f'<Value raw="{raw}">{escape(text)}</Value>' for raw, text in kept)
+    values = "".join(f'<Value raw="{raw}">{saxutils.escape(text)}</Value>' for raw, text in kept)
     if not comment and not values:
         return ""
-    described = f" comment={quoteattr(comment[:_MOST_COMMENT])}" if comment else ""
-    return f"<Signal name={quoteattr(name)}{described}>{values}</Signal>"
+    described = f" comment={saxutils.quoteattr(comment[:_MOST_COMMENT])}" if comment else ""
+    return f"<Signal name={saxutils.quoteattr(name)}{described}>{values}</Signal>"
 
 
 def read_value_table(teds: DecodedTeds | None) -> dict[int, str]:
@@ -34,6 +39,6 @@ def read_value_table(teds: DecodedTeds | None) -> dict[int, str]:
         text = octets[:_MOST_OCTETS].decode(errors="replace")
         if not text.startswith("<Signal "):
             continue
-        rows = {int(raw): unescape(word) for raw, word in _ROW.findall(text)[:MOST_ROWS]}
+        rows = {int(raw): saxutils.unescape(word) for raw, word in _ROW.findall(text)[:MOST_ROWS]}
         return {raw: word for raw, word in rows.items() if word.isprintable()}
     return {}

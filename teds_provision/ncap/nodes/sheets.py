@@ -13,7 +13,7 @@ from teds_provision.ncap.nodes.inspection import read_anew
 from teds_provision.ncap.nodes.node_jobs import NodeJobs
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now
-from teds_provision.steps.build import guard
+from teds_provision.steps.calibration_guard import guard
 from teds_provision.steps.datasheet_edit import SheetPlan, plan_sheet, write_sheet
 from teds_provision.steps.identify import identify
 from teds_provision.steps.readings import NodeVerdict, is_keyed, verdict_of
