@@ -26,6 +26,7 @@ from pathlib import Path
 import teds_provision
 from benchmarks.machine import line as machine
 from benchmarks.provisioning import SLOW, next_node, next_nodes, nodes
+from benchmarks.verifying import fill as fill_images
 from teds_provision.links.ports import free_port
 from teds_provision.station.station import initialise
 from teds_provision.vault import forget_vaults
@@ -146,6 +147,29 @@ def timed(home: Path, *words: str) -> float:
     began = time.perf_counter()
     finished(started(home, *words))
     return time.perf_counter() - began
+
+
+def start_to_end(rows: Rows) -> None:
+    """Processor time of commands that need no node, beside that of a bare ``import click``."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, home = Path(name, "images"), Path(name, "home")
+        fill_images(folder, home, 1)
+        (image,) = folder.iterdir()
+        commands = {"nodes": 120, "": 160, f"verify {image}": 160, "doctor": 250}
+        rows.tell("import click, processor time", _least_work("-c", "import click"), "ms")
+        for words, aim in commands.items():
+            work = _least_work("-m", "teds_provision", "--home", str(home), *words.split())
+            rows.tell(f"  {words.partition(' ')[0] or 'the bare command'}", work, "ms", aim=aim)
+
+
+def _least_work(*words: str) -> float:
+    """Return the least processor time of seven runs, in ms."""
+    times = []
+    for _ in range(7):
+        worked = processor_time()
+        subprocess.run([sys.executable, *words], check=True, capture_output=True)
+        times.append(processor_time() - worked)
+    return min(times) * 1e3
 
 
 def fixed_cost(rows: Rows) -> None:
@@ -342,7 +366,7 @@ def main(words: list[str] | None = None) -> None:
     # as an installer leaves it: PYTHONDONTWRITEBYTECODE, here or there, would have each process compile what it loads
     compileall.compile_dir(Path(teds_provision.__file__).parent, quiet=2)
     rows = Rows()
-    for part in (start_up, fixed_cost, one_command, zeroing, watching, eight_readers):
+    for part in (start_up, start_to_end, fixed_cost, one_command, zeroing, watching, eight_readers):
         if options.only in ("", part.__name__):
             part(rows)
     if options.only in ("", "whole_bus"):
