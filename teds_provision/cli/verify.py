@@ -60,8 +60,7 @@ def verify(
         return
     station = app.station()
     if not node and Path(what[0]).is_file():
-        image = steps.image_file.read_image_file(Path(what[0]))
-        done = steps.image_file.verify_image_alone(station, image, accept_calibration)
+        done = steps.image_file.verify_image_file(station, Path(what[0]), accept_calibration)
     else:
         done = steps.commands.verify_at(
             station,

@@ -65,6 +65,11 @@ class VerifyReport:
     firmware: KnownFirmware | None = None
 
 
+def verify_image_file(station: Station, path: Path, accept_calibration: str | None = None) -> VerifyReport:
+    """Read an image file and check it by itself, as :func:`verify_image_alone`."""
+    return verify_image_alone(station, read_image_file(path), accept_calibration)
+
+
 def verify_image_alone(station: Station, image: Image, accept_calibration: str | None = None) -> VerifyReport:
     """Check a datasheet by itself; ``accept_calibration``: why a calibration that the guard refuses is right."""
     verified = Verification(image.uuid, tuple(verify_image(station, image)), scope="image")
