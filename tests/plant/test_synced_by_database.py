@@ -26,6 +26,7 @@ from tests.plant.handing import board_of
 from tests.plant.postgres import Database
 from tests.plant.relay import relay
 from tests.plant.stations import Plant, ask
+from tests.plant.test_reported_firmware import OLD, board_with, look, version
 
 pytestmark = pytest.mark.system
 
@@ -89,6 +90,14 @@ def test_pages_and_rosters_reach_everybody(office: Office) -> None:
     office.sync(office.north, south)
     assert south.plant.roster is not None
     assert south.plant.roster.member(west.fingerprint) is not None
+
+
+def test_firmware_that_a_board_reported_reaches_the_other_station(office: Office) -> None:
+    south = office.member("south", "base")
+    board = board_with(office.north, OLD)
+    look(office.north, board)
+    office.sync(office.north, south)
+    assert version(south, board) == ("1.2.0", "north")
 
 
 def test_nothing_new_is_one_round_trip(office: Office) -> None:
