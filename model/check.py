@@ -1,4 +1,4 @@
-"""Check the model of a key's life with SPIN: the rules as they are hold, and each broken rule is found.
+"""Check the models of a key's life and of the plant with SPIN: the rules hold, and each broken rule is found.
 
 Usage: python model/check.py [--quick]. Prints a line per run: what was tried, how many states, how long, and whether
 the outcome is the expected one; exits 1 where one is not, 2 where spin or a C compiler is missing.
@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-MODEL = Path(__file__).with_name("keys_life.pml")
+KEYS_LIFE, PLANT_LIFE = (Path(__file__).with_name(name) for name in ("keys_life.pml", "plant_life.pml"))
 SECONDS = 3000
 SAMPLE_MINUTES = 10
 
@@ -41,6 +41,21 @@ class Bounds:
 
 
 @dataclass(frozen=True)
+class PlantBounds:
+    """How long a chain of pages gets in the model of the plant, and how many homes have the CA key."""
+
+    pages: int
+    owners: int = 1
+
+    def defines(self) -> list[str]:
+        """Return the bounds as options of spin."""
+        return [f"-DPAGES={self.pages}", *(["-DTWO_OWNERS"] if self.owners > 1 else [])]
+
+    def __str__(self) -> str:
+        return f"the plant, {self.pages} pages, {self.owners} homes with the CA key"
+
+
+@dataclass(frozen=True)
 class Run:
     """One run of the checker. ``whole``: every state is visited.
 
@@ -49,7 +64,7 @@ class Run:
     optimised checker takes longer to compile than to run.
     """
 
-    bounds: Bounds
+    bounds: Bounds | PlantBounds
     broken: str = ""
     parts: tuple[str, ...] = ()
     whole: bool = True
@@ -75,11 +90,20 @@ BROKEN = {
     Bounds(2, 1, commits=2): "SIGNER",
     Bounds(3, 1): "DROP_PENDING",
 }
+PLANT_BROKEN = {
+    PlantBounds(
+        2
+    ): "RESTORED_WRITES NO_LOOK PUSH_NEW GAP FORK_UNSEEN REMOVED_COUNTS REMOVED_WRITES ROSTER_BACK OWNER_BLIND",
+    PlantBounds(3): "ADOPT_ANY PREVIOUS",
+    PlantBounds(2, owners=2): "TWO_ROSTERS ROSTER_PREVIOUS",
+}
 HARMLESS = ("RECEIPT_ALL", "LATE", "MOVE_DUE", "IMPORT_TWICE", "EPOCH_UNCHECKED")
 """Rules of the code without which nothing goes wrong in the model, as another rule does the same (README)."""
 BY_TEST = {"M1", "LIFTED", "BACK_NO_ROTATION", "UNSETTLED", "M6", "PENDING", "LATE+MOVE_DUE", "HELD_BACK"}
 BY_TEST |= {"MOVE_ORDER", "EPOCH_BACK", "CONTINUED", "GIVEN_COMMIT", "SESSION", "ERASE"}
 FOUND = [Run(bounds, rule) for bounds, rules in BROKEN.items() for rule in rules.split()]
+FOUND += [Run(bounds, rule) for bounds, rules in PLANT_BROKEN.items() for rule in rules.split()]
+PLANT_RUNS = [Run(PlantBounds(3)), Run(PlantBounds(2, owners=2))]
 SMALL_RUNS = [
     Run(SMALL),
     Run(Bounds(2, 1, restores=1, resets=1)),
@@ -111,7 +135,7 @@ def check(run: Run, folder: Path) -> Outcome:
         *(f"-DBREAK_{rule}" for rule in run.broken.split("+") if rule),
         *(f"-D{part}" for part in run.parts),
     ]
-    _call(["spin", "-a", *defines, str(MODEL)], folder)
+    _call(["spin", "-a", *defines, str(PLANT_LIFE if isinstance(run.bounds, PlantBounds) else KEYS_LIFE)], folder)
     memory = ["-DHC4"] if run.whole else ["-DBITSTATE"]
     _call(["cc", "-O0" if run.small else "-O2", "-DSAFETY", *memory, "-DMEMLIM=8000", "-o", "pan", "pan.c"], folder)
     table = 31 if not run.whole else 20 if run.small else 25
@@ -158,7 +182,7 @@ def main(arguments: list[str]) -> int:
     quick = "--quick" in arguments
     found = [run for run in FOUND if run.broken in BY_TEST] if quick else FOUND
     harmless = [] if quick else [Run(SMALL, rule) for rule in HARMLESS]
-    small = [*SMALL_RUNS, *found, *harmless]
+    small = [*SMALL_RUNS, *([] if quick else PLANT_RUNS), *found, *harmless]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for run, outcome in zip(small, pool.map(tried, small), strict=True):
             wrong += not told(run, outcome)
