@@ -385,14 +385,23 @@ def _tell_one_of(app: App, boards: BatchRun, board: BoardResult) -> None:
 
 
 def _tell_warnings(app: App, boards: BatchRun) -> None:
-    """Print each warning about boards of a bus once, with the names of those that have it."""
+    """Print each warning about boards of a bus once, with the boards that have it.
+
+    A board is named by its UUID if it has no name, or shares it as boards do that are named after their type.
+    """
     found = boards.board_warnings
     station = app.station() if found else None
     for warning, uuids in found.items():
+        if len(uuids) == boards.ended > 1:
+            app.warn(f"All {boards.ended} boards: {warning}")
+            continue
         known = [station.nodes.get(uuid) for uuid in uuids[:_NAMED]] if station is not None else []
-        names = [record.name or record.uuid.hex() for record in known if record is not None]
+        names = [record.name or "" for record in known if record is not None]
+        shown = [
+            name if name and names.count(name) == 1 else uuid.hex() for name, uuid in zip(names, uuids, strict=False)
+        ]
         more = f" and {len(uuids) - _NAMED} more" if len(uuids) > _NAMED else ""
-        app.warn(f"{', '.join(names)}{more}: {warning}")
+        app.warn(f"{', '.join(shown)}{more}: {warning}")
 
 
 def _tell_totals(app: App, boards: BatchRun) -> None:

@@ -304,6 +304,25 @@ def test_of_many_on_a_bus_each_line_names_its_node_and_one_without_the_calibrati
     assert (again.code, "1 failed" in again.out) == (6, True), "it is not finished the second time either"
 
 
+def test_a_warning_of_several_boards_is_printed_once_with_what_identifies_them(desk: Desk, station: Station) -> None:
+    """It began with "load cell, load cell, load cell": unnamed boards take the name of their type."""
+    uuids = [desk.node(f"node{number}").start(nfc=False, can=True).uuid for number in range(3)]
+    over = desk.links.over("can")
+    for uuid in uuids:
+        station.ask("whitelist", "add", uuid)
+    done = station.run("provision", "--all", "-p", ANGLE, *over)
+    assert done.err.count("Channel 1 has no calibration") == 1
+    assert "Warning: All 3 boards: Channel 1 has no calibration" in done.err
+
+    calibration, sheet = desk.folder / "calibration.csv", desk.folder / "boards.csv"
+    calibration.write_text("# date: 2026-11-01\nraw,value [degree]\n0,0\n65535,359.9\n")
+    sheet.write_text(f"uuid,calibration\n{uuids[0]},calibration.csv\n{uuids[1]},\n{uuids[2]},\n")
+    done = station.run("provision", "--all", "--batch", sheet, "-p", ANGLE, "--yes", *over)
+    [warning] = [line for line in done.err.splitlines() if "Channel 1 has no calibration" in line]
+    assert uuids[0] not in warning
+    assert all(uuid in warning for uuid in uuids[1:])
+
+
 @pytest.mark.needs("a slow chip")
 def test_every_board_of_a_sheet_counts_whatever_the_time_out_and_a_corrected_calibration_is_written(
     desk: Desk, station: Station, tmp_path: Path
