@@ -421,6 +421,27 @@ PATTERNS = (
     Pattern(
         "a job's count is checked again", "_require_room", "given >= job.total", "False", "tests/plant/test_office.py"
     ),
+    Pattern(
+        "a job counts in its own registry",
+        "read_job",
+        "job.registry != roster.registry",
+        "False",
+        "tests/plant/test_carried_pages.py",
+    ),
+    Pattern(
+        "pages behind a gap wait",
+        "take_carried",
+        "page.number - 1 not in numbers",
+        "False",
+        "tests/plant/test_carried_pages.py",
+    ),
+    Pattern(
+        "a page counts in its own place",
+        "open_carried",
+        "page.station != station or page.number != carried.number",
+        "page.station != station",
+        "tests/plant/test_carried_pages.py",
+    ),
     # wrapped sensors (node/wrapped)
     Pattern(
         "a late value of a wrapped sensor is invalid",
