@@ -243,10 +243,10 @@ def _remarks(node: dict[str, Any]) -> str:
     remarks = []
     if node["wrapped"]:
         remarks.append(f"wrapped: {node['wrapped']['name']} ({node['wrapped']['kind']})")
+    if node["firmware"] and node["firmware"]["state"] in ("bad", "other", "outdated", "not-reported"):
+        remarks.append(f"firmware {node['firmware']['state']}")
     if node["firmware"] and node["firmware"]["changed"]:
         remarks.append(FIRMWARE_CHANGED)
-    elif node["firmware"] and node["firmware"]["state"] in ("bad", "other", "outdated", "not-reported"):
-        remarks.append(f"firmware {node['firmware']['state']}")
     if node["revoked"]:
         remarks.append(f"revoked: {node['revoked']['why']}")
     if node["moved_to"]:

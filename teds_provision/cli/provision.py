@@ -180,6 +180,7 @@ def provision(
                 hint="For many boards: agree, update --match EXPR IMAGE, provision. For a plan: update --dry-run.",
             )
         image = firmware_image.load_firmware_image(firmware, firmware_key)
+        links = replace(links, via_chosen=True)  # as what follows: the board is tapped, unless a bus is named
         request = replace(request, node=_with_firmware(app, base, links, uuid, image, reporter, yes=yes))
     boards = steps_room.batch.BatchRun(base, links, request, reporter, line=line)
     for warning in boards.warnings:

@@ -211,6 +211,16 @@ def test_provision_installs_the_firmware_first(desk: Desk, owner: Owner) -> None
     assert line["result"] == "already"
 
 
+def test_without_a_link_the_firmware_of_a_new_board_waits_for_the_tap_too(desk: Desk, owner: Owner) -> None:
+    station, node = desk.station(), board(desk, owner)
+    station.ask("identify", *desk.links.over("can"))
+    station.ask("config", "set", "can", desk.links.can)
+    refused = station.refuses("provision", node.uuid, "--firmware", owner.new, *PROVISIONED, "--yes", code=5)
+    assert "No NFC reader" in refused["message"]
+    (known,) = station.ask("nodes", node.uuid)["nodes"]
+    assert (known["keys"], known["whitelisted"]) == ([], False), "nothing was done over the bus that it was met on"
+
+
 def test_update_over_nfc_says_that_it_is_slow(desk: Desk, owner: Owner) -> None:
     station = desk.station()
     node = desk.node(firmware=(owner.old, owner.key)).start()

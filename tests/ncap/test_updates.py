@@ -227,9 +227,23 @@ def test_what_is_no_image_and_who_may_not_is_refused(bench: Bench) -> None:
         assert bench.service.raw("POST", path, {**writer, "Content-Type": kind}, image).status == 415
     assert bench.service.raw("POST", path, {**writer, **octets, "Origin": "http://evil.example"}, image).status == 403
     assert bench.service.raw("POST", "/api/v1/groups", {**writer, **octets}, image).status == 415
+    for words in ("dryrun=1", "dry_run=1&Wait=9", "allow_downgrade=no", "dry_run=perhaps"):
+        assert bench.service.raw("POST", f"{path}&{words}", {**writer, **octets}, image).status == 422, words
     assert not bench.kept
     with bench.service.client() as asked:
         assert all(update["state"] != "running" for update in asked.updates())
+
+
+def test_a_script_may_write_a_switch_as_its_language_does(bench: Bench) -> None:
+    one, older = bench.boards[0], bench.image("0.9.0").read_bytes()
+    headers = {
+        "Content-Type": "application/octet-stream",
+        "Authorization": f"Bearer {bench.service.token('script')}",
+    }
+    for word, code in (("False", "downgrade"), ("0", "downgrade"), ("True", None), ("1", None)):
+        path = f"/api/v1/updates?nodes={one.uuid}&dry_run=True&allow_downgrade={word}"
+        (row,) = bench.service.raw("POST", path, headers, older).json["boards"]
+        assert (row["error"] or {"code": None})["code"] == code, word
 
 
 def test_a_second_update_is_refused_with_who_updates(bench: Bench) -> None:

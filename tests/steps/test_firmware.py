@@ -36,6 +36,7 @@ from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.profile.firmware import FirmwareDemand
 from tests.bench import Board, MemoryLink, contact
+from tests.cli.shell import call
 from tests.e2e.desk import ANGLE
 
 OLD = FirmwareReport("nrf/angle", (1, 1, 0), 3, bytes([1]) * 32)
@@ -255,7 +256,7 @@ def test_a_report_that_another_program_wrote_does_not_count(station: Station) ->
     assert station.firmware_reports.get(board.uuid) is None
 
 
-def test_doctor_names_what_a_type_does_not_accept_and_what_changed(station: Station, tmp_path: Path) -> None:
+def test_doctor_and_nodes_name_what_a_type_does_not_accept_and_what_changed(station: Station, tmp_path: Path) -> None:
     board = FirmwareBoard()
     given(station, board, profile(tmp_path, TABLE))
     station.flush()
@@ -268,6 +269,7 @@ def test_doctor_names_what_a_type_does_not_accept_and_what_changed(station: Stat
         f"1 with firmware that their type does not accept: {board.uuid.hex()}.",
         f"1 whose firmware changed since calibration: {board.uuid.hex()}.",
     }
+    assert "firmware outdated; firmware changed since calibration" in call(station.home, "nodes").out
 
 
 @pytest.mark.parametrize(

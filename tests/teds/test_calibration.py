@@ -447,6 +447,7 @@ offsets = [25]
         ("[]", "c.json", 1, "object"),
         ('{"slope": true}', "c.json", 1, "slope"),
         ('{\n"slope": 1,\n"channel": "x"}', "c.json", 3, "channel"),
+        ('{\n"slope": 1,\n"channel": [{"number": 1}]}', "c.json", 3, "not a list; several channels: [["),
     ],
 )
 def test_a_bad_file_names_file_line_and_field(text: str, name: str, place: int, field: str, magnetic: Profile) -> None:

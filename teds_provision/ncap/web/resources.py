@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -42,6 +42,7 @@ from teds_provision.teds.profile import default_folders, list_profiles, listed
 
 Handler = Callable[[Request], Awaitable[Response]]
 _LENT_LOOK: Final = 0.5
+_OF_UPDATES: Final = ("nodes", "match", "dry_run", "other_board", "allow_downgrade", "parallel", "wait")
 _DIGITS: Final = 9  # of a number in a query; Python gives up on four thousand
 _UNIX: Final = re.compile(r"[0-9]{1,12}(\.[0-9]{1,9})?")
 
@@ -360,6 +361,7 @@ class Resources:
         updates, caller = self._daemon.updates, request.scope[CALLER]
         if request.method == "GET":
             return _shown(request, {"updates": await asyncio.to_thread(updates.all)})
+        _require_known(request, _OF_UPDATES)
         image = await request.body()
         asked = await self._update_request(request)
         if _says(request, "dry_run"):
@@ -492,8 +494,18 @@ def _integer(request: Request, name: str, default: int, most: int, least: int = 
 
 
 def _says(request: Request, name: str) -> bool:
-    """Return True if a switch of the query is on."""
-    return request.query_params.get(name, "0") not in ("0", "", "false")
+    """Return True if a switch of the query is on; raises UsageError if it is neither on nor off."""
+    word = request.query_params.get(name, "").lower()
+    if word not in ("", "0", "1", "false", "true"):
+        raise UsageError(f"{name} must be 1 or 0.")
+    return word in ("1", "true")
+
+
+def _require_known(request: Request, names: Collection[str]) -> None:
+    """Raise UsageError for an unknown word of the query: a mistyped dry_run must not begin the update."""
+    unknown = sorted(set(request.query_params) - set(names))
+    if unknown:
+        raise UsageError(f"Unknown in the query: {', '.join(unknown)}.", hint=f"Known: {', '.join(sorted(names))}.")
 
 
 def _listed(request: Request, name: str) -> list[str]:

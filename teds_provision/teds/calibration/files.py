@@ -478,7 +478,8 @@ def _channels(order: CalibrationOrder, profile: Profile) -> list[ChannelProfile]
         return list(profile.channels)
     match = _CHANNELS.match(str(value).strip()) if not isinstance(value, bool) else None
     if match is None:
-        raise order.wrong("channel", f'a channel is a number, a range like 1-12, or "all", not {value!r}.')
+        given = repr(value) if isinstance(value, str | int | float) else "a list; several channels: [[calibration]]"
+        raise order.wrong("channel", f'a channel is a number, a range like 1-12, or "all", not {given}.')
     low, high = int(match[1]), int(match[2] or match[1])
     found = [channel for channel in profile.channels if low <= channel.number <= high]
     if len(found) != high - low + 1:
