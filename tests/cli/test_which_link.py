@@ -14,7 +14,7 @@ from teds_provision.cli.options import link_options
 from teds_provision.cli.sample import over_the_bus
 from teds_provision.errors import TedsProvisionError
 from teds_provision.links import LinkSettings
-from teds_provision.links.nfc import reader
+from teds_provision.links.nfc import pcsc_readers, reader
 from teds_provision.links.ports import LISTEN_SECONDS
 from teds_provision.station.station import Station
 from teds_provision.steps import sign
@@ -98,7 +98,7 @@ def test_a_node_without_a_link_is_told_what_to_name(home: Path, monkeypatch: pyt
     call(home, "whitelist", "add", uuid, "--fingerprint", "ab" * 32)
     remember(home, uuid, can_address=0x21)
     monkeypatch.setattr(reader, "_usb_readers", lambda _path: [])
-    monkeypatch.setattr(reader, "names_if_any", list)
+    monkeypatch.setattr(pcsc_readers, "names_if_any", list)
     for command in ("sample", "mode", "verify", "read"):
         said = call(home, "--json", command, uuid)
         assert said.code == 5, said
