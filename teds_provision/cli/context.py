@@ -15,7 +15,9 @@ from teds_provision import protocol, vault
 from teds_provision import station as station_room
 from teds_provision.cli.config_file import home_of
 from teds_provision.errors import (
+    LinkError,
     NoPassphraseError,
+    NotFoundError,
     PolicyError,
     StoreError,
     TedsProvisionError,
@@ -44,6 +46,7 @@ else:
 _BEHIND = " [y/N]: "
 _TELLING = threading.Lock()
 SOCKET: Final = "ncap.sock"
+_SERVICE_SECONDS: Final = 5.0
 """``client.SOCKET``; that module is loaded only if the socket exists."""
 
 
@@ -276,6 +279,7 @@ class App:
         station.notice = self.note
         station.use_agent = not self.has_passphrase
         station.released = self._released
+        station.service_measures = self._service_measures
         self.closing(station.close)
         return station
 
@@ -288,6 +292,16 @@ class App:
         if not (self.home / SOCKET).exists():
             return nullcontext()
         return client.connect(home=self.home).released(uuid.hex(), command)
+
+    def _service_measures(self, uuid: bytes) -> bool:
+        service = self.running_service(timeout=_SERVICE_SECONDS)
+        if service is None:
+            return False
+        try:
+            with service:
+                return service.node(uuid.hex()).get("measuring") is not None
+        except (LinkError, NotFoundError):  # it has just ended, or does not know the node
+            return False
 
     def closing(self, close: Callable[[], None]) -> None:
         """Register what is to be closed when the command ends, however it ends."""

@@ -177,7 +177,7 @@ def provision(
         if firmware is None or dry_run or request.several or line is not None:
             raise UsageError(
                 "--firmware installs an image on one board; --firmware-key goes with it.",
-                hint="For many boards: agree, update --match EXPR IMAGE, provision. For a plan: update --dry-run.",
+                hint="Many boards: whitelist add, agree, update --match EXPR IMAGE, provision. Plan: update --dry-run.",
             )
         image = firmware_image.load_firmware_image(firmware, firmware_key)
         links = replace(links, via_chosen=True)  # as what follows: the board is tapped, unless a bus is named

@@ -270,6 +270,6 @@ def _read_profile(path: Path, folders: tuple[Path, ...], _changed: int, _second:
 
 def _wrong(part: str, text: str) -> UsageError:
     return UsageError(
-        f"{part!r} in {text!r} does not select nodes to measure.",
+        f"{part!r} in {text!r} does not select nodes.",
         hint="Use all, a group, type:PROFILE, name:GLOB, group:NAME or 'angle >= 360 deg', joined by commas.",
     )

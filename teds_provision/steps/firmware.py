@@ -95,7 +95,7 @@ def require_firmware(uuid: bytes, demand: FirmwareDemand | None, reading: Firmwa
     )
     raise FirmwareError(
         f"Board {node} {_REFUSED[state]}{named}{f' (wanted: {wanted})' if wanted else ''}. Nothing was signed.",
-        hint=f"Install other firmware, then try again: agree {node}, update {node} IMAGE, provision.",
+        hint=f"Install other firmware in the same run: provision {node} --firmware IMAGE",
     )
 
 

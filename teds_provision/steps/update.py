@@ -15,6 +15,7 @@ from typing import Final, Literal
 from teds_provision.errors import (
     BoardLostError,
     DowngradeError,
+    FrozenError,
     GarbledError,
     LinkClosedError,
     LinkError,
@@ -129,7 +130,12 @@ def plan_or_refusal(
         try:
             avoid_measuring_source(station, port, uuid)
             looked = _Update(station, port, links.timeout, uuid, order, reporter)
-            return looked.plan()
+            plan = looked.plan()
+            if plan.interrupts and not station.service_measures(uuid):
+                raise FrozenError(
+                    f"Node {uuid.hex()} is being measured by {plan.interrupts[0]}.", hint="End that measurement first."
+                )
+            return plan
         finally:
             port.close()
     except TedsProvisionError as error:

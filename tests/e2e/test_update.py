@@ -231,6 +231,24 @@ def test_update_over_nfc_says_that_it_is_slow(desk: Desk, owner: Owner) -> None:
     assert "1.0.0 → 1.1.0  updated" in done.out
 
 
+def test_the_plan_for_a_board_that_another_command_measures_refuses_what_the_update_would(
+    desk: Desk, owner: Owner
+) -> None:
+    """It named the measurement as one that pauses, and the update then ended with 6."""
+    station = desk.station()
+    sensor = desk.node("sensor", type_=ANGLE, firmware=(owner.old, owner.key)).start(nfc=False, can=True)
+    over = desk.links.over("can")
+    station.ask("whitelist", "add", sensor.uuid)
+    station.run("provision", sensor.uuid, *PROVISIONED, "--yes", *over)
+    measuring = station.start("--json", "measure", sensor.uuid, "--rate", "10", *over)
+    measuring.wait_for('"data"')
+    for more in ("--dry-run", "--yes"):
+        done = station.run("--json", "update", sensor.uuid, owner.image("1.5.0"), "--other-board", more, *over)
+        assert (done.code, json.loads(done.out.splitlines()[0])["error"]["code"]) == (6, "frozen"), done
+    measuring.signal(signal.SIGINT)
+    measuring.end()
+
+
 @pytest.mark.realtime
 def test_a_measurement_beside_an_update_loses_nothing(desk: Desk, owner: Owner) -> None:
     station, node = desk.station(), board(desk, owner)

@@ -173,7 +173,7 @@ def test_a_board_with_other_firmware_is_refused_before_it_becomes_ours(
     with pytest.raises(FirmwareError) as caught:
         given(station, board, profile(tmp_path, TABLE))
     assert (caught.value.code, caught.value.exit_code) == ("firmware", 6)
-    assert f"agree {board.uuid.hex()}, update {board.uuid.hex()} IMAGE, provision" in caught.value.hint
+    assert f"provision {board.uuid.hex()} --firmware IMAGE" in caught.value.hint, "it is not on the whitelist yet"
     assert (board.state.state, station.pins.entry(board.uuid)) == (NodeState.FACTORY, None)
 
 
