@@ -22,7 +22,7 @@ def test_outdated_firmware_is_not_measured_until_it_is_updated(desk: Desk, tmp_p
     demand = f'extends = "{ANGLE}"\ntitle = "Angle"\n[channel.1.calibration]\nrequired = false\n[firmware]\nminimum = '
     profile.write_text(demand + '"1.0.0"\n')
     station = desk.station()
-    node = desk.node(firmware=(old, key)).start("--source", "ramp:5", nfc=False, can=True)
+    node = desk.node(type_=ANGLE, firmware=(old, key)).start("--source", "ramp:5", nfc=False, can=True)
     assert station.provision("can", "--profile", profile)["verdict"] == "authentic"
     profile.write_text(demand + '"1.1.0"\n')
     (known,) = station.ask("nodes", node.uuid)["nodes"]
@@ -39,4 +39,9 @@ def test_outdated_firmware_is_not_measured_until_it_is_updated(desk: Desk, tmp_p
     assert updated.code == 0, updated
     until(lambda: ask.node(node.uuid)["measurement"], lambda: ask.node(node.uuid))
     until(lambda: ask.node(node.uuid)["firmware"]["state"] == "good", lambda: ask.node(node.uuid)["firmware"])
+
+    until(lambda: (ask.node(node.uuid).get("measuring") or {}).get("state") == "running", ask.measurements)
+    planned = station.run("--json", "update", node.uuid, old, "--allow-downgrade", "--dry-run", *over)
+    assert planned.code == 0, planned
+    assert len(planned.json["interrupts"]) == 1, "the service releases the node for an update"
     service.end()
