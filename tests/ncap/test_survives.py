@@ -195,7 +195,8 @@ def test_a_node_that_starts_anew_is_measured_on(lab: Lab) -> None:
     until(lambda: lab.state()["measuring"]["state"] == "lost")
     assert lab.state()["problem"]["message"]
     lab.power()
-    assert lab.flows()["measuring"]["state"] == "running"
+    until(lambda: lab.state()["measuring"]["state"] == "running", lab.state)
+    lab.flows()
     assert lab.state()["problem"] is None
     assert lab.service.process is not None
     lab.service.process.read(0.1)
