@@ -55,7 +55,7 @@ create or replace function registry.me() returns bytea language sql stable secur
 create or replace function registry.append(wanted int, previous bytea, page text) returns int language plpgsql security definer set search_path = pg_catalog, pg_temp as $$
 declare m registry.member; h bytea := sha256(convert_to(left(page, length(page) - position('.' in reverse(page))), 'UTF8')); begin
   if current_setting('transaction_isolation') <> 'read committed' then raise exception 'isolation' using errcode = 'TE005'; end if;
-  select * into m from registry.member where role = session_user and open for update;
+  select * into m from registry.member where role = session_user and open for no key update;
   if not found then raise exception 'not a member' using errcode = 'TE001'; end if;
   if wanted <= m.n then
     if exists (select from registry.page p where p.station = m.station and p.n = wanted and p.hash = h) then return m.n; end if; -- the same page again
@@ -69,7 +69,7 @@ declare m registry.member; h bytea := sha256(convert_to(left(page, length(page) 
 create or replace function registry.restore(fingerprint bytea, number int, page text) returns boolean language plpgsql security definer set search_path = pg_catalog, pg_temp as $$
 declare who bytea; h bytea := sha256(convert_to(left(page, length(page) - position('.' in reverse(page))), 'UTF8')); kept bigint; begin
   if current_setting('transaction_isolation') <> 'read committed' then raise exception 'isolation' using errcode = 'TE005'; end if;
-  select m.station into who from registry.member m where m.role = session_user and m.open for update; -- one at a time: the limit is exact
+  select m.station into who from registry.member m where m.role = session_user and m.open for no key update; -- one at a time: the limit is exact
   if not found then raise exception 'not a member' using errcode = 'TE001'; end if;
   if exists (select from registry.member m where m.station = fingerprint and m.open) then
     raise exception 'its author is an open member and appends its own pages' using errcode = 'TE006'; end if;
@@ -92,7 +92,7 @@ declare who bytea := registry.me(); begin
   perform pg_notify('teds', 'roster ' || number); end $$;
 create or replace function registry.send(parcel uuid, receiver bytea, content bytea, until timestamptz) returns void language plpgsql security definer set search_path = pg_catalog, pg_temp as $$
 declare who bytea; waiting bigint; begin
-  select m.station into who from registry.member m where m.role = session_user and m.open for update; -- one at a time: the limit is exact
+  select m.station into who from registry.member m where m.role = session_user and m.open for no key update; -- one at a time: the limit is exact
   if not found then raise exception 'not a member' using errcode = 'TE001'; end if;
   if until > now() + interval '31 days' then raise exception 'too long' using errcode = 'TE004'; end if;
   delete from registry.parcel where expires < now() and sender = who;

@@ -140,10 +140,15 @@ def test_the_daemon_follows_it_too(hall: Hall, clock: SystemClock, tmp_path: Pat
             return abs(asked.node(hall.nodes["a"].uuid)["channels"][0]["last"]["time"] - time.time()) < 5
 
         until(right, "the page's value has the time of the wrong clock")
-        files = [Path(file) for sink in asked.status()["sinks"] for file in sink["files"]]
+
+        def files() -> list[Path]:
+            return [Path(file) for sink in asked.status()["sinks"] for file in sink["files"]]
+
+        # its own recording and the one that the measurement names, two parts of each
+        until(lambda: len(files()) == 4, files)
+        parts = files()
     service.end()
-    assert len(files) == 4, "its own recording and the one that the measurement names, two parts of each"
-    for file in files:
+    for file in parts:
         assert stamps(file)
         assert abs(stamps(file)[-1] - (time.time() - (0.0 if ".2." in file.name else HOUR))) < 60
 

@@ -106,6 +106,16 @@ def test_a_parcel_goes_to_its_receiver_and_is_taken_away(post: Registry, login: 
     receiver.close()
 
 
+def test_two_stations_that_send_to_each_other_at_once_do_not_lock_each_other_out(login: Login) -> None:
+    """Each locked its own row against the reference to it by the other's parcel: "deadlock detected"."""
+    other = login.database.member()
+    with login.connect() as here, other.connect() as there, here.transaction():
+        send = "select registry.send(%s, %s, %s, %s)"
+        here.execute(send, (uuid.uuid4(), bytes.fromhex(other.fingerprint), b"to the other", later()))
+        there.execute("set lock_timeout = '20s'")
+        there.execute(send, (uuid.uuid4(), bytes.fromhex(login.fingerprint), b"and back", later()))
+
+
 def test_a_roster_that_many_post_comes_once(post: Registry, login: Login) -> None:
     other = registry(login.database.member())
     post.post_roster(4, b"the fourth")
