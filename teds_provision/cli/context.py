@@ -17,7 +17,6 @@ from teds_provision.cli.config_file import home_of
 from teds_provision.errors import (
     LinkError,
     NoPassphraseError,
-    NotFoundError,
     PolicyError,
     StoreError,
     TedsProvisionError,
@@ -279,7 +278,7 @@ class App:
         station.notice = self.note
         station.use_agent = not self.has_passphrase
         station.released = self._released
-        station.service_measures = self._service_measures
+        station.service_runs = self._service_runs
         self.closing(station.close)
         return station
 
@@ -293,15 +292,16 @@ class App:
             return nullcontext()
         return client.connect(home=self.home).released(uuid.hex(), command)
 
-    def _service_measures(self, uuid: bytes) -> bool:
+    def _service_runs(self) -> bool:
         service = self.running_service(timeout=_SERVICE_SECONDS)
         if service is None:
             return False
         try:
             with service:
-                return service.node(uuid.hex()).get("measuring") is not None
-        except (LinkError, NotFoundError):  # it has just ended, or does not know the node
+                service.status()
+        except LinkError:  # it has just ended
             return False
+        return True
 
     def closing(self, close: Callable[[], None]) -> None:
         """Register what is to be closed when the command ends, however it ends."""

@@ -98,8 +98,8 @@ class Station:
         A command that writes enters it before it contacts the node. Raises PolicyError if a running `ncap` does not
         release the node; if none runs, or in that process itself, there is nothing to do.
         """
-        self.service_measures: Callable[[bytes], bool] = lambda uuid: False
-        """Returns True if a running `ncap` of this home measures the node, and so could release it."""
+        self.service_runs: Callable[[], bool] = lambda: False
+        """Returns True if a running `ncap` of this home answers, which could release a node that it measures."""
         self.use_agent = True
         """True if an agent's secret (``unlock``) opens the vault; False if the passphrase itself is asked for."""
         store.notice = lambda text: self.notice(text)  # noqa: PLW0108 - it is replaced later

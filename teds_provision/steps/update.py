@@ -131,7 +131,7 @@ def plan_or_refusal(
             avoid_measuring_source(station, port, uuid)
             looked = _Update(station, port, links.timeout, uuid, order, reporter)
             plan = looked.plan()
-            if plan.interrupts and not station.service_measures(uuid):
+            if plan.interrupts and not station.service_runs():  # a command releases nothing
                 raise FrozenError(
                     f"Node {uuid.hex()} is being measured by {plan.interrupts[0]}.", hint="End that measurement first."
                 )
