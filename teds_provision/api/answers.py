@@ -446,7 +446,7 @@ class UpdateBoard(_UpdateFrom):
     to: str
     state: Literal["planned", "waiting", "running", "ended", "skipped"]
     board: Annotated[str, Meta(description="the board that it reports to be")] | None
-    plan: Annotated[Literal["upload", "restart", "prove", "nothing"], Meta(description="where it begins")] | None
+    plan: Annotated[Literal["upload", "restart", "prove", "nothing"], Meta(description="the first step")] | None
     octets: Annotated[int, Meta(description="to send; at the end, that were sent")]
     seconds: Annotated[float, Meta(description="about how long they take; at the end, how long it took")]
     interrupts: Annotated[list[str], Meta(description="measurements that pause")]

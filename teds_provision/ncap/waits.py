@@ -12,22 +12,22 @@ from typing import Final
 
 @dataclass(frozen=True)
 class Waits:
-    """Seconds between two looks, each at one thing."""
+    """Seconds between two checks of the same thing."""
 
     store: float = 1.0
-    """At the store, for what another process has changed."""
+    """Changes that another process made to the store."""
     selection: float = 2.0
-    """At which members of a measurement are still selected, after a change of the store."""
+    """Members of a measurement that are still selected, after a change of the store."""
     keys: float = 10.0
-    """At whose keys are held: their nodes are looked for at once when they announce themselves."""
+    """Nodes whose keys are held: they are asked at once when they announce themselves."""
     link: float = 0.5
-    """At a bus: who is silent, and whether it works."""
+    """Nodes that are silent on a bus, and whether the bus works."""
     silent_node: float = 10.0
-    """At a node that was silent on a bus: the contract's bound for asking one that announces itself."""
+    """A node that was silent on a bus; operation.md allows one question in 10 s to a node that announces itself."""
     token: float = 1.0
-    """At the token of a connection: whether it was removed, or has expired."""
+    """The token of a connection: removed or expired."""
     discovery: float = 1.5
-    """For the answers to a discovery that the API asks for."""
+    """Wait for the answers to a discovery that the API asks for."""
 
 
 USUAL: Final = Waits()
