@@ -54,7 +54,7 @@ compiled: $(VENV)/.dev
 
 # The inner loop: the rooms without a link or a process, the rules of the house, one case of each link, one provisioning
 # by command. CONTRIBUTING.md says what that leaves out.
-QUICK := $(wildcard tests/test_[!m]*.py) tests/teds tests/protocol tests/station tests/steps tests/talk tests/trace \
+QUICK := $(wildcard tests/test_[!m]*.py) tests/teds tests/protocol tests/station tests/provisioning tests/trace \
   tests/measure/test_clock.py tests/measure/test_grid.py tests/measure/test_lookout.py \
   'tests/links/nfc/test_nfc_exchange.py::test_frames_of_every_size_come_back_whole[4]' \
   tests/links/can/test_can_exchange.py::test_a_node_answers_an_fd_station_in_fd_and_a_classic_one_in_classic \
@@ -144,7 +144,7 @@ fuzz: .venv-fuzz/.ready
 # backups of 100,000 nodes; an hour and a half, or all (FULL=1).
 faults: $(VENV)/.dev
 	$(BIN)/python -m tests.faults.bench $(if $(FULL),--full,--minutes 60)
-	$(BIN)/python -m pytest -q -m soak tests/steps/test_update.py
+	$(BIN)/python -m pytest -q -m soak tests/provisioning/test_update.py
 	$(BIN)/pytest -q -m "soak or not soak" tests/plant/test_cut.py tests/plant/test_line_cut.py \
 	  tests/plant/test_server_faults.py
 

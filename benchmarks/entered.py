@@ -22,12 +22,12 @@ from types import FrameType
 from benchmarks.provisioning import PROFILE, next_node, nodes
 from teds_provision.links import LinkSettings, Notice, open_port
 from teds_provision.links.ports import free_port
+from teds_provision.provisioning.build import BuildOrder, prepare
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import provision
 from teds_provision.station.station import Station, initialise
-from teds_provision.steps.build import BuildOrder, prepare
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import provision
-from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import SilentReporter
 from teds_provision.vault.passphrase import THROWAWAY
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import call

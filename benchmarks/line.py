@@ -30,10 +30,10 @@ from teds_provision.plant.office import answer
 from teds_provision.protocol.keys import SoftwareKey, node_key_message, prove_message, public_key, to_pem
 from teds_provision.protocol.plant.evidence import EvidenceClaim, seal
 from teds_provision.protocol.plant.signing import SignRequest, challenge, seal_request
-from teds_provision.steps.build import BuildOrder, prepare
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import provision
-from teds_provision.talk.progress import SilentReporter
+from teds_provision.provisioning.build import BuildOrder, prepare
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import provision
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 from tests.bench import Board, talk

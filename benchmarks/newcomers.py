@@ -43,12 +43,12 @@ from teds_provision.node.node_template import create
 from teds_provision.node.realtime_loop import RealtimeLoop
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.announce import LAST_ADDRESS, default_can_address, is_announce
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import provision
 from teds_provision.station.station import Station, initialise
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import provision
-from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
 from teds_provision.vault import forget_vaults, passphrase

@@ -31,11 +31,11 @@ from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.page import PageDraft, seal_page
+from teds_provision.provisioning.build import BuildOrder, prepare
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import provision
 from teds_provision.station.station import Station
-from teds_provision.steps.build import BuildOrder, prepare
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import provision
-from teds_provision.talk.progress import SilentReporter
 from tests.bench import Board, make_station, talk
 from tests.plant.owner import ANGLE, alone
 from tests.plant.stations import Plant, ask

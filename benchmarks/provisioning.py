@@ -36,13 +36,13 @@ from teds_provision.links import Capabilities, Contact, LinkSettings, Notice, op
 from teds_provision.links.ports import free_port
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.messages.identity import Identity
+from teds_provision.provisioning.build import BuildOrder, prepare
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import provision
 from teds_provision.station.station import Station, initialise
 from teds_provision.station.store.database import Database
-from teds_provision.steps.build import BuildOrder, prepare
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import provision
-from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import SilentReporter
 from teds_provision.vault.passphrase import THROWAWAY
 
 PROFILE = "magnetic-angular-position-sensor"

@@ -24,12 +24,12 @@ from typing import Any
 
 from teds_provision.links import LinkSettings
 from teds_provision.links.ports import free_port
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.meeting import meet
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.station.station import Station, initialise
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import ProvisionResult, provision
-from teds_provision.talk.meeting import meet
-from teds_provision.talk.progress import SilentReporter
 from teds_provision.vault.passphrase import THROWAWAY
 
 PROFILE = "magnetic-angular-position-sensor"

@@ -38,13 +38,13 @@ from teds_provision.links.can.spec import FIRST_STATION, parse_spec
 from teds_provision.links.ports import free_port
 from teds_provision.node.firmware.boot_loader import ImageSlots
 from teds_provision.node.flash_file import FlashFile
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.meeting import meet
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter, StepResult
+from teds_provision.provisioning.provision import provision
+from teds_provision.provisioning.update import BoardUpdate, UpdateOrder, update_boards
 from teds_provision.station.station import Station, initialise
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import provision
-from teds_provision.steps.update import BoardUpdate, UpdateOrder, update_boards
-from teds_provision.talk.meeting import meet
-from teds_provision.talk.progress import SilentReporter, StepResult
 from teds_provision.vault import passphrase
 
 PROFILE = "magnetic-angular-position-sensor"

@@ -2,7 +2,7 @@
 
 Usage: python scripts/room.py ROOM. ``make room ROOM=station`` runs what it prints. The arrows are read from the imports
 (scripts/house.py), so the answer cannot drift from the code. Tests that see the whole program (tests/e2e) are named
-only for the rooms that a command is made of: cli, ncap, measure, steps.
+only for the rooms that a command is made of: cli, ncap, measure, provisioning.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 import house
 
 TESTS = Path(__file__).resolve().parent.parent / "tests"
-WHOLE_RUNS = {"cli", "ncap", "measure", "steps"}
+WHOLE_RUNS = {"cli", "ncap", "measure", "provisioning"}
 
 
 def rooms() -> dict[str, set[str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from teds_provision.steps.operator import AcceptingOperator
+from teds_provision.provisioning.operator import AcceptingOperator
 
 
 class Answers(AcceptingOperator):

@@ -15,8 +15,8 @@ from teds_provision.protocol.keys import SoftwareKey, node_key_message
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import Repetition
 from teds_provision.protocol.tim import Tim
+from teds_provision.provisioning.conversation import Conversation
 from teds_provision.station.station import Station, initialise
-from teds_provision.talk.conversation import Conversation
 from teds_provision.vault import passphrase
 from tests.protocol.memory import PowerCut, RamFlash
 

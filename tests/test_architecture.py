@@ -19,7 +19,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # Room: the rooms that it may import. All may import errors, lazy, limits, sanitize, json_decoder, itself;
 # all but protocol also files and portable.
 WITHOUT_FILES = {"errors", "sanitize", "lazy", "limits", "portable", "protocol", "json_decoder"}
-_BELOW_TALK = {"station", "links", "vault", "protocol", "teds", "shapes"}
+_BELOW_PROVISIONING = {"station", "links", "vault", "protocol", "teds", "shapes"}
 ARROWS = {
     "shapes": set(),
     "api": {"shapes"},
@@ -38,22 +38,21 @@ ARROWS = {
     "station": {"vault", "protocol", "teds", "shapes"},
     "node": {"links", "protocol", "teds", "firmware_image"},
     "trace": {"links", "protocol", "teds"},
-    "talk": _BELOW_TALK,
-    "steps": _BELOW_TALK | {"talk", "firmware_image"},
-    "handover": _BELOW_TALK | {"talk", "steps"},
-    "plant": _BELOW_TALK | {"talk", "steps", "handover"},
-    "measure": _BELOW_TALK | {"talk", "steps", "handover"},
+    "provisioning": _BELOW_PROVISIONING | {"firmware_image"},
+    "handover": _BELOW_PROVISIONING | {"provisioning"},
+    "plant": _BELOW_PROVISIONING | {"provisioning", "handover"},
+    "measure": _BELOW_PROVISIONING | {"provisioning", "handover"},
     "client": {"api", "shapes"},
-    "describe": _BELOW_TALK | {"talk", "steps", "handover", "measure", "api"},
-    "ncap": _BELOW_TALK
-    | {"talk", "steps", "handover", "plant", "measure", "node", "client", "api", "describe"}
+    "describe": _BELOW_PROVISIONING | {"provisioning", "handover", "measure", "api"},
+    "ncap": _BELOW_PROVISIONING
+    | {"provisioning", "handover", "plant", "measure", "node", "client", "api", "describe"}
     | {"firmware_image"},
-    "check": _BELOW_TALK | {"talk", "steps"},
+    "check": _BELOW_PROVISIONING | {"provisioning"},
     "backup": {"station", "vault", "protocol", "teds"},
     "doctor": {"station", "links", "vault", "protocol", "teds"},
-    "demo": _BELOW_TALK | {"talk", "steps", "handover", "plant", "measure", "client"},
-    "cli": _BELOW_TALK
-    | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure", "check", "ncap", "client", "api"}
+    "demo": _BELOW_PROVISIONING | {"provisioning", "handover", "plant", "measure", "client"},
+    "cli": _BELOW_PROVISIONING
+    | {"provisioning", "handover", "backup", "doctor", "demo", "node", "measure", "check", "ncap", "client", "api"}
     | {"trace", "plant", "describe", "firmware_image"},
     "__main__": {"cli"},
 }
@@ -168,7 +167,7 @@ def test_what_must_be_quick_loads_nothing_heavy(statement: str) -> None:
     assert not HEAVY.intersection(loaded), statement
 
 
-@pytest.mark.parametrize("module", ["steps.provision", "teds.sheet", "teds.formats", "teds.diff", "teds.fits"])
+@pytest.mark.parametrize("module", ["provisioning.provision", "teds.sheet", "teds.formats", "teds.diff", "teds.fits"])
 def test_numbers_without_a_calibration_need_no_numpy(module: str) -> None:
     ask = f"import sys, teds_provision.{module}; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, timeout=60, check=True)
@@ -179,7 +178,7 @@ _AT_A_NODE = ("at_node", "build", "provision", "verify", "whitelist")
 # Acts of a module beyond one for each of its commands: write --from brings back, --dry-run plans, verify takes files,
 # lists are planned, provision --firmware keys the board first.
 _MORE_ACTS = {"build": 2, "provision": 1, "verify": 2, "whitelist": 9}
-_ROOMS_THAT_ACT = ("steps", "talk", "links", "handover", "backup")
+_ROOMS_THAT_ACT = ("provisioning", "links", "handover", "backup")
 
 
 def room_of_name(dotted: str) -> str:
@@ -208,7 +207,7 @@ def named(tree: ast.Module) -> Iterator[tuple[str, str]]:
 
 def test_a_command_at_a_node_is_one_call_of_one_step() -> None:
     """A command that provisions takes one function of the rooms below; meetings, sessions and locks are not its own."""
-    for path in (PACKAGE / "cli" / f"{name}.py" for name in _AT_A_NODE):
+    for path in (PACKAGE / "cli" / "node" / f"{name}.py" for name in _AT_A_NODE):
         tree = parsed(path)
         commands = sum(
             isinstance(node, ast.FunctionDef) and any("command(" in ast.unparse(part) for part in node.decorator_list)
@@ -220,7 +219,8 @@ def test_a_command_at_a_node_is_one_call_of_one_step() -> None:
             if room_of_name(module) in _ROOMS_THAT_ACT and name[0].islower()
         }
         assert len(acts) <= commands + _MORE_ACTS.get(path.stem, 0), f"{path.name}: {sorted(acts)}"
-        assert not {module for module, _ in acts if module.split(".")[0] in ("talk", "links")}, path.name
+        conversing = ("links", "provisioning.meeting", "provisioning.conversation")
+        assert not {module for module, _ in acts if module.startswith(conversing)}, path.name
 
 
 # Who has one of them can read and write any row; the rest of the folder is records, locks and the audit log.

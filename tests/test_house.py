@@ -32,8 +32,8 @@ MANY_PARAMETERS = {
     "ncap/dynamic_membership.py __init__": _WIRED,
     "ncap/measurement_supervisor.py __init__": _WIRED,
     "ncap/nodes/link_watch.py __init__": _WIRED,
-    "steps/sign.py sign": "what a signature depends on, which each caller has from another place",
-    "steps/write.py _conclude": "what one durable write of the store holds",
+    "provisioning/sign.py sign": "what a signature depends on, which each caller has from another place",
+    "provisioning/write.py _conclude": "what one durable write of the store holds",
     "measure/topic_actuators.py __init__": "the session, the streams' clock and lock, and the two ways of an answer",
     "measure/capture.py capture_at": "a command's arguments, as each function of that name has them",
 }

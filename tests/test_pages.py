@@ -96,9 +96,9 @@ def test_the_ways_through_the_code_are_as_the_page_says() -> None:
     assert len(ways) == 7
     wrong = [name for way in ways for name in missing_on_the_way(way)]
     assert wrong == []
-    assert missing_on_the_way("`steps/verify.py` `judge`, `jugde` → `steps/verifi.py` `judge`") == [
-        "steps/verify.py jugde",
-        "steps/verifi.py",
+    assert missing_on_the_way("`provisioning/verify.py` `judge`, `jugde` → `provisioning/verifi.py` `judge`") == [
+        "provisioning/verify.py jugde",
+        "provisioning/verifi.py",
     ]
 
 
@@ -115,7 +115,9 @@ def missing_in_the_glossary(text: str) -> list[str]:
 def test_the_glossary_names_files_that_exist_and_defines_each_word_once() -> None:
     text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
     assert missing_in_the_glossary(text) == []
-    assert missing_in_the_glossary("`steps/verify.py` `steps/verifi.py` `../tests/strangers/`") == ["steps/verifi.py"]
+    assert missing_in_the_glossary("`provisioning/verify.py` `provisioning/verifi.py` `../tests/strangers/`") == [
+        "provisioning/verifi.py"
+    ]
     for section in text.split("\n## ")[1:]:
         words = [line.split("|")[1].strip() for line in section.splitlines() if line.startswith("| ")]
         assert sorted(set(words)) == sorted(words), section.splitlines()[0]

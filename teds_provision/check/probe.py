@@ -29,7 +29,7 @@ from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.messages.tables import describe_answer, describe_command, describe_reply
 from teds_provision.protocol.session import TAG_OCTETS, StationSession, open_mac
 from teds_provision.protocol.wire_agreement import AgreedKey, Credentials, key_id
-from teds_provision.talk.conversation import BUSY_PAUSE, BUSY_SECONDS
+from teds_provision.provisioning.conversation import BUSY_PAUSE, BUSY_SECONDS
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.image import SECURITY as SECURITY_TEDS

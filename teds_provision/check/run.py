@@ -24,12 +24,12 @@ from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import Function, Reason, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.wire_agreement import AgreedKey, key_id
+from teds_provision.provisioning.agree import open_session, reset_node
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.identify import examine
+from teds_provision.provisioning.meeting import meet
+from teds_provision.provisioning.progress import Reporter
 from teds_provision.station.station import NodeKey, Station
-from teds_provision.steps.agree import open_session, reset_node
-from teds_provision.steps.identify import examine
-from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.meeting import meet
-from teds_provision.talk.progress import Reporter
 
 _REGISTERS = (
     plain_rules,

@@ -8,7 +8,7 @@ import sys
 import click
 
 from teds_provision import demo as demo_room
-from teds_provision import talk
+from teds_provision import provisioning
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
 from teds_provision.cli.rendering import reporter_for
@@ -81,7 +81,7 @@ def _plant(app: App) -> None:
 
 
 def _page(app: App, http: str | None) -> None:
-    over = talk.meeting.IdleStop(None)
+    over = provisioning.meeting.IdleStop(None)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: over.request_stop())
     with demo_room.page.page_demo(app.note, http) as shown:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from teds_provision.errors import TedsProvisionError, UsageError
+from teds_provision.provisioning.progress import FAILED, NOTHING, SKIPPED, Reporter, SilentReporter, StepResult
 from teds_provision.sanitize import sanitize
-from teds_provision.talk.progress import FAILED, NOTHING, SKIPPED, Reporter, SilentReporter, StepResult
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import doctor, measure, steps
+from teds_provision import doctor, measure, provisioning
 from teds_provision.cli.context import App
 from teds_provision.cli.rendering import aligned, count_of, shown
 from teds_provision.errors import LinkError, NotFoundError, TedsProvisionError
@@ -70,7 +70,7 @@ def _station(station: Station) -> dict[str, Any]:
 
 def _of_links(station: Station, named: LinkSettings) -> dict[str, Any]:
     """Ask on the links themselves: the named ones, else those of the last contacts, and present readers."""
-    known = [node["uuid"] for node in steps.inventory.inventory(station, steps.inventory.search(station))]
+    known = [node["uuid"] for node in provisioning.inventory.inventory(station, provisioning.inventory.search(station))]
     remembered = sorted(set(station.nodes.last_places([bytes.fromhex(uuid) for uuid in known]).values()))
     places = [place for place in named.places if named.nfc] + list(named.buses or remembered)
     present = [*measure.link_survey.look(station, places), *([] if named.nfc else measure.link_survey.readers())]
@@ -92,7 +92,7 @@ def _link(link: LinkSurvey) -> dict[str, Any]:
 
 
 def _node(station: Station, place: str, address: int, who: Any) -> dict[str, Any]:
-    (known,) = steps.inventory.inventory(station, [who.uuid])
+    (known,) = provisioning.inventory.inventory(station, [who.uuid])
     return {
         "uuid": who.uuid.hex(),
         "name": known["name"],

@@ -7,10 +7,10 @@ from typing import Final
 
 from teds_provision.cli.context import App
 from teds_provision.errors import NotWhitelistedError, PolicyError
-from teds_provision.steps.adoption import FactoryDatasheet
-from teds_provision.steps.batch_sheet import DeclinedError
-from teds_provision.steps.identify import IdentifiedNode
-from teds_provision.steps.operator import Operator
+from teds_provision.provisioning.adoption import FactoryDatasheet
+from teds_provision.provisioning.batch_sheet import DeclinedError
+from teds_provision.provisioning.identify import IdentifiedNode
+from teds_provision.provisioning.operator import Operator
 from teds_provision.teds.diff import Change
 
 _CHANGES_SHOWN: Final = 20

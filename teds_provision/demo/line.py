@@ -28,13 +28,13 @@ from teds_provision.protocol.plant.document import MemberRequest
 from teds_provision.protocol.plant.job import CalibrationRule, Job, seal_job
 from teds_provision.protocol.plant.roster import Role
 from teds_provision.protocol.plant.signing import SignRequest
+from teds_provision.provisioning.board_type import WrongBoardError
+from teds_provision.provisioning.meeting import meet
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import Reporter, SilentReporter, StepResult
+from teds_provision.provisioning.provision import ProvisionResult, provision, verify_only
+from teds_provision.provisioning.verify import require_authentic
 from teds_provision.station.station import Station
-from teds_provision.steps.board_type import WrongBoardError
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import ProvisionResult, provision, verify_only
-from teds_provision.steps.verify import require_authentic
-from teds_provision.talk.meeting import meet
-from teds_provision.talk.progress import Reporter, SilentReporter, StepResult
 from teds_provision.teds.profile.load import default_folders, files_digest, find_profile
 
 OTHER = "tactile-finger-sensor"

@@ -25,14 +25,14 @@ from teds_provision.links.ports import free_port
 from teds_provision.plant.transport import Transport
 from teds_provision.protocol.plant.document import open_request
 from teds_provision.protocol.plant.roster import Role, Roster, Share
+from teds_provision.provisioning.agree import session_if_keyed
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.meeting import meet
+from teds_provision.provisioning.progress import Reporter, StepResult
+from teds_provision.provisioning.teds_read import read_image
+from teds_provision.provisioning.verify_node import verify_node
 from teds_provision.station.station import Station, initialise
-from teds_provision.steps.agree import session_if_keyed
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.identify import identify
-from teds_provision.steps.teds_read import read_image
-from teds_provision.steps.verify_node import verify_node
-from teds_provision.talk.meeting import meet
-from teds_provision.talk.progress import Reporter, StepResult
 
 _DATABASE: Final = "plant"
 _ROLES: Final[dict[str, frozenset[Role]]] = {

@@ -22,8 +22,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from teds_provision import steps as steps_room
-from teds_provision import vault
+from teds_provision import provisioning, vault
 from teds_provision.errors import LinkError, NotAuthenticError, PolicyError
 from teds_provision.handover.incoming import ImportResult, NodeProof, import_bundle, plan_import, prove_nodes
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
@@ -33,18 +32,18 @@ from teds_provision.lazy import late
 from teds_provision.links import LinkSettings, can
 from teds_provision.links.ports import free_port
 from teds_provision.protocol.keys import fingerprint
+from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.meeting import meet
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import Reporter, StepResult, Steps
+from teds_provision.provisioning.provision import ProvisionResult, provision
+from teds_provision.provisioning.teds_read import read_image
+from teds_provision.provisioning.verify import require_authentic
+from teds_provision.provisioning.verify_node import verify_node
 from teds_provision.station.station import Station, initialise
 from teds_provision.station.store import TrustRecord
-from teds_provision.steps.agree import require_session
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.identify import identify
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import ProvisionResult, provision
-from teds_provision.steps.teds_read import read_image
-from teds_provision.steps.verify import require_authentic
-from teds_provision.steps.verify_node import verify_node
-from teds_provision.talk.meeting import meet
-from teds_provision.talk.progress import Reporter, StepResult, Steps
 
 if TYPE_CHECKING:
     from teds_provision.measure import blocks, held_actuator, request, runner, sinks, verified_session
@@ -311,7 +310,7 @@ def new_station(demo: Demo, name: str) -> Station:
 def _over_can(demo: Demo, station: Station) -> None:
     provision_over(demo, station, "can", demo.uuid, BuildOrder(PROFILE, name="crane slew angle"))
     with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node, demo.steps.step("rotate") as step:
-        agreed = steps_room.agree.agree(station, node, steps_room.identify.identify(station, node), rotate=True)
+        agreed = provisioning.agree.agree(station, node, provisioning.identify.identify(station, node), rotate=True)
         step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"
 
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 from teds_provision.errors import BadDataError, NotFoundError
+from teds_provision.provisioning.readings import verdict_of
+from teds_provision.provisioning.verify import require_authentic
 from teds_provision.station.shown_units import shown_units
 from teds_provision.station.station import Station
-from teds_provision.steps.readings import verdict_of
-from teds_provision.steps.verify import require_authentic
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.formats.xmlform import parse

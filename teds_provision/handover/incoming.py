@@ -26,15 +26,15 @@ from teds_provision.protocol.handover.revocation import Revocation as Statement
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.progress import Reporter
 from teds_provision.station.bulk import BulkRows
 from teds_provision.station.groups import valid_name
 from teds_provision.station.node_keys import MAX_PENDING
 from teds_provision.station.station import Station
 from teds_provision.station.store import Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, chunks, utc_now
-from teds_provision.steps.agree import require_session
-from teds_provision.steps.identify import identify
-from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import Reporter
 
 # Nodes that come with a bundle: what becomes of each, and the rows of those that are taken in.
 

@@ -15,11 +15,11 @@ from typing import Final
 from teds_provision.errors import BadDataError, BadDatasheetError, GarbledError, NodeRefusedError, NodeSilentError
 from teds_provision.measure.buses import MeasuredBus
 from teds_provision.measure.verified_session import VerifiedSession
+from teds_provision.provisioning import readings
+from teds_provision.provisioning.teds_read import read_in_between
+from teds_provision.provisioning.verify import freshness_floor_of
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import iso
-from teds_provision.steps import readings
-from teds_provision.steps.teds_read import read_in_between
-from teds_provision.steps.verify import freshness_floor_of
 from teds_provision.teds.image import Image
 
 GAP: Final = 1  # ms between the frames of a reply: of a bus of 500 kbit/s three quarters stay free meanwhile

@@ -18,7 +18,7 @@ from teds_provision.errors import BadDataError, LinkError, PolicyError, TedsProv
 from teds_provision.measure.sinks.lines import plain
 from teds_provision.measure.verified_session import DEAD_MAN, LEASE, VerifiedSession, claim, operation
 from teds_provision.protocol.operation.commands import ChannelState, idle, write_data_set
-from teds_provision.talk.conversation import SessionLostError
+from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.sheet import Channel
 from teds_provision.teds.units import WrittenUnit, parse_unit

@@ -22,11 +22,11 @@ from teds_provision.measure.planning import BusTime, plan_node, sensors_of
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.sinks.base import ROWS
 from teds_provision.measure.standing import why_not_measured
+from teds_provision.provisioning.board_type import misfit
+from teds_provision.provisioning.readings import verdict_of
 from teds_provision.station.groups import ALL
 from teds_provision.station.overview import Search
 from teds_provision.station.station import Station
-from teds_provision.steps.board_type import misfit
-from teds_provision.steps.readings import verdict_of
 from teds_provision.teds.fits import Requirement, judge, met, parse_fits
 from teds_provision.teds.profile.load import (
     default_folders,

@@ -51,10 +51,10 @@ from teds_provision.measure.verified_session import (
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import idle
 from teds_provision.protocol.operation.stream_commands import SOON
+from teds_provision.provisioning.conversation import Conversation, SessionLostError
+from teds_provision.provisioning.firmware import firmware_warning, read_firmware, require_good_firmware
 from teds_provision.station.firmware import firmware_of
 from teds_provision.station.station import Station
-from teds_provision.steps.firmware import firmware_warning, read_firmware, require_good_firmware
-from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.teds.sheet import Channel
 
 _log = logging.getLogger(__name__)

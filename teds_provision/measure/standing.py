@@ -19,9 +19,9 @@ from teds_provision.errors import (
     PolicyError,
     TedsProvisionError,
 )
+from teds_provision.provisioning.readings import verdict_of
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import iso
-from teds_provision.steps.readings import verdict_of
 
 SETTLING: Final = 0.5
 """Seconds between two judgements of one node while the store changes all the time."""

@@ -29,7 +29,7 @@ from teds_provision.protocol.operation.commands import write_data_set
 from teds_provision.protocol.operation.datagram import Layout
 from teds_provision.protocol.operation.driving import Driver
 from teds_provision.protocol.operation.stream_commands import CLOCK, DriveReply, drive
-from teds_provision.talk.conversation import SessionLostError
+from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 
 DRIVE_ABOVE = 50  # set points a second

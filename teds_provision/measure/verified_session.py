@@ -17,15 +17,15 @@ from teds_provision.measure.standing import require_measurable
 from teds_provision.protocol.operation import commands
 from teds_provision.protocol.operation.commands import OperationReply
 from teds_provision.protocol.operation.stream_commands import CLOCK, ClockReply
+from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.board_type import operate
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.readings import keep
+from teds_provision.provisioning.teds_read import read_image
+from teds_provision.provisioning.verify import freshness_floor_of, require_authentic
+from teds_provision.provisioning.verify_node import NodeVerification, verify_in_session
 from teds_provision.station.shown_units import channel_profiles, shown_units
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import require_session
-from teds_provision.steps.board_type import operate
-from teds_provision.steps.readings import keep
-from teds_provision.steps.teds_read import read_image
-from teds_provision.steps.verify import freshness_floor_of, require_authentic
-from teds_provision.steps.verify_node import NodeVerification, verify_in_session
-from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.profile import ChannelProfile
 from teds_provision.teds.sheet import Channel, ChannelKind, Sheet
 

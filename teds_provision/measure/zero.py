@@ -21,15 +21,15 @@ from teds_provision.measure.sources import beside
 from teds_provision.measure.verified_session import VerifiedSession, operation, trusted_from
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.operation.commands import ChannelState
+from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.calibration_guard import guard
+from teds_provision.provisioning.commands import NodeVisit, at_node
+from teds_provision.provisioning.conversation import SessionLostError
+from teds_provision.provisioning.progress import DONE, NOTHING, Reporter, StepResult, Steps
+from teds_provision.provisioning.sign import require_not_measured, sign
+from teds_provision.provisioning.verify_node import NodeVerification, verify_in_session, verify_node
+from teds_provision.provisioning.write import Low, wait_for_charge, write
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import require_session
-from teds_provision.steps.calibration_guard import guard
-from teds_provision.steps.commands import NodeVisit, at_node
-from teds_provision.steps.sign import require_not_measured, sign
-from teds_provision.steps.verify_node import NodeVerification, verify_in_session, verify_node
-from teds_provision.steps.write import Low, wait_for_charge, write
-from teds_provision.talk.conversation import SessionLostError
-from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.zero import offset_for, reading_of, shortest, turn_of, with_zero_offset
 from teds_provision.teds.channel import TURN, Channel, wrapped

@@ -17,5 +17,5 @@ module                      what it does
 ==========================  ========================================================================
 
 Threads do what talks to nodes and to the disk; one event loop serves the clients. Nothing here writes keys, whitelist
-or TEDS except through ``steps``.
+or TEDS except through ``provisioning``.
 """

@@ -42,9 +42,9 @@ from teds_provision.ncap.settings import Detection, Settings, own_source
 from teds_provision.ncap.sinks import DaemonSinks
 from teds_provision.ncap.waits import USUAL, Waits
 from teds_provision.ncap.web.tokens import Tokens
+from teds_provision.provisioning.commands import locate_here, locate_measured
+from teds_provision.provisioning.conversation import Conversation
 from teds_provision.station.station import Station
-from teds_provision.steps.commands import locate_here, locate_measured
-from teds_provision.talk.conversation import Conversation
 
 _log = logging.getLogger(__name__)
 _ENDING: Final = 8.0

@@ -14,10 +14,10 @@ from teds_provision.protocol.keys import prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.plant.evidence import NONCE_OCTETS, EvidenceClaim, seal
 from teds_provision.protocol.wire_agreement import Credentials
+from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.station.plant.line import EvidenceRow
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now
-from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.teds.codec import security
 
 TOOL = f"teds-provision {__version__}"

@@ -21,20 +21,20 @@ from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant.evidence import FAILED, PASSED, BoardFacts, EvidenceClaim, blocks_of, firmware_facts
 from teds_provision.protocol.plant.job import WORTH, Job
+from teds_provision.provisioning.batch_sheet import BoardResult
+from teds_provision.provisioning.board_type import WrongBoardError
+from teds_provision.provisioning.build import BuildOrder, PreparedOrder, Proposal, prepare, profile_files_digest
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.identify import IdentifiedNode
+from teds_provision.provisioning.progress import DONE, StepResult
+from teds_provision.provisioning.progress import FAILED as STEP_FAILED
+from teds_provision.provisioning.provision import ProvisionResult
+from teds_provision.provisioning.sign import SignResult
+from teds_provision.provisioning.teds_read import NodeSnapshot
 from teds_provision.station.label import label_of, read_label, write_label
 from teds_provision.station.plant.line import EvidenceRow, UnitRow
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry, utc_now
-from teds_provision.steps.batch_sheet import BoardResult
-from teds_provision.steps.board_type import WrongBoardError
-from teds_provision.steps.build import BuildOrder, PreparedOrder, Proposal, prepare, profile_files_digest
-from teds_provision.steps.identify import IdentifiedNode
-from teds_provision.steps.provision import ProvisionResult
-from teds_provision.steps.sign import SignResult
-from teds_provision.steps.teds_read import NodeSnapshot
-from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import DONE, StepResult
-from teds_provision.talk.progress import FAILED as STEP_FAILED
 from teds_provision.teds.certificate import certificate_reference_of
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
@@ -375,7 +375,7 @@ class Scans:
 
 @dataclass
 class LineUnit:
-    """One board of a run; see :class:`teds_provision.steps.provision.Unit`."""
+    """One board of a run; see :class:`teds_provision.provisioning.provision.Unit`."""
 
     run: LineRun
     prepared: PreparedOrder

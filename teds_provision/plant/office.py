@@ -33,12 +33,12 @@ from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.job import Job
 from teds_provision.protocol.plant.roster import MOST_AHEAD
 from teds_provision.protocol.plant.signing import Answer, SignRequest, open_answer, open_request, seal_answer
+from teds_provision.provisioning.build import check_name
+from teds_provision.provisioning.calibration_guard import guard
+from teds_provision.provisioning.sign import sign
 from teds_provision.station.plant.line import SignRequestRow, UnitRow
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry, utc_now
-from teds_provision.steps.build import check_name
-from teds_provision.steps.calibration_guard import guard
-from teds_provision.steps.sign import sign
 from teds_provision.teds.calibration.files import read_calibrations
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.image import SECURITY, Image

@@ -50,15 +50,15 @@ from teds_provision.protocol.plant.signing import (
     open_request,
     seal_request,
 )
+from teds_provision.provisioning.build import own_name
+from teds_provision.provisioning.commands import at_node
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.progress import Reporter
+from teds_provision.provisioning.sign import SignResult
+from teds_provision.provisioning.teds_read import read_identity
 from teds_provision.station.plant.line import SignRequestRow
 from teds_provision.station.station import Station
 from teds_provision.station.store import Draft
-from teds_provision.steps.build import own_name
-from teds_provision.steps.commands import at_node
-from teds_provision.steps.sign import SignResult
-from teds_provision.steps.teds_read import read_identity
-from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import Reporter
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY, Image
 

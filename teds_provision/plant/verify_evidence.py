@@ -22,9 +22,9 @@ from teds_provision.protocol.plant.roster import Roster, open_roster
 from teds_provision.teds.codec import security
 
 if TYPE_CHECKING:
-    from teds_provision.steps import whitelist
+    from teds_provision.provisioning import whitelist
 else:  # it brings the store along, which nothing else here needs
-    whitelist = late("teds_provision.steps.whitelist")
+    whitelist = late("teds_provision.provisioning.whitelist")
 
 _FEW: Final = 50
 """So many are judged sooner than another process is ready."""

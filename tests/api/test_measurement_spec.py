@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from teds_provision.api import answers, bodies
-from teds_provision.cli.measure import measure
+from teds_provision.cli.measure.measure import measure
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.running.measurement_job import request_of
 from teds_provision.shapes.measurement import NAMES, OPTIONS, PUBLISHED, MeasurementMembers, MeasurementSpec

@@ -13,8 +13,8 @@ import pytest
 from teds_provision.check import session_rules
 from teds_provision.check.run import CheckReport, check_at
 from teds_provision.links import LinkSettings
+from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
-from teds_provision.talk.progress import SilentReporter
 from tests.check.board import ADDRESS_SECONDS
 from tests.cli.shell import clean_environment
 from tests.pace import PATIENCE

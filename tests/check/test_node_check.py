@@ -15,9 +15,9 @@ from teds_provision.check.run import CheckReport, check_node
 from teds_provision.errors import GarbledError, MessageTooLongError, NodeSilentError, PolicyError
 from teds_provision.protocol.messages.frames import Function, Reason, decode_reply, refusal, security_command
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning.agree import reset_node
+from teds_provision.provisioning.identify import identify
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import reset_node
-from teds_provision.steps.identify import identify
 from tests.protocol.operation.bench import SAFE_VALUE
 
 from .. import bench

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import pytest
 from rich.console import Console
 
-from teds_provision.cli.provision import BoardReporter, OperatorScreen
+from teds_provision.cli.node.provision import BoardReporter, OperatorScreen
 from teds_provision.errors import NodeSilentError, TedsProvisionError
-from teds_provision.steps.batch_sheet import BoardResult, DeclinedError, SheetRow
-from teds_provision.steps.build import BuildOrder, PreparedOrder
-from teds_provision.talk.progress import SilentReporter
+from teds_provision.provisioning.batch_sheet import BoardResult, DeclinedError, SheetRow
+from teds_provision.provisioning.build import BuildOrder, PreparedOrder
+from teds_provision.provisioning.progress import SilentReporter
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")
 LONG = "the left knee of the third robot in hall B, at the very end of the row, behind the crane, and then to the right"

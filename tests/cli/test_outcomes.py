@@ -16,13 +16,13 @@ from teds_provision.cli.terminal_operator import TerminalOperator
 from teds_provision.errors import NotAuthenticError
 from teds_provision.links import Notice
 from teds_provision.links.nfc.message import NdefRecord
+from teds_provision.provisioning.agree import agree
+from teds_provision.provisioning.build import BuildOrder, build
+from teds_provision.provisioning.commands import SignOrder, sign_image
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import provision
 from teds_provision.station.store import StoreLock, WhitelistEntry
-from teds_provision.steps.agree import agree
-from teds_provision.steps.build import BuildOrder, build
-from teds_provision.steps.commands import SignOrder, sign_image
-from teds_provision.steps.identify import identify
-from teds_provision.steps.provision import provision
-from teds_provision.talk.progress import SilentReporter
 
 from ..bench import PASSPHRASE, Board, make_station, talk
 from .shell import call, clean_environment, spawn

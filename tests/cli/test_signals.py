@@ -10,8 +10,8 @@ from tests.test_architecture import MODULES
 
 INTERRUPTED = """
 import signal, sys
-from teds_provision.cli.sample import ending
-from teds_provision.talk.meeting import IdleStop
+from teds_provision.cli.measure.sample import ending
+from teds_provision.provisioning.meeting import IdleStop
 stop = IdleStop(None)
 with ending(stop):
     with stop._cond:  # as for some microseconds in each wait

@@ -10,14 +10,14 @@ import click
 import pytest
 
 from teds_provision.cli.config_file import Defaults
+from teds_provision.cli.measure.sample import over_the_bus
 from teds_provision.cli.options import link_options
-from teds_provision.cli.sample import over_the_bus
 from teds_provision.errors import TedsProvisionError
 from teds_provision.links import LinkSettings
 from teds_provision.links.nfc import pcsc_readers, reader
 from teds_provision.links.ports import LISTEN_SECONDS
+from teds_provision.provisioning import sign
 from teds_provision.station.station import Station
-from teds_provision.steps import sign
 from tests.bench import PASSPHRASE
 from tests.places import free_bus
 

@@ -19,11 +19,11 @@ from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError
 from teds_provision.handover.life import revoke
 from teds_provision.measure.running.measurement_job import station_facts
 from teds_provision.measure.sinks.names import Topics
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import provision
 from teds_provision.station.station import Station
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import provision
-from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.profile.load import shipped_profiles
 from tests.bench import Board, talk
 from tests.cli.shell import call

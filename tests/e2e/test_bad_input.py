@@ -165,7 +165,7 @@ def test_a_node_whose_flash_fails_is_refused_by_it_and_stays_as_it_was(station: 
 
 
 def test_an_image_that_was_tampered_with_is_not_authentic(station: Station, finished: Node, tmp_path: Path) -> None:
-    """One octet in each TEDS, and in each part of the Security TEDS; every single octet: tests/steps."""
+    """One octet in each TEDS, and in each part of the Security TEDS; every single octet: tests/provisioning."""
     image, file = tmp_path / "image.json", tmp_path / "tampered.json"
     station.ask("read", finished.uuid, "--output", image, *station.desk.links.over("nfc"))
     assert station.ask("verify", image)["verdict"] == "authentic"

@@ -15,12 +15,12 @@ import pytest
 from teds_provision.errors import LinkError, NoReaderError
 from teds_provision.links import LinkSettings
 from teds_provision.links.nfc import port
+from teds_provision.provisioning.batch import BatchRun, ProvisionRequest
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.inventory import inventory
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station as BaseStation
-from teds_provision.steps.batch import BatchRun, ProvisionRequest
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.inventory import inventory
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.talk.progress import SilentReporter
 from tests.bench import PASSPHRASE
 from tests.links.nfc.field import Field
 

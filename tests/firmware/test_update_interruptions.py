@@ -14,13 +14,13 @@ from teds_provision.errors import NodeSilentError
 from teds_provision.firmware_image import FirmwareImage, load_firmware_image
 from teds_provision.links import LinkSettings
 from teds_provision.links.can.link import CanLink
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.meeting import meet
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import provision
+from teds_provision.provisioning.update import BoardUpdate, UpdateOrder, update_boards
 from teds_provision.station.station import Station
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import provision
-from teds_provision.steps.update import BoardUpdate, UpdateOrder, update_boards
-from teds_provision.talk.meeting import meet
-from teds_provision.talk.progress import SilentReporter
 from tests.bench import PASSPHRASE, make_station
 from tests.e2e.desk import Desk
 from tests.firmware.conftest import CNode

@@ -350,8 +350,8 @@ def check_update(data: bytes) -> None:
     replies ``length u8 ‖ body``, the last one again and again. The upload ends, whatever comes."""
     from teds_provision.links.ports import Contact
     from teds_provision.protocol.messages.identity import Identity, NodeState
-    from teds_provision.steps.image_manager import ImageManager
-    from teds_provision.talk.conversation import Conversation
+    from teds_provision.provisioning.conversation import Conversation
+    from teds_provision.provisioning.image_manager import ImageManager
 
     if not data:
         return
@@ -425,7 +425,7 @@ def update_seeds() -> list[bytes]:
 def check_about(data: bytes) -> None:
     """Replies to About and Locate, and what the station keeps and shows of one."""
     from teds_provision.protocol.messages.firmware import FirmwareReport
-    from teds_provision.steps.update import version_of
+    from teds_provision.provisioning.update import version_of
 
     with suppress(TedsProvisionError):
         report = FirmwareReport.decode(data)
@@ -591,7 +591,7 @@ def backup_seeds() -> Iterable[bytes]:
 
 def check_whitelist(data: bytes) -> None:
     """Whitelists that other people write: XML, CSV, JSON by the first octet."""
-    from teds_provision.steps import whitelist
+    from teds_provision.provisioning import whitelist
 
     if not data:
         return

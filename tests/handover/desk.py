@@ -11,14 +11,14 @@ from teds_provision.handover.outgoing import ExportOrder, ExportResult, export_b
 from teds_provision.protocol.handover.bundle import Mode
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.wire_agreement import key_id
+from teds_provision.provisioning.agree import agree, require_session
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.station.station import Station
 from teds_provision.station.store import Handover, TrustRecord, WhitelistEntry
-from teds_provision.steps.agree import agree, require_session
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.identify import identify
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import ProvisionResult, provision
-from teds_provision.talk.progress import SilentReporter
 from tests.bench import Board, MemoryLink, make_station, talk
 
 

@@ -9,9 +9,9 @@ import pytest
 from teds_provision.errors import PolicyError
 from teds_provision.handover.incoming import prove_node
 from teds_provision.handover.pending import close
-from teds_provision.steps.agree import agree
-from teds_provision.steps.identify import identify
-from teds_provision.steps.teds_read import read_image
+from teds_provision.provisioning.agree import agree
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.teds_read import read_image
 from tests.bench import MemoryLink, make_station, talk
 from tests.handover.desk import Pair, held, row, session, trust
 

@@ -23,15 +23,15 @@ from teds_provision.handover.trust import (
     write_certificate,
 )
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning.agree import agree, require_session
+from teds_provision.provisioning.build import BuildOrder, build
+from teds_provision.provisioning.commands import SignOrder, sign_image
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.verify import Verification, verify_image
+from teds_provision.provisioning.verify_node import verify_at_node
+from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station, initialise
 from teds_provision.station.store import WhitelistEntry
-from teds_provision.steps.agree import agree, require_session
-from teds_provision.steps.build import BuildOrder, build
-from teds_provision.steps.commands import SignOrder, sign_image
-from teds_provision.steps.identify import identify
-from teds_provision.steps.verify import Verification, verify_image
-from teds_provision.steps.verify_node import verify_at_node
-from teds_provision.steps.write import write
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.vault import forget_vaults

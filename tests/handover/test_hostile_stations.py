@@ -28,12 +28,12 @@ from teds_provision.protocol.handover.receipt import TYPE, open_receipt, seal_re
 from teds_provision.protocol.handover.revocation import seal_revocation
 from teds_provision.protocol.keys import station_key_message
 from teds_provision.protocol.messages.frames import Command
+from teds_provision.provisioning.agree import agree, require_session
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.sign import known_node_keys, sign
+from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station
 from teds_provision.station.store import NodeRecord
-from teds_provision.steps.agree import agree, require_session
-from teds_provision.steps.identify import identify
-from teds_provision.steps.sign import known_node_keys, sign
-from teds_provision.steps.write import write
 from tests.bench import Board, MemoryLink, make_station, talk
 from tests.handover.desk import Pair, held, key_up, provisioned, session, trust
 

@@ -13,8 +13,8 @@ from teds_provision.handover.incoming import ImportPlan, ImportResult, import_bu
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import close
 from teds_provision.protocol.wire_agreement import key_id
-from teds_provision.steps.agree import agree, reset_node
-from teds_provision.steps.identify import identify
+from teds_provision.provisioning.agree import agree, reset_node
+from teds_provision.provisioning.identify import identify
 from tests.bench import Board, make_station, talk
 from tests.handover.desk import Pair, everything, held, key_up, provisioned, session
 

@@ -12,13 +12,13 @@ from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_imp
 from teds_provision.handover.life import is_finished, plan_takeover, retire, revoke, take_over
 from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning.agree import ResetReceipt, agree, reset_node
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.inventory import inventory
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.verify import verify_image
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry
-from teds_provision.steps.agree import ResetReceipt, agree, reset_node
-from teds_provision.steps.identify import identify
-from teds_provision.steps.inventory import inventory
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.verify import verify_image
 from teds_provision.teds.image import Image
 from tests.bench import Board, talk
 from tests.handover.desk import Pair, held, key_up, provisioned, session
@@ -164,9 +164,9 @@ def test_a_spare_takes_over_name_groups_and_profile(pair: Pair) -> None:
 
 
 def calibrated(pair: Pair, tmp_path: Path) -> Board:
-    from teds_provision.steps.build import BuildOrder
-    from teds_provision.steps.provision import provision
-    from teds_provision.talk.progress import SilentReporter
+    from teds_provision.provisioning.build import BuildOrder
+    from teds_provision.provisioning.progress import SilentReporter
+    from teds_provision.provisioning.provision import provision
 
     board = Board(uuid=bytes.fromhex("8d4d9da65281f700aaaa"))
     calibration = tmp_path / "calibration.csv"

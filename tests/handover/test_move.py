@@ -12,12 +12,12 @@ from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError, 
 from teds_provision.handover.incoming import ImportPlan, plan_import, prove_node, proven_of
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import content_digest
+from teds_provision.provisioning.agree import agree, open_session
+from teds_provision.provisioning.commands import set_address
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.teds_read import read_image
+from teds_provision.provisioning.verify_node import verify_node
 from teds_provision.station.store import RevocationRecord
-from teds_provision.steps.agree import agree, open_session
-from teds_provision.steps.commands import set_address
-from teds_provision.steps.identify import identify
-from teds_provision.steps.teds_read import read_image
-from teds_provision.steps.verify_node import verify_node
 from tests.bench import MemoryLink, make_station, talk
 from tests.handover.desk import Pair, held, node_key_id, provisioned, session, trust
 

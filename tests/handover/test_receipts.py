@@ -11,9 +11,9 @@ import pytest
 from teds_provision.errors import NotAuthenticError, NotFoundError, PolicyError
 from teds_provision.handover.pending import close, find_handover, list_handovers, undo
 from teds_provision.protocol.handover.receipt import open_receipt
+from teds_provision.provisioning.agree import agree
+from teds_provision.provisioning.identify import identify
 from teds_provision.station.store import WhitelistEntry
-from teds_provision.steps.agree import agree
-from teds_provision.steps.identify import identify
 from tests.bench import make_station, talk
 from tests.handover.desk import Pair, everything, held, row, session, trust
 

@@ -10,9 +10,9 @@ from teds_provision.backup.backup import backup
 from teds_provision.backup.restore import rebuild
 from teds_provision.backup.sealed_file import SealedFile
 from teds_provision.errors import NodeSilentError, PolicyError
+from teds_provision.provisioning.agree import agree, open_session, require_session
+from teds_provision.provisioning.identify import identify
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import agree, open_session, require_session
-from teds_provision.steps.identify import identify
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
 from tests.bench import PASSPHRASE, Board, MemoryLink, make_station, talk

@@ -29,7 +29,7 @@ from teds_provision.protocol.operation.commands import EITHER, OPERATE_FUNCTION
 from teds_provision.protocol.operation.hardware import RawReading
 from teds_provision.protocol.operation.stream_commands import ClockReply, SubscribeReply
 from teds_provision.protocol.operation.streams import DataFrame, Stream
-from teds_provision.talk.meeting import IdleStop
+from teds_provision.provisioning.meeting import IdleStop
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.sheet import Sheet
 

@@ -13,15 +13,15 @@ from typing import Any
 
 from teds_provision.node.node_template import create
 from teds_provision.node.virtual import VirtualNode
+from teds_provision.provisioning.agree import agree
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import provision
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry, utc_now
-from teds_provision.steps.agree import agree
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.identify import identify
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import provision
-from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import SilentReporter
 from tests.bench import make_station, on_reader
 from tests.e2e.desk import ANGLE, Desk, Running
 from tests.e2e.desk import Station as Commands

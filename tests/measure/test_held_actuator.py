@@ -13,7 +13,7 @@ from teds_provision.measure.held_actuator import HeldActuator
 from teds_provision.measure.verified_session import VerifiedSession
 from teds_provision.protocol.messages.frames import Command, Function
 from teds_provision.protocol.operation.commands import ChannelState, OperationReply
-from teds_provision.talk.conversation import SessionLostError
+from teds_provision.provisioning.conversation import SessionLostError
 from tests.measure.test_topic_actuators import SHEET
 
 DEAD_MAN = 400

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from defusedxml import ElementTree
 
-from teds_provision.cli.measure import measure
+from teds_provision.cli.measure.measure import measure
 from teds_provision.measure.sinks.live import COMMANDS, STATES
 from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE
 

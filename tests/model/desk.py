@@ -32,13 +32,13 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.wire_agreement import key_id
+from teds_provision.provisioning.agree import _agree_anew, agree, open_session, reset_node
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.teds_read import read_block
 from teds_provision.station import node_keys
 from teds_provision.station.station import Station
 from teds_provision.station.store import TrustRecord, WhitelistEntry
-from teds_provision.steps.agree import _agree_anew, agree, open_session, reset_node
-from teds_provision.steps.identify import identify
-from teds_provision.steps.teds_read import read_block
-from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.image import SECURITY
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY

@@ -121,7 +121,7 @@ def _functions(node: ast.AST, of: str) -> Iterator[tuple[str, ast.FunctionDef | 
 
 
 def modules(room: str = "") -> list[Module]:
-    """Every module of the package below ``room`` (``steps``, ``protocol/tim``, ``steps/agree.py``)."""
+    """Every module of the package below ``room`` (``steps``, ``protocol/tim``, ``provisioning/agree.py``)."""
     place = PACKAGE / room
     paths = [place] if place.is_file() else sorted(place.rglob("*.py"))
     return [Module(path.relative_to(ROOT).as_posix(), path.read_text()) for path in paths]

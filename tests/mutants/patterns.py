@@ -20,7 +20,7 @@ PATTERNS = (
         "_agree_anew",
         "returning and not agreed.unsigned",
         "False",
-        "tests/steps/test_pinning.py",
+        "tests/provisioning/test_pinning.py",
     ),
     Pattern(
         "a lost-out station never agrees by itself",
@@ -49,13 +49,13 @@ PATTERNS = (
         "station.keys.rotates_now(node.uuid)",
         "False",
     ),
-    Pattern("only a tap pins", "_pin_for", "node.tapped", "True", "tests/steps/test_agree.py"),
+    Pattern("only a tap pins", "_pin_for", "node.tapped", "True", "tests/provisioning/test_agree.py"),
     Pattern(
         "only a new node's bus pins",
         "_pin_for",
         "who.state == NodeState.FACTORY and node.wired",
         "node.wired",
-        "tests/steps/test_agree.py",
+        "tests/provisioning/test_agree.py",
     ),
     Pattern("a held-back Confirm finds its key", "NodeKeys.outdated", "other.created >= late", "False"),
     Pattern("eight pending keys", "NodeKeys.add_pending", "pending[MAX_PENDING - 1:]", "[]"),
@@ -70,7 +70,7 @@ PATTERNS = (
         "Pins.epoch_to_exceed",
         "not same_key(former, pinned)",
         "False",
-        "tests/steps/test_agree.py",
+        "tests/provisioning/test_agree.py",
     ),
     Pattern(
         "only its receiver hands back",
@@ -216,7 +216,7 @@ PATTERNS = (
         "_require_newer",
         "signed.key_epoch != identity.epoch",
         "False",
-        "tests/steps/test_verify.py",
+        "tests/provisioning/test_verify.py",
     ),
     Pattern(
         "write asks before a jump",
@@ -236,7 +236,7 @@ PATTERNS = (
         "sign",
         "number > node_sequence",
         "True",
-        "tests/steps/test_verify.py",
+        "tests/provisioning/test_verify.py",
     ),
     # the plant
     Pattern(
@@ -279,7 +279,7 @@ PATTERNS = (
         "Conversation.lives",
         "not self._is_noisy",
         "True",
-        "tests/talk/test_opening.py",
+        "tests/provisioning/test_opening.py",
     ),
     Pattern(
         "an option that an interface does not take is named",
@@ -471,7 +471,7 @@ PATTERNS = (
         "False",
         "tests/plant/test_evidence.py",
     ),
-    # firmware (protocol/tim/manage.py, node/firmware, steps/update.py)
+    # firmware (protocol/tim/manage.py, node/firmware, provisioning/update.py)
     Pattern(
         "no packet passes that is not listed",
         "ManageFilter.run",
@@ -533,35 +533,35 @@ PATTERNS = (
         "ImageManager._upload_once",
         "stuck >= _STUCK",
         "False",
-        "tests/steps/test_update.py",
+        "tests/provisioning/test_update.py",
     ),
     Pattern(
         "a value of another type is no reply",
         "ImageManager._ask",
         "not _is_same(values, loaded.model_dump(include=set(values)))",
         "False",
-        "tests/steps/test_update.py",
+        "tests/provisioning/test_update.py",
     ),
     Pattern(
         "an image that confirmed itself is not proven",
         "_Update._prove",
         "FirmwareFlag.ON_TRIAL not in report.flags",
         "False",
-        "tests/steps/test_update.py",
+        "tests/provisioning/test_update.py",
     ),
     Pattern(
         "the datasheet is the same after the restart",
         "_Update._prove",
         "read_block(node, SECURITY) != before.security",
         "False",
-        "tests/steps/test_update.py",
+        "tests/provisioning/test_update.py",
     ),
     Pattern(
         "a new image shows a valid value",
         "require_working_hardware",
         "free and (not any((_gives_value(node, channel, digest) for channel in free[:_TRIED])))",
         "False",
-        "tests/steps/test_update.py",
+        "tests/provisioning/test_update.py",
     ),
 )
 

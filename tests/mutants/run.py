@@ -182,7 +182,9 @@ def main(arguments: list[str]) -> int:
     """Run the bench."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=300, help="patterns and random ones together")
-    parser.add_argument("--room", default="", help="a room or a module: steps, protocol/tim, steps/agree.py; firmware")
+    parser.add_argument(
+        "--room", default="", help="a room or a module: steps, protocol/tim, provisioning/agree.py; firmware"
+    )
     parser.add_argument("--minutes", type=float, default=60)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=int, default=0, help="0: another sample each time, told")

@@ -57,6 +57,6 @@ def test_the_nearest_tests_of_a_module_come_first(house: list[Module]) -> None:
         mutant: Mutant = any_of(module)[0]
         return tests.nearest(mutant, 4)
 
-    assert "tests/steps/test_agree.py" in first("steps/agree.py")
+    assert "tests/provisioning/test_agree.py" in first("provisioning/agree.py")
     assert "tests/ncap/test_guard.py" in first("ncap/web/tokens.py")
     assert any(path.startswith("tests/protocol/") for path in first("protocol/tim/teds_access.py"))

@@ -17,7 +17,7 @@ from teds_provision.teds.image import BlockId
 from tests.e2e.desk import Desk, Node
 from tests.ncap.service import Service, verdict
 from tests.pace import until
-from tests.steps.test_adopting import factory, named
+from tests.provisioning.test_adopting import factory, named
 
 pytestmark = pytest.mark.link
 

@@ -21,11 +21,11 @@ from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
 from teds_provision.ncap.nodes.inspection import look
 from teds_provision.ncap.nodes.link_watch import MOST_KNOWN, LinkWatch
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
+from teds_provision.provisioning.conversation import Conversation
 from teds_provision.station.store import KeptMeasurement
-from teds_provision.talk.conversation import Conversation
 from tests.bench import MemoryLink, contact, make_station
 from tests.pace import until
-from tests.steps.test_firmware import FirmwareBoard
+from tests.provisioning.test_firmware import FirmwareBoard
 
 
 class Silence:

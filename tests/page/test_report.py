@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from teds_provision.errors import NodeSilentError
+from teds_provision.provisioning.batch_sheet import BoardResult, Progress, ReportHead, read_sheet, write_report
+from teds_provision.provisioning.build import BuildOrder
 from teds_provision.station.station import Station
-from teds_provision.steps.batch_sheet import BoardResult, Progress, ReportHead, read_sheet, write_report
-from teds_provision.steps.build import BuildOrder
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

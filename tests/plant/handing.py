@@ -16,11 +16,11 @@ from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.fold import LocalState, MergedClaims, merge_claims
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster, Share, open_roster, seal_roster
+from teds_provision.provisioning.agree import agree
+from teds_provision.provisioning.identify import identify
 from teds_provision.station.plant.plant import PlantRecord, RosterRow
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry, utc_now
-from teds_provision.steps.agree import agree
-from teds_provision.steps.identify import identify
 from tests.bench import PASSPHRASE, Board, make_station, talk
 
 REGISTRY = "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"

@@ -18,7 +18,7 @@ from teds_provision.station.station import Station
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
 from tests.bench import Board, talk
-from tests.steps.test_provision import run
+from tests.provisioning.test_provision import run
 
 BEGUN = "2026-03-01T11:29:00Z"
 

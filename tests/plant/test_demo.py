@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.demo import cluster, plant
-from teds_provision.talk.progress import SilentReporter
+from teds_provision.provisioning.progress import SilentReporter
 
 
 @pytest.mark.link

@@ -22,15 +22,15 @@ from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_m
 from teds_provision.protocol.messages.firmware import FirmwareReport
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.evidence import EvidenceClaim
+from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.firmware import read_firmware
+from teds_provision.provisioning.identify import identify
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import require_session
-from teds_provision.steps.firmware import read_firmware
-from teds_provision.steps.identify import identify
 from teds_provision.teds.image import SECURITY
 from teds_provision.teds.origin import Origin
 from tests.bench import Board, MemoryLink, make_station, talk
 from tests.cli.shell import call
-from tests.steps.test_firmware import GOOD, FirmwareBoard
+from tests.provisioning.test_firmware import GOOD, FirmwareBoard
 
 from .proofs import evidence_of, facts_of, run, signed_anew
 

@@ -36,18 +36,18 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.job import CalibrationRule, Job, open_job, require_pattern, seal_job
 from teds_provision.protocol.plant.roster import Roster
+from teds_provision.provisioning.board_type import WrongBoardError
+from teds_provision.provisioning.build import BuildOrder, PreparedOrder, prepare
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import ProvisionResult, provision, verify_only
 from teds_provision.station.plant.parcels import ParcelRow
 from teds_provision.station.station import Station
-from teds_provision.steps.board_type import WrongBoardError
-from teds_provision.steps.build import BuildOrder, PreparedOrder, prepare
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import ProvisionResult, provision, verify_only
-from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.certificate import certificate_reference_of
 from teds_provision.teds.profile.load import files_digest, find_profile, shipped_profiles
 from tests.answers import Answers
 from tests.bench import PASSPHRASE, Board, MemoryLink, make_station, talk
-from tests.steps.test_firmware import GOOD, FirmwareBoard
+from tests.provisioning.test_firmware import GOOD, FirmwareBoard
 from tests.teds.certificates import ANGLE as CERTIFICATE
 
 from .owner import ALL, ANGLE, NOW, alone, job_of, join, member, roster_of

@@ -16,18 +16,18 @@ from teds_provision.plant.sync import close_page
 from teds_provision.protocol.messages.firmware import FirmwareFlag, FirmwareReport
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.roster import Share
+from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.firmware import keep_firmware, read_firmware
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.inventory import inventory
 from teds_provision.station.firmware import FirmwareReading
 from teds_provision.station.station import Station
 from teds_provision.station.store import TrustRecord
-from teds_provision.steps.agree import require_session
-from teds_provision.steps.firmware import keep_firmware, read_firmware
-from teds_provision.steps.identify import identify
-from teds_provision.steps.inventory import inventory
 from tests.bench import talk
 from tests.cli.shell import call
 from tests.plant.handing import keyed
 from tests.plant.stations import Plant
-from tests.steps.test_firmware import FirmwareBoard
+from tests.provisioning.test_firmware import FirmwareBoard
 
 OLD = FirmwareReport("nrf/loadcell", (1, 2, 0), 3, bytes([0xA1]) * 32)
 NEW = FirmwareReport("nrf/loadcell", (1, 3, 0), 0, bytes([0xA2]) * 32)

@@ -9,12 +9,18 @@ import pytest
 
 from teds_provision import plant
 from teds_provision.errors import PolicyError, UnprovenError
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import provision
+from teds_provision.provisioning.verify import (
+    Verification,
+    require_authentic,
+    snapshot_trust,
+    verify_image,
+    verify_images,
+)
 from teds_provision.station.station import Station
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import provision
-from teds_provision.steps.verify import Verification, require_authentic, snapshot_trust, verify_image, verify_images
-from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import Image
 from tests.bench import Board, talk
 from tests.plant.stations import Plant

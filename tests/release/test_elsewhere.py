@@ -14,7 +14,7 @@ from tests.bench import PASSPHRASE, Board
 from tests.cli.shell import Outcome, call, clean_environment
 from tests.measure.recordings.test_converting import recorded
 from tests.plant.proofs import evidence_of
-from tests.steps.test_provision import run as provision
+from tests.provisioning.test_provision import run as provision
 
 ROOT = Path(__file__).resolve().parents[2]
 PROFILE = ROOT / "profiles" / "magnetic-angular-position-sensor.toml"

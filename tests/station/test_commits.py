@@ -13,14 +13,14 @@ import pytest
 
 from teds_provision.errors import LinkError, StoreError
 from teds_provision.protocol.messages.frames import Command
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import provision
 from teds_provision.station.station import Station
 from teds_provision.station.store import NodeRecord
 from teds_provision.station.store.audit import ACTOR
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import provision
-from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import SilentReporter
 from tests.bench import Board, MemoryLink, make_station, talk
 
 _CHANGES = ("INSERT", "UPDATE", "DELETE", "REPLACE")

@@ -10,11 +10,11 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from teds_provision.errors import BadDataError, GarbledError, NotAuthenticError, PolicyError, TedsProvisionError
 from teds_provision.links import LINKS, Capabilities, Contact
 from teds_provision.protocol.messages.identity import Identity
+from teds_provision.provisioning.agree import AgreeResult, agree
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.identify import identify
 from teds_provision.station.station import Station as Ours
 from teds_provision.station.store import WhitelistEntry
-from teds_provision.steps.agree import AgreeResult, agree
-from teds_provision.steps.identify import identify
-from teds_provision.talk.conversation import Conversation
 from tests.bench import Board
 from tests.strangers.agreement import FAULTS, Node, Station
 from tests.strangers.crypto import CURVE, point

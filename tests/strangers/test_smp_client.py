@@ -13,9 +13,9 @@ from smpclient.requests.os_management import BootloaderInformationRead, EchoWrit
 
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.smp import MANAGE_OVERHEAD
-from teds_provision.steps.agree import require_session
-from teds_provision.talk.conversation import Conversation
-from tests.steps.update_bench import Owner, UpdateBench
+from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.conversation import Conversation
+from tests.provisioning.update_bench import Owner, UpdateBench
 
 
 class SessionTransport:

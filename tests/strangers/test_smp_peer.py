@@ -6,9 +6,9 @@ from pathlib import Path
 
 from teds_provision.errors import NodeRefusedError
 from teds_provision.protocol.messages.frames import Function, security_command
-from teds_provision.steps.agree import require_session
-from teds_provision.talk.conversation import Conversation
-from tests.steps.update_bench import Owner, UpdateBench
+from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.conversation import Conversation
+from tests.provisioning.update_bench import Owner, UpdateBench
 from tests.strangers.smp_peer import PASSED, PEER, Ask, run_client
 
 pytestmark = PEER

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from teds_provision.cli import record, sample
-from teds_provision.cli.measure_view import value_text
+from teds_provision.cli.measure import record, sample
+from teds_provision.cli.measure.measure_view import value_text
 from teds_provision.measure.blocks import ChannelFacts
 from teds_provision.measure.sampling import Sample
 from teds_provision.teds.channel import Channel, ChannelKind

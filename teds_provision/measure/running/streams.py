@@ -20,7 +20,7 @@ from teds_provision.measure.stream_receiver import ReceivedStream
 from teds_provision.measure.verified_session import VerifiedSession, ask_clock
 from teds_provision.protocol.operation.stream_commands import ClockReply, StreamKind, decode_stopped, stop
 from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
-from teds_provision.talk.conversation import SessionLostError
+from teds_provision.provisioning.conversation import SessionLostError
 
 UNSIGNED = "the datasheet is unsigned: raw values only"
 SILENT = 2.0  # seconds without a good message, beside three messages' time: then the node is lost

@@ -16,7 +16,7 @@ from teds_provision.measure.verified_session import VerifiedSession
 from teds_provision.protocol.operation.stream_commands import Action
 from teds_provision.protocol.operation.subscription import TickBounds
 from teds_provision.protocol.operation.timing import START_AFTER_MARK, TriggerToken, mark_is_honest
-from teds_provision.talk.conversation import SessionLostError
+from teds_provision.provisioning.conversation import SessionLostError
 
 TRIGGER_LIFE = 30  # seconds
 HELD_BACK = 10_000_000  # ns: a controller may hold a frame back while others win arbitration; a node in a busy process

@@ -32,8 +32,8 @@ from teds_provision.measure.verified_session import DEAD_MAN, VerifiedSession, o
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.node_jobs import NodeJobs, NodeLocks
 from teds_provision.protocol.messages.frames import Reason
+from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.station.station import Station
-from teds_provision.talk.conversation import Conversation, SessionLostError
 
 HOLD: Final = 1.0  # seconds, if a request has none
 _STARTING: Final = 15.0

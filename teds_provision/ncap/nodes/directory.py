@@ -20,13 +20,13 @@ from teds_provision.api.operations import MOST_NODES
 from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.sinks import for_readers
+from teds_provision.provisioning.inventory import with_verdicts
+from teds_provision.provisioning.readings import NodeVerdict
 from teds_provision.sanitize import by_name
 from teds_provision.station.overview import Search
 from teds_provision.station.shown_units import shown_units, units_of_profile
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import iso
-from teds_provision.steps.inventory import with_verdicts
-from teds_provision.steps.readings import NodeVerdict
 from teds_provision.teds.sheet import Channel, Sheet
 
 _log = logging.getLogger(__name__)

@@ -13,17 +13,17 @@ from typing import Any, Final
 from teds_provision.errors import BadDataError, NodeRefusedError, TedsProvisionError
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.operation.commands import POWER, PowerReply
+from teds_provision.provisioning.agree import session_if_keyed
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.firmware import read_firmware
+from teds_provision.provisioning.identify import IdentifiedNode, identify
+from teds_provision.provisioning.readings import NodeVerdict, is_keyed, keep
+from teds_provision.provisioning.teds_read import list_blocks, read_block, read_identity, read_image
+from teds_provision.provisioning.verify import Verification, freshness_floor_of, session_check, verify_image
+from teds_provision.provisioning.verify_node import verify_in_session
 from teds_provision.station.firmware import firmware_of
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now
-from teds_provision.steps.agree import session_if_keyed
-from teds_provision.steps.firmware import read_firmware
-from teds_provision.steps.identify import IdentifiedNode, identify
-from teds_provision.steps.readings import NodeVerdict, is_keyed, keep
-from teds_provision.steps.teds_read import list_blocks, read_block, read_identity, read_image
-from teds_provision.steps.verify import Verification, freshness_floor_of, session_check, verify_image
-from teds_provision.steps.verify_node import verify_in_session
-from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.sheet import Sheet
 

@@ -29,8 +29,8 @@ from teds_provision.ncap.nodes.inspection import NodeInspection, as_problem, loo
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
 from teds_provision.ncap.waits import USUAL, Waits
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.station.station import Station
-from teds_provision.talk.conversation import Conversation, SessionLostError
 
 # Whether a node that was seen on a bus is still there: it is asked itself, twice, before it is said to have left.
 #

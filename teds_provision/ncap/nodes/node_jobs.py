@@ -17,7 +17,7 @@ from teds_provision.errors import FrozenError, InternalError, NodeBusyError, NoN
 from teds_provision.links import Port
 from teds_provision.links.ports import Contact, Notice
 from teds_provision.ncap.nodes.directory import NodeDirectory
-from teds_provision.talk.conversation import Conversation, SessionLostError
+from teds_provision.provisioning.conversation import Conversation, SessionLostError
 
 # One thing at a time with each node: sessions of this process share one address, and a second Open ends the first.
 # A measurement keeps its nodes for as long as it runs; what else is asked of them meanwhile goes through its session,

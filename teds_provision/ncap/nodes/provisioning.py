@@ -33,19 +33,19 @@ from teds_provision.ncap.nodes.node_jobs import NodeJob, NodeJobs, as_program_er
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning.adoption import FactoryDatasheet
+from teds_provision.provisioning.agree import agree
+from teds_provision.provisioning.build import BuildOrder, prepare
+from teds_provision.provisioning.conversation import Conversation, SessionLostError
+from teds_provision.provisioning.datasheet_edit import write_sheet
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter, StepResult
+from teds_provision.provisioning.provision import ProvisionResult, new_whitelist_entry, provision
+from teds_provision.provisioning.teds_read import list_blocks
+from teds_provision.provisioning.verify import Verification, require_authentic
 from teds_provision.station.station import Station
 from teds_provision.station.store.audit import ACTOR
-from teds_provision.steps.adoption import FactoryDatasheet
-from teds_provision.steps.agree import agree
-from teds_provision.steps.build import BuildOrder, prepare
-from teds_provision.steps.datasheet_edit import write_sheet
-from teds_provision.steps.identify import identify
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import ProvisionResult, new_whitelist_entry, provision
-from teds_provision.steps.teds_read import list_blocks
-from teds_provision.steps.verify import Verification, require_authentic
-from teds_provision.talk.conversation import Conversation, SessionLostError
-from teds_provision.talk.progress import SilentReporter, StepResult
 
 _log = logging.getLogger(__name__)
 WAITING: Final = 300.0  # seconds for a tap

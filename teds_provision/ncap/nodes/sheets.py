@@ -11,16 +11,16 @@ from teds_provision.errors import BadDataError, NotFoundError, TedsProvisionErro
 from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.inspection import read_anew
 from teds_provision.ncap.nodes.node_jobs import NodeJobs
+from teds_provision.provisioning.calibration_guard import guard
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.datasheet_edit import SheetPlan, plan_sheet, write_sheet
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.readings import NodeVerdict, is_keyed, verdict_of
+from teds_provision.provisioning.teds_read import read_image
+from teds_provision.provisioning.verify import Verification, freshness_floor_of, session_check, verify_image
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now
-from teds_provision.steps.calibration_guard import guard
-from teds_provision.steps.datasheet_edit import SheetPlan, plan_sheet, write_sheet
-from teds_provision.steps.identify import identify
-from teds_provision.steps.readings import NodeVerdict, is_keyed, verdict_of
-from teds_provision.steps.teds_read import read_image
-from teds_provision.steps.verify import Verification, freshness_floor_of, session_check, verify_image
-from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds import curve as curves_of_guard
 from teds_provision.teds.calibration.model import is_finite
 from teds_provision.teds.channel import TURN

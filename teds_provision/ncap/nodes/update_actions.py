@@ -19,7 +19,7 @@ from teds_provision.api.operations import LARGEST_IMAGE
 from teds_provision.errors import BadDataError, StoreError, TedsProvisionError
 from teds_provision.files import private_folder, read_limited, write_whole
 from teds_provision.firmware_image import FirmwareImage, read_firmware_image
-from teds_provision.steps.update import RESULTS
+from teds_provision.provisioning.update import RESULTS
 
 _log = logging.getLogger(__name__)
 FOLDER: Final = "updates"

@@ -46,10 +46,10 @@ from teds_provision.ncap.nodes.update_actions import (
     UpdateRequest,
     by_age,
 )
-from teds_provision.station.station import Station
-from teds_provision.station.store.audit import ACTOR
-from teds_provision.steps.parallel import ParallelWork
-from teds_provision.steps.update import (
+from teds_provision.provisioning.conversation import SessionLostError
+from teds_provision.provisioning.parallel import ParallelWork
+from teds_provision.provisioning.progress import SilentReporter, StepResult
+from teds_provision.provisioning.update import (
     BoardUpdate,
     UpdateOrder,
     UpdatePlan,
@@ -60,8 +60,8 @@ from teds_provision.steps.update import (
     update_at,
     version_of,
 )
-from teds_provision.talk.conversation import SessionLostError
-from teds_provision.talk.progress import SilentReporter, StepResult
+from teds_provision.station.station import Station
+from teds_provision.station.store.audit import ACTOR
 
 _log = logging.getLogger(__name__)
 _WAITED_FOR: Final = 60.0

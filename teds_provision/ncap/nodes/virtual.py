@@ -37,9 +37,9 @@ from teds_provision.node.node_template import create
 from teds_provision.node.sources.base import seconds_of
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.keys import fingerprint
+from teds_provision.provisioning.build import check_name
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry
-from teds_provision.steps.build import check_name
 from teds_provision.teds.formats import UUID_OCTETS, placed, stated_uuid
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.profile import default_folders

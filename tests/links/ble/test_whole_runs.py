@@ -13,13 +13,13 @@ from teds_provision.links import LinkSettings, Notice
 from teds_provision.links.hints import BleAddress
 from teds_provision.node import node_template
 from teds_provision.node.virtual import VirtualNode
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.meeting import meet
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter, StepResult
+from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.station.station import Station as OpenStation
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.operator import AcceptingOperator
-from teds_provision.steps.provision import ProvisionResult, provision
-from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.meeting import meet
-from teds_provision.talk.progress import SilentReporter, StepResult
 from tests.bench import make_station, on_reader
 from tests.e2e.desk import Desk, Station, results
 from tests.firmware_images import make_key, sign

@@ -15,7 +15,7 @@ from typing import Any
 
 from teds_provision.node.nfc.server import NfcServer
 from teds_provision.protocol.messages.identity import Identity, NodeState
-from teds_provision.talk.meeting import IdleStop
+from teds_provision.provisioning.meeting import IdleStop
 
 
 class Echo:

@@ -1,0 +1,1 @@
+"""The commands that identify, key, write and check one node or many."""

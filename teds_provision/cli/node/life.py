@@ -1,0 +1,233 @@
+"""``revoke``, ``decommission``, ``replace``: the end of a node's life."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision import handover, plant, provisioning
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import command, dry_run_option, link_options, links_given, yes_option
+from teds_provision.cli.rendering import reporter_for
+from teds_provision.errors import FrozenError, LinkError, PolicyError
+from teds_provision.links import LinkSettings
+from teds_provision.sanitize import counted
+
+if TYPE_CHECKING:
+    from teds_provision.handover.life import TakeoverPlan
+    from teds_provision.provisioning.agree import ResetReceipt
+    from teds_provision.station.measurements import HandedOn
+    from teds_provision.station.station import Station
+
+
+@command('teds-provision revoke 8d4d --why "stolen with the arm"', "teds-provision revoke --lift 8d4d --yes")
+@click.argument("uuid")
+@click.option("--why", metavar="TEXT", help="Reason, shown to everyone who meets the node, and logged.")
+@click.option("--lift", is_flag=True, help="Lift the ban on this station, also one that another station issued.")
+@yes_option
+@dry_run_option
+@pass_app
+def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run: bool) -> None:
+    """Ban a node: remove it from the whitelist, delete its keys, and add a signed statement to every future bundle.
+
+    Stations that trust this one and know the node honor it when they import. --lift lifts a ban on this station, even
+    one issued by another station; deleted keys do not come back.
+    """
+    if lift == (why is not None):
+        raise click.UsageError("Use --why TEXT to revoke, or --lift alone to lift a ban.")
+    station = app.station()
+    octets = plant.status.resolve(station, uuid)
+    if lift:
+        _lift(app, station, octets, yes=yes, dry_run=dry_run)
+        return
+    assert why is not None
+    if dry_run:
+        keys = len(station.keys.keys_of(octets))
+        app.emit(
+            {"uuid": octets.hex(), "plan": "revoke", "keys": keys},
+            f"Plan: revoke {octets.hex()}, delete {counted(keys, 'key')}.",
+        )
+        return
+    station.unlock()
+    if station.policy.revocation(octets) is None:
+        app.confirm(f"Revoke node {octets.hex()}? Its keys will be deleted here.", yes=yes)
+    with station.lock("revoke", app.note):
+        done = handover.life.revoke(station, octets, why)
+    told = {
+        "uuid": octets.hex(),
+        "fingerprint": done.entry.fingerprint,
+        "why": done.entry.why,
+        "created": done.entry.created,
+        "fresh": done.fresh,
+    }
+    app.emit(told, f"Node {octets.hex()} is revoked: {done.entry.why}" + ("" if done.fresh else " (already known)."))
+
+
+def _lift(app: App, station: Station, uuid: bytes, *, yes: bool, dry_run: bool) -> None:
+    entry = station.policy.revocation(uuid)
+    told: dict[str, Any] = {"lifted": uuid.hex(), "why": entry.why if entry else None, "fresh": entry is not None}
+    if entry is None:
+        app.emit(told, f"Nothing to do: node {uuid.hex()} is not revoked here.")
+        return
+    if dry_run:
+        app.emit({**told, "plan": True}, f"Plan: lift the ban on {uuid.hex()}: {entry.why}")
+        return
+    station.unlock()
+    app.confirm(f"Lift the ban on node {uuid.hex()} ({entry.why}, {entry.created})?", yes=yes)
+    with station.lock("revoke --lift", app.note):
+        handover.deny.lift(station, uuid)
+    app.emit(told, f"The ban on node {uuid.hex()} is lifted here. To use it, whitelist it and agree on a key.")
+
+
+@command("teds-provision decommission 8d4d --yes --via can --can udp_multicast:239.74.163.2")
+@click.argument("uuid")
+@click.option(
+    "--force", is_flag=True, help="Take it out of service even if it does not answer (recorded as unconfirmed)."
+)
+@yes_option
+@dry_run_option
+@link_options
+@pass_app
+def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, links: LinkSettings) -> None:
+    """Reset a node in a session, keep its signed receipt, and take it out of service.
+
+    With --force, a node that does not answer is recorded as unconfirmed; its keys remain, so you can run this again.
+    """
+    station = app.station()
+    octets = station.nodes.resolve(uuid)
+    station.policy.require_not_given_away(octets)
+    if dry_run:
+        app.emit({"uuid": octets.hex(), "plan": "decommission"}, f"Plan: reset {octets.hex()}, take it out of service.")
+        return
+    station.unlock(octets)
+    if handover.life.is_finished(station, octets):
+        app.emit(
+            _result(octets, None) | {"confirmed": True, "fresh": False}, "Nothing to do: it is already out of service."
+        )
+        return
+    app.confirm(
+        f"Take node {octets.hex()} out of service? Its key will be erased on the node and on this station.", yes=yes
+    )
+    with station.lock("decommission", app.note):
+        receipt = _reset(app, station, octets, links, force=force)
+        left = handover.life.retire(station, octets, receipt)
+    state = "is out of service and signed that it is in factory state" if receipt else "is out of service, unconfirmed"
+    told = _result(octets, receipt) | {"fresh": True, "removed": left.to_json()}
+    app.emit(told, f"Node {octets.hex()} {state}.{_handed_on(left, 'Removed from')}")
+
+
+def _handed_on(moved: HandedOn, verb: str) -> str:
+    """Return what a node was removed from, or handed on, in lines; "" if there is nothing."""
+    lines = [
+        f"{verb} {what}: {', '.join(values)}"
+        for what, values in (
+            ("groups", moved.groups),
+            ("topic names", moved.topics),
+            ("measurements", moved.measurements),
+        )
+        if values
+    ]
+    lines += [f"Measurements that had no other node were deleted: {', '.join(moved.ended)}"] if moved.ended else []
+    return "".join(f"\n{line}" for line in (*lines, *(f"Not moved: {why}" for why in moved.kept)))
+
+
+def _result(uuid: bytes, receipt: ResetReceipt | None) -> dict[str, Any]:
+    return {
+        "uuid": uuid.hex(),
+        "confirmed": receipt is not None,
+        "epoch": receipt.epoch if receipt else None,
+        "challenge": receipt.challenge.hex() if receipt else None,
+        "proof": receipt.proof.hex() if receipt else None,
+    }
+
+
+def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, force: bool) -> ResetReceipt | None:
+    """Reset the node; None if it is unreachable and that is to be recorded as unconfirmed."""
+    try:
+        with (
+            provisioning.meeting.meet(station, links, uuid, reporter_for(app)) as node,
+            station.node_lock(uuid),
+            station.released(uuid, "reset") as released,
+        ):
+            undone = "It was not reset and stays in service."
+            provisioning.sign.require_not_measured(station, node, released=bool(released), undone=undone)
+            return provisioning.agree.reset_node(station, node, provisioning.identify.identify(station, node))
+    except (LinkError, PolicyError) as error:
+        if isinstance(error, FrozenError) or provisioning.conversation.is_busy(error):
+            raise  # it answers: once it is free it signs its reset, and --force would record less than can be had
+        if not force and not app.interactive:
+            first = "Bring the node within reach" if isinstance(error, LinkError) else error.hint.rstrip(".")
+            error.hint = (
+                f"{first}, or add --force to record it as unconfirmed." if first else "Add --force: unconfirmed."
+            )
+            raise
+        app.note(f"Cannot reset the node: {error.message}")
+        app.confirm("Take it out of service anyway, unconfirmed?", yes=force)
+        return None
+
+
+@command(
+    "teds-provision replace 8d4d9da65281f7000000 8d4d9da65281f7000001 --yes",
+    "teds-provision replace old-finger 8d4d --copy-calibration",
+)
+@click.argument("old")
+@click.argument("new")
+@click.option(
+    "--copy-calibration", is_flag=True, help="Copy OLD's calibration to NEW; only if the sensor itself moves."
+)
+@yes_option
+@dry_run_option
+@link_options
+@click.pass_context
+def replace(
+    ctx: click.Context, old: str, new: str, copy_calibration: bool, yes: bool, dry_run: bool, links: LinkSettings
+) -> None:
+    """Replace OLD with the whitelisted spare NEW.
+
+    NEW takes over its name, groups, topic names, measurements and profile; what moved, and what could not, is listed.
+    A calibration belongs to one sensor, so it is copied only on request. If you name a link, OLD is reset when it can
+    be reached; otherwise it goes out of service unconfirmed.
+    """
+    app = ctx.find_object(App)
+    assert app is not None
+    station = app.station()
+    octets, spare = station.nodes.resolve(old), station.nodes.resolve(new)
+    station.unlock(octets)
+    with station.lock("replace", app.note):
+        plan = handover.life.plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
+        told, text = _takeover(plan)
+        told["groups"] = station.groups.of(spare if plan.done else octets)
+        if dry_run:
+            app.emit({**told, "plan": True}, f"Plan: {text}.")
+            return
+        if plan.done:
+            moved = handover.life.hand_on(station, plan)
+            rest = _handed_on(moved, "Moved")
+            text = "It has already taken over." if rest else "Nothing to do: it has already taken over."
+            app.emit({**told, "moved": moved.to_json(), "fresh": False}, f"{text}{rest}")
+            return
+        app.confirm(f"{text}?", yes=yes)
+        receipt = _reset(app, station, octets, links, force=True) if links_given(ctx) else None
+        warnings, moved = handover.life.take_over(station, plan, receipt)
+    for warning in warnings:
+        app.warn(warning)
+    confirmed = receipt is not None
+    next_step = f"Next, run provision (or sign and write) for {spare.hex()}."
+    told |= {"confirmed": confirmed, "fresh": True, "warnings": list(warnings), "moved": moved.to_json()}
+    app.emit(told, f"{text}.{_handed_on(moved, 'Moved')}\n{next_step}")
+
+
+def _takeover(plan: TakeoverPlan) -> tuple[dict[str, Any], str]:
+    """Return what one node takes over from another, for scripts and in a sentence."""
+    taken = plan.new if plan.done else plan.old
+    told = {
+        "old": plan.old.uuid.hex(),
+        "new": plan.new.uuid.hex(),
+        "name": taken.name,
+        "profile": taken.profile,
+        "calibration_copied": bool(plan.calibration),
+    }
+    given = [f"{what} {value}" for what, value in (("name", taken.name), ("profile", taken.profile)) if value]
+    text = f"{plan.new.uuid.hex()} takes over from {plan.old.uuid.hex()}"
+    return told, f"{text}: {', '.join(given) or 'no name or profile'}"

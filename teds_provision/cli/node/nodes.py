@@ -1,0 +1,373 @@
+"""``nodes``: what this station knows of its nodes, as a table, CSV or JSON; streamed, so a big list costs little."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from datetime import UTC, datetime, timedelta
+from itertools import chain, islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision import plant, provisioning, teds
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import WholeNumber, command
+from teds_provision.cli.rendering import (
+    FIRMWARE_CHANGED,
+    firmware_words,
+    local_time,
+    moment,
+    print_json_list,
+    print_table,
+    shown,
+)
+from teds_provision.errors import BadDataError, NotFoundError, UsageError
+from teds_provision.provisioning.inventory import PAGE, STATES, inventory, search
+from teds_provision.sanitize import by_name
+from teds_provision.station.label import label_of, write_label
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from teds_provision.station.station import Station
+
+_FIRST = 200  # the rows that decide how wide each column is
+_NAME_COLUMNS = 24
+_GAP = "  "
+
+
+@command("teds-provision nodes", "teds-provision nodes finger --state provisioned", "teds-provision --json nodes 8d4d")
+@click.argument("text", required=False, metavar="[UUID|TEXT]")
+@click.option("--state", type=click.Choice(STATES), help="Show only nodes in this state.")
+@click.option("--profile", metavar="P", help="Show only nodes of this type.")
+@click.option("--group", metavar="G", help="Show only nodes in this group.")
+@click.option(
+    "--due",
+    type=WholeNumber(min=0, max=36500),
+    metavar="DAYS",
+    help="Show only nodes whose calibration expires within DAYS, or has expired.",
+)
+@click.option("--since", metavar="TIME", help="Show only nodes seen since: ISO 8601, today, or 2h, 3d.")
+@click.option(
+    "--fits", metavar="EXPR", help='Check datasheets: "angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz".'
+)
+@click.option("--format", "form", type=click.Choice(["table", "csv", "json"]), help="Default: table.")
+@click.option(
+    "--plant", "of_plant", is_flag=True, help="Show what the plant's stations report: holders, firmware, conflicts."
+)
+@pass_app
+def nodes(
+    app: App,
+    text: str | None,
+    state: str | None,
+    profile: str | None,
+    group: str | None,
+    due: int | None,
+    since: str | None,
+    fits: str | None,
+    form: str | None,
+    of_plant: bool,
+) -> None:
+    """List every node that this station has met, whitelisted or received, or show one in detail.
+
+    TEXT matches any part of UUID, name or profile; a full UUID or an exact name shows that node. The nodes themselves
+    are not contacted.
+    """
+    station = app.station()
+    if of_plant:
+        _show_plant(app, station, text, as_json=app.json or form == "json")
+        return
+    day = (datetime.now(UTC) + timedelta(days=due)).strftime("%Y-%m-%d") if due is not None else None
+    seen = moment(since) if since is not None else None
+    try:
+        found = search(station, text, state=state, profile=profile, group=group, due=day, since=seen)
+    except NotFoundError:
+        found = _named_in_plant(station, text) if not any((state, profile, group, due, since)) else []
+        if not found:
+            raise
+    if fits is not None:
+        show_fits(app, station, fits, found)
+        return
+    if not app.json and form in (None, "table"):  # what scripts read stays in the order of UUIDs
+        names = {record.uuid: record.name for record in station.nodes.all()}
+        found = sorted(found, key=lambda uuid: by_name(names.get(uuid), uuid.hex()))
+    described = _with_plant(station, inventory(station, found))
+    if app.json or form == "json":
+        print_json_list("nodes", described)
+    elif form == "csv":
+        writer = csv.writer(sys.stdout, lineterminator="\n")
+        writer.writerow((*_FIELDS, "remarks"))
+        for node in described:
+            row = [node[name] for name in _FIELDS]
+            writer.writerow([shown(value) if isinstance(value, str) else value for value in (*row, _remarks(node))])
+    elif not found:
+        known = bool(search(station))
+        print("No known node matches." if known else "No nodes are known yet.", end=" ")
+        print("To list all: teds-provision nodes" if known else "To add one by tap: teds-provision identify --add")
+    elif text is not None and len(found) == 1:
+        _one(next(described))
+    else:
+        _table(described)
+
+
+def _named_in_plant(station: Station, text: str | None) -> list[bytes]:
+    """Return the known node that only another station of the plant calls ``text``; empty if there is none."""
+    if text is None or station.plant.joined is None:
+        return []
+    uuid = plant.status.resolve(station, text)
+    if not station.overview.is_known(uuid):
+        raise NotFoundError(f"This station has not met node {uuid.hex()}.", hint=f"See: nodes --plant {uuid.hex()}")
+    return [uuid]
+
+
+def _with_plant(station: Station, described: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Add to each node its conflicts in the plant, and the plant's name if this station gave it none.
+
+    Leave the nodes unchanged if the station joined no registry.
+    """
+    roster = station.plant.roster
+    if roster is None:
+        yield from described
+        return
+    found: dict[str, list[dict[str, str]]] = {}
+    for uuid, name, why in station.plant.claims.conflicts():
+        found.setdefault(uuid.hex(), []).append({"name": name, "why": why})
+    rest = iter(described)
+    while page := list(islice(rest, PAGE)):
+        names = plant.status.names(station, roster, [bytes.fromhex(node["uuid"]) for node in page if not node["name"]])
+        for node in page:
+            named = node["name"] or names.get(bytes.fromhex(node["uuid"]))
+            yield {**node, "name": named, "conflicts": found.get(node["uuid"], [])}
+
+
+def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) -> None:
+    """Show the stations' claims about nodes, including those that this one never met."""
+    described = plant.status.nodes(station, plant.apply_pages.require_roster(station), text)
+    if as_json:
+        print_json_list("nodes", described)
+        return
+    for node in described:
+        says = node["says"]
+        holders = ", ".join(name for names in says["holders"].values() for name in names)
+        written = f", datasheet {says['sequence']} by {says['written_by']}" if says["written_by"] else ""
+        banned = f", revoked by {', '.join(says['revoked'])}" if says["revoked"] else ""
+        held = f"held by {holders} (epoch {says['epoch']})" if says["holders"] else "no holder"
+        told = f"{held}{written}, firmware {_reported(says['firmware'])}{banned}"
+        line = "  ".join(filter(None, (node["uuid"], shown(node["name"] or ""), told)))
+        app.lines([
+            line,
+            *(f"  {conflict['name']}: {shown(conflict['why'])}" for conflict in node["conflicts"]),
+            *(f"  also reported: firmware {_reported(seen)}" for seen in _others(says)),
+        ])  # fmt: skip
+
+
+def _reported(firmware: dict[str, Any] | None) -> str:
+    """Return the firmware that a station saw, by whom and when; None: no station reports any."""
+    if firmware is None:
+        return "not reported"
+    by = f"({firmware['by']}, {local_time(firmware['at'])})"
+    if firmware["version"] is None:
+        return shown(f"not reported {by}")
+    build = f"+{firmware['build']}" if firmware["build"] else ""
+    return shown(" ".join(filter(None, (firmware["text"], f"{firmware['version']}{build}", by))))
+
+
+def _others(says: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return earlier reports of other stations that differ from the newest."""
+    newest = says["firmware"] or {}
+    what = ("text", "version", "build", "image")
+    return [seen for seen in says["firmware_by"].values() if any(seen[name] != newest[name] for name in what)]
+
+
+_FIELDS = (
+    "uuid", "name", "profile", "state", "epoch", "sequence", "fingerprint", "whitelisted", "assurance", "verdict",
+    "last_seen", "due", "channels", "can_address", "group", "retired",
+)  # fmt: skip
+
+
+# Title, the text of a cell, and the order in which columns are dropped on a narrow terminal (0: never).
+_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str], int], ...] = (
+    ("UUID", lambda node: node["uuid"], 0),
+    ("name", lambda node: _cut(shown(node["name"]), _NAME_COLUMNS), 1),
+    ("state", lambda node: node["state"] or "unseen", 2),
+    ("verdict", lambda node: node["retired"] or node["verdict"] or "", 3),
+    ("profile", lambda node: node["profile"] or "", 6),
+    ("epoch", lambda node: str(node["epoch"]), 8),
+    ("sequence", lambda node: str(node["sequence"]), 9),
+    ("due", lambda node: node["due"] or "", 5),
+    ("key", lambda node: (node["fingerprint"] or "")[:16], 7),
+    ("remarks", lambda node: shown(_remarks(node)), 4),
+)
+
+
+def _table(described: Iterator[dict[str, Any]]) -> None:
+    """Print a line per node as it is read. The first rows decide the widths; a narrow terminal gets fewer columns."""
+    head = list(islice(described, _FIRST))
+    widths = [max(len(title), *(len(cell(node)) for node in head)) for title, cell, _ in _COLUMNS]
+    kept = _fitting(widths)
+    columns = [(*_COLUMNS[number][:2], widths[number]) for number in kept]
+    limit = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+    lines = chain(
+        [_GAP.join(title.ljust(width) for title, _, width in columns)],
+        (_GAP.join(cell(node).ljust(width) for _, cell, width in columns) for node in chain(head, described)),
+    )
+    sys.stdout.writelines(f"{_cut(shown(line.rstrip()), limit)}\n" for line in lines)
+    sys.stdout.flush()
+
+
+def _fitting(widths: list[int]) -> list[int]:
+    """Numbers of the columns that fit side by side; those that are missed least go first, a UUID never."""
+    kept = list(range(len(widths)))
+    if not sys.stdout.isatty():
+        return kept
+    room = shutil.get_terminal_size().columns
+    remarks = len(_COLUMNS) - 1
+    while len(kept) > 1:
+        # the last column may be cut at the edge, if a useful part of it is seen
+        needed = sum(min(widths[number], 24) if number == remarks else widths[number] for number in kept)
+        if needed + len(_GAP) * (len(kept) - 1) <= room:
+            break
+        kept.remove(max(kept, key=lambda number: _COLUMNS[number][2]))
+    return kept
+
+
+def _cut(text: str, limit: int | None) -> str:
+    return text if limit is None or len(text) <= limit else f"{text[: limit - 1]}…"
+
+
+def _remarks(node: dict[str, Any]) -> str:
+    remarks = []
+    if node["wrapped"]:
+        remarks.append(f"wrapped: {node['wrapped']['name']} ({node['wrapped']['kind']})")
+    if node["firmware"] and node["firmware"]["state"] in ("bad", "other", "outdated", "not-reported"):
+        remarks.append(f"firmware {node['firmware']['state']}")
+    if node["firmware"] and node["firmware"]["changed"]:
+        remarks.append(FIRMWARE_CHANGED)
+    if node["revoked"]:
+        remarks.append(f"revoked: {node['revoked']['why']}")
+    if node["moved_to"]:
+        remarks.append(f"moved to {node['moved_to']['fingerprint'][:16]}")
+    if not node["whitelisted"]:
+        remarks.append("not whitelisted")
+    if node["rotation_due"]:
+        remarks.append("rotation due")
+    if node["holders"]:
+        remarks.append("also held by " + ", ".join(holder["fingerprint"][:16] for holder in node["holders"]))
+    pending = sum(key["state"] == "pending" for key in node["keys"])
+    if pending:
+        remarks.append(f"{pending} key{'s' if pending > 1 else ''} pending")
+    return "; ".join(remarks)
+
+
+def _verdict(node: dict[str, Any]) -> str:
+    """Return the verdict, and its basis; the reason for a retired node goes before it."""
+    read, retired = node["reading"], node["retired"]
+    if read is None:
+        return retired or node["verdict"] or "never verified"
+    how = {
+        "session": "read in a session",
+        "kept": "Security TEDS read in a session, the rest from the stored copy",
+        "plain": "read without a session",
+    }
+    verdict = f"{node['verdict']} ({how[read['from']]} {local_time(read['at'])}, by {read['by']})"
+    return f"{retired}; {verdict}" if retired else verdict
+
+
+def _charge(charging: dict[str, Any] | None) -> str:
+    """Return the node's last charge report; unauthenticated."""
+    return f"{shown(charging['text'])} (reported by the node at {local_time(charging['at'])})" if charging else ""
+
+
+def _link_keys(node: dict[str, Any]) -> list[str]:
+    keys = [
+        f"{key['key_id']} {key['state']}, epoch {key['epoch']}, {local_time(key['created'])}" for key in node["keys"]
+    ]
+    return keys or ["none"]
+
+
+# Title and text of each line about one node; what is empty is left out, a list gives a line for each.
+_LINES: tuple[tuple[str, Callable[[dict[str, Any]], str | list[str]]], ...] = (
+    ("UUID", lambda node: node["uuid"]),
+    ("name", lambda node: node["name"] or ""),
+    ("profile", lambda node: node["profile"] or ""),
+    ("state", lambda node: node["state"] or "unseen"),
+    ("epoch", lambda node: f"{node['epoch']}, sequence {node['sequence']}"),
+    ("key", lambda node: (node["fingerprint"] or "not pinned yet")[:32]),
+    ("whitelist", lambda node: f"yes, assurance {node['assurance']}" if node["whitelisted"] else "no"),
+    ("verdict", _verdict),
+    ("firmware", lambda node: firmware_words(node["firmware"])),
+    ("last seen", lambda node: local_time(node["last_seen"]) if node["last_seen"] else "never"),
+    ("calibration", lambda node: f"due {node['due']}" if node["due"] else ""),
+    ("charging", lambda node: _charge(node["charging"])),
+    ("channels", lambda node: str(node["channels"])),
+    ("CAN address", lambda node: f"0x{node['can_address']:02x}" if node["can_address"] else "none"),
+    ("groups", lambda node: ", ".join(node["groups"])),
+    ("link key", _link_keys),
+    ("rotation", lambda node: node["rotation_due"] or ""),
+    ("conflict", lambda node: [f"{conflict['name']}: {conflict['why']}" for conflict in node.get("conflicts", ())]),
+    ("remarks", _remarks),
+)
+
+
+def _one(node: dict[str, Any]) -> None:
+    for title, text_of in _LINES:
+        found = text_of(node)
+        for text in [found] if isinstance(found, str) else found:
+            if text:
+                print(f"{title:<12} {shown(text)}")
+
+
+# ``label``: QR code and text for a board.
+
+
+@command("teds-provision label 8d4d --output finger-1.svg", "teds-provision label 8d4d --output finger-1.png")
+@click.argument("uuid")
+@click.option(
+    "--output",
+    required=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.svg|png",
+    help="Output file; the extension selects the format.",
+)
+@pass_app
+def label(app: App, uuid: str, output: Path) -> None:
+    """Write a label with the node's UUID and full key fingerprint, as QR code and text.
+
+    Pass the scanned text to whitelist add to pin the key before the first tap.
+    """
+    station = app.station()
+    made = label_of(station, station.nodes.resolve(uuid))
+    write_label(made, output)
+    told = {"label": {"text": made.text, "uuid": made.uuid.hex(), "fingerprint": made.fingerprint, "file": str(output)}}
+    app.emit(told, f"{output}: {made.text}")
+
+
+# ``nodes --fits``: whether datasheets suffice for a task.
+
+
+def show_fits(app: App, station: Station, expression: str, uuids: list[bytes]) -> None:
+    """Print for every channel of these nodes whether it meets ``expression``, and why not."""
+    try:
+        requirement = teds.fits.parse_fits(expression)
+    except BadDataError as error:
+        raise UsageError(f"--fits: {error.message}", hint=error.hint) from error
+    found = [fit.to_json() for fit in provisioning.inventory.fits_of(station, [requirement], uuids, datetime.now(UTC))]
+    app.emit({"fits": found}, lambda console: _fits_table(console, found))
+
+
+def _fits_table(console: Console, found: list[dict[str, Any]]) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table("UUID", "channel", "result", "why", box=None, pad_edge=False)
+    style = {"passed": "green", "failed": "red", "skipped": "dim"}
+    for fit in found:
+        channel = "" if fit["channel"] is None else f"{fit['channel']} {fit['name']}".strip()
+        table.add_row(
+            fit["uuid"], Text(shown(channel)), Text(fit["result"], style[fit["result"]]), Text(shown(fit["why"]))
+        )
+    print_table(console, table)

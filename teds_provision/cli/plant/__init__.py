@@ -1,0 +1,1 @@
+"""The commands of an owner's plant and of its production line."""

@@ -1,0 +1,1 @@
+"""The commands of the base station as a service."""

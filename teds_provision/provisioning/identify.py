@@ -1,0 +1,176 @@
+"""Step 1: which node is this, which key does it hold, and can it prove it (Figure 3 of the paper, upper half)."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+from teds_provision import teds
+from teds_provision.errors import KeyringUnavailableError, NodeRefusedError, NotAuthenticError, WrongPassphraseError
+from teds_provision.protocol.fingerprints import is_whole
+from teds_provision.protocol.keys import CHALLENGE_OCTETS, fingerprint, node_key_good, prove_message, verify
+from teds_provision.protocol.messages.frames import Function, security_command
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.readings import keep_shown
+from teds_provision.provisioning.teds_read import read_block
+from teds_provision.sanitize import printable
+from teds_provision.station.station import Station
+from teds_provision.station.store import WhitelistEntry, utc_now
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.image import SECURITY
+
+
+@dataclass(frozen=True)
+class IdentifiedNode:
+    """A node that proved possession of the key that it shows."""
+
+    uuid: bytes
+    point: bytes
+    key_signature: bytes
+    state: NodeState
+    tag_uid: bytes | None
+    address: int | None
+    security_teds: bytes
+    whitelisted: WhitelistEntry | None
+
+    @property
+    def fingerprint(self) -> str:
+        """Fingerprint of the node's key."""
+        return fingerprint(self.point)
+
+
+def prove(node: Conversation, point: bytes) -> None:
+    """Have the node sign a fresh challenge (128.8); raises NotAuthenticError if it cannot."""
+    challenge = os.urandom(CHALLENGE_OCTETS)
+    proof = node.request_idempotent(security_command(Function.PROVE, challenge), "to prove its key")
+    if not verify(point, prove_message(node.uuid, challenge), proof):
+        raise NotAuthenticError(
+            f"The node cannot prove that it holds the key {fingerprint(point)[:16]}, which it presents.",
+            hint="This may be a copied tag, or two boards with one UUID answer. Do not use it; connect one alone.",
+        )
+
+
+def identify(
+    station: Station, node: Conversation, *, expect: Callable[[IdentifiedNode], object] = lambda who: None
+) -> IdentifiedNode:
+    """Read UUID and key, require the proof, and check both against this station's store.
+
+    Raises KeyMismatchError (a known UUID with another key), NotAuthenticError, BadDataError, LinkError. A tap pins the
+    key that it brought; over a bus, where any device can use any UUID, only a whitelisted key is kept, and
+    ``last_seen`` changes only if the key that signed is known. State, epoch and address of a plain Identify are hints:
+    they change nothing in the store, a session does. ``expect`` is called before anything is recorded, and raises if
+    another node was meant.
+    """
+    who = examine(station, node)
+    expect(who)
+    entry = who.whitelisted
+    counts = node.tapped or (entry is not None and entry.fingerprint is not None)
+    facts = _facts(station, who, counts=counts) | _charge(node)
+    pinned = _pinned_now(station, who) if counts else None
+    with station.durable("identify", more_follows=True):
+        if facts:
+            station.nodes.remember(node.uuid, **facts)
+        if pinned is not None:
+            who = replace(who, whitelisted=pinned)
+            station.pins.put(pinned)
+            told = {"fingerprint": pinned.fingerprint, "assurance": pinned.assurance}
+            station.audit("whitelist", node.uuid, "pinned", **told)
+        if known_key(station, node.uuid) != who.point:
+            keep_shown(station, node.uuid, who.security_teds, by="identify")
+    return who
+
+
+def _facts(station: Station, who: IdentifiedNode, *, counts: bool) -> dict[str, object]:
+    """Return the facts to record of a node that proved its key; ``counts``: by tap, or under a whitelisted key."""
+    facts: dict[str, object] = {"point": who.point} if counts else {}
+    known = station.nodes.get(who.uuid)
+    if counts or (known is not None and known.point == who.point):
+        facts["last_seen"] = utc_now()  # its own key signed a moment ago; any other key may be a stranger's
+    return facts
+
+
+def _charge(node: Conversation) -> dict[str, object]:
+    """Return the charge from the node's initial message, with the time; a hint that is only shown."""
+    charging = node.contact.charging
+    return {} if charging is None else {"charging": json.dumps({**charging.to_json(), "at": utc_now()})}
+
+
+def _pinned_now(station: Station, who: IdentifiedNode) -> WhitelistEntry | None:
+    """Return the entry with its whole fingerprint, None if it has that already, or the vault stays closed.
+
+    An entry without a fingerprint is pinned by its first tap (profile.md, "Keys and trust"); one with the first digits
+    gets the others by the first contact, whatever the link.
+    """
+    entry = who.whitelisted
+    if entry is None or is_whole(entry.fingerprint) or not _opened(station):
+        return None
+    return replace(entry, fingerprint=who.fingerprint, assurance=entry.assurance if entry.fingerprint else "tap")
+
+
+def _opened(station: Station) -> bool:
+    """Return True if the vault is open, which makes a pin's MAC.
+
+    Without the passphrase, the first agreement will pin.
+    """
+    with suppress(WrongPassphraseError, KeyringUnavailableError):
+        station.unlock()
+        return True
+    return False
+
+
+def examine(station: Station, node: Conversation) -> IdentifiedNode:
+    """Return what :func:`identify` finds out, without a change of the store (but for a wrong key in the audit log)."""
+    octets = read_block(node, SECURITY)
+    shown = security.decode(octets)
+    point = shown.node_key
+    if not node_key_good(node.uuid, point, shown.node_key_signature):
+        raise NotAuthenticError(f"The key that the node presents is not signed for UUID {node.uuid.hex()} (field 102).")
+    prove(node, point)
+    with station.reading():
+        station.pins.check(node.uuid, point)
+        entry = station.pins.entry(node.uuid)
+    identity = node.identity
+    return IdentifiedNode(
+        uuid=node.uuid,
+        point=point,
+        key_signature=shown.node_key_signature,
+        state=identity.state,
+        tag_uid=node.contact.tag_uid,
+        address=node.contact.address,
+        security_teds=octets,
+        whitelisted=entry,
+    )
+
+
+def known_key(station: Station, uuid: bytes) -> bytes | None:
+    """Return P(node) of the Security TEDS last read from this UUID, None if there is none of this profile."""
+    row = station.datasheets.reading(uuid)
+    return row.node_key if row is not None else None
+
+
+@dataclass(frozen=True)
+class Description:
+    """A node's own, unverified description."""
+
+    name: str | None
+    channels: int
+
+
+def describe(node: Conversation) -> Description:
+    """Read name and number of channels from Meta-TEDS and XdcrName, if the node has them; nothing is verified."""
+    name: str | None = None
+    channels = 0
+    for block in ((0, AccessCode.META), (0, AccessCode.NAME)):
+        try:
+            decoded = teds.decode(read_block(node, block))
+        except NodeRefusedError:
+            continue
+        found, count = decoded.get("TCName"), decoded.get("MaxChan")
+        name = printable(found) if isinstance(found, str) else name
+        channels = count if isinstance(count, int) else channels
+    return Description(name, channels)

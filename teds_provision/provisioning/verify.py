@@ -1,0 +1,557 @@
+"""Step 7: everything that the profile demands of a datasheet, check by check (profile.md, "The Security TEDS")."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol
+
+from teds_provision.errors import BadDataError, BadDatasheetError, NotAuthenticError, TedsProvisionError, UnprovenError
+from teds_provision.protocol import datasheet
+from teds_provision.protocol.fingerprints import same_key
+from teds_provision.protocol.keys import fingerprint, node_key_good
+from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.wire_agreement import other_key
+from teds_provision.provisioning.sign import known_image
+from teds_provision.station.station import Station
+from teds_provision.station.store import RevocationRecord, WhitelistEntry
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.security import NotCanonicalError, SecurityTeds
+from teds_provision.teds.image import SECURITY, Image
+
+if TYPE_CHECKING:
+    from teds_provision.protocol.plant.signer import SignerVerdict
+    from teds_provision.station.plant.plant import SignerRules
+
+# -- what it is judged by: a station's keys, pins and deny list, asked one by one or remembered for many ---------------
+
+
+class PinLookup(Protocol):
+    """Which key a UUID is pinned to."""
+
+    def check(self, uuid: bytes, point: bytes) -> None:
+        """Raise KeyMismatchError if this UUID is known with another key."""
+
+    def entry(self, uuid: bytes) -> WhitelistEntry | None:
+        """Return the whitelist entry of a node."""
+
+
+class TrustLookup(Protocol):
+    """Whose signatures count, and who is denied."""
+
+    def revocation(self, uuid: bytes) -> RevocationRecord | None:
+        """Why a node is denied, None if it is not."""
+
+    def trusted_cas(self, uuid: bytes | None = None) -> list[bytes]:
+        """CA keys that count for a node."""
+
+    def trusted_stations(self) -> list[bytes]:
+        """Station keys that count."""
+
+    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> SignerVerdict | None:
+        """Return the plant's verdict on the signer of this digest; None if it does not apply."""
+
+
+class TrustSource(Protocol):
+    """A station, or what was remembered of one."""
+
+    @property
+    def point(self) -> bytes:
+        """The station's own key."""
+
+    @property
+    def pins(self) -> PinLookup:
+        """Pinned keys."""
+
+    @property
+    def policy(self) -> TrustLookup:
+        """Trust and denials."""
+
+
+@dataclass(frozen=True)
+class _PinSnapshot:
+    by_uuid: Mapping[bytes, str]
+    entries: Mapping[bytes, WhitelistEntry]
+
+    def check(self, uuid: bytes, point: bytes) -> None:
+        pinned = self.by_uuid.get(uuid)
+        if pinned is not None and not same_key(pinned, fingerprint(point)):
+            raise other_key(pinned, point)
+
+    def entry(self, uuid: bytes) -> WhitelistEntry | None:
+        return self.entries.get(uuid)
+
+
+@dataclass(frozen=True)
+class _TrustSnapshot:
+    denied: Mapping[bytes, RevocationRecord]
+    cas: tuple[bytes, ...]
+    cas_of_nodes: Mapping[bytes, bytes]
+    stations: tuple[bytes, ...]
+    rules: SignerRules | None
+
+    def revocation(self, uuid: bytes) -> RevocationRecord | None:
+        return self.denied.get(uuid)
+
+    def trusted_cas(self, uuid: bytes | None = None) -> list[bytes]:
+        kept = self.cas_of_nodes.get(uuid) if uuid is not None else None
+        return [*self.cas, *([kept] if kept is not None and kept not in self.cas else [])]
+
+    def trusted_stations(self) -> list[bytes]:
+        return list(self.stations)
+
+    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> SignerVerdict | None:
+        return None if self.rules is None else self.rules.signing(certifier, station_key, digest)
+
+
+@dataclass(frozen=True)
+class StationSnapshot:
+    """Snapshot of a station's trust: plain data, so that other processes can judge by it too."""
+
+    point: bytes
+    pins: _PinSnapshot
+    policy: _TrustSnapshot
+
+
+def snapshot_trust(station: Station) -> StationSnapshot:
+    """Take down everything that judging images asks a station for; raises StoreChangedError as the station does."""
+    return StationSnapshot(
+        station.point,
+        _PinSnapshot(station.pins.all(), {entry.uuid: entry for entry in station.pins.whitelist()}),
+        _TrustSnapshot(
+            {revocation.uuid: revocation for revocation in station.policy.revocations()},
+            tuple(station.policy.trusted_cas()),
+            _counting(station, station.keys.cas_of_nodes()),
+            tuple(station.policy.trusted_stations()),
+            station.policy.signer_rules(),
+        ),
+    )
+
+
+def snapshot_trust_of(station: Station, uuids: Sequence[bytes]) -> StationSnapshot:
+    """As :func:`snapshot_trust`, of what is asked for a page of nodes alone: a list of 100,000 is never held whole."""
+    entries = station.pins.get_many(uuids)
+    return StationSnapshot(
+        station.point,
+        _PinSnapshot(station.pins.pinned_among(station.nodes.get_many(uuids).values(), entries.values()), entries),
+        _TrustSnapshot(
+            station.policy.revocations_of(uuids),
+            tuple(station.policy.trusted_cas()),
+            _counting(station, station.keys.cas_among(uuids)),
+            tuple(station.policy.trusted_stations()),
+            station.policy.signer_rules(),
+        ),
+    )
+
+
+def _counting(station: Station, cas: Mapping[bytes, bytes]) -> dict[bytes, bytes]:
+    """Those of the CAs that nodes keep in which trust was not ended; a CA is asked about once."""
+    counts = {ca: station.policy.counts(ca) for ca in set(cas.values())}
+    return {uuid: ca for uuid, ca in cas.items() if counts[ca]}
+
+
+Outcome = Literal["passed", "failed", "skipped"]
+Verdict = Literal["authentic", "unsigned", "not authentic", "unproven"]
+Scope = Literal["node", "image"]
+MERELY_UNSIGNED: Final = frozenset({"signed", "every TEDS is signed"})
+"""Checks that fail if the only fault is a missing signature."""
+_FRESHNESS = {"sequence", "key epoch"}
+_DIGEST_OCTETS: Final = 32  # a TEDS is longer
+_SESSION = "session"
+_PAGES = "pages"
+
+
+class Check(NamedTuple):  # a tuple: thirteen of them for each of ten thousand files
+    """One check of the datasheet; ``why`` is the finding.
+
+    ``kept``: the TEDS concerned were not read again since the node last started; those of the last reading are judged
+    in their place.
+    """
+
+    name: str
+    result: Outcome
+    why: str = ""
+    kept: bool = False
+
+    def to_json(self) -> dict[str, str]:
+        """As `verify --json` and the API have it."""
+        return {"name": self.name, "result": self.result, "why": self.why, **({"from": "kept"} if self.kept else {})}
+
+
+@dataclass(frozen=True)
+class Verification:
+    """All checks and the one verdict. ``scope``: a node, or an image file alone.
+
+    ``unsigned``: the only fault is that (part of) it has no signature. ``unproven``: a key of the node is held and no
+    session was opened, so that the answers may be a replay of recorded ones.
+    """
+
+    uuid: bytes
+    checks: tuple[Check, ...]
+    scope: Scope = "node"
+
+    @property
+    def verdict(self) -> Verdict:
+        """One word for all checks."""
+        failed = {check.name for check in self.checks if check.result == "failed"}
+        if _PAGES in failed and failed <= {_PAGES, _SESSION}:
+            return "unproven"
+        if _SESSION in failed:  # what came without a session proves nothing, except that it is too old
+            return "not authentic" if failed & _FRESHNESS else "unproven"
+        if failed - MERELY_UNSIGNED:
+            return "not authentic"
+        return "unsigned" if failed else "authentic"
+
+
+@dataclass(frozen=True)
+class FreshnessFloor:
+    """Lower bounds of a node's datasheet: the node's own values, and those of the last one checked here.
+
+    ``identity`` was read in a session, None if there was none; ``sequence`` and ``key_epoch`` are fields 106 and 107 of
+    the newest datasheet with a good signature that this station saw on the node, 0 for none.
+    """
+
+    identity: Identity | None = None
+    sequence: int = 0
+    key_epoch: int = 0
+
+
+def freshness_floor_of(station: Station, uuid: bytes, identity: Identity | None) -> FreshnessFloor:
+    """Return this station's bounds for a node's datasheet.
+
+    Only signed values count: any device could serve the others.
+    """
+    image = known_image(station, uuid)
+    octets = image.security if image is not None else None
+    try:
+        shown = security.decode(octets) if octets is not None else None
+    except BadDataError:
+        shown = None
+    if image is None or octets is None or shown is None or not shown.signed:
+        return FreshnessFloor(identity)
+    signers = Signers.from_security_teds(shown)
+    counts = _signer(station, signers, _certifier(station, uuid, signers), octets)[0].result == "passed"
+    trusted = counts and datasheet.signature_good(shown, octets, uuid)
+    return FreshnessFloor(identity, shown.sequence, shown.key_epoch) if trusted else FreshnessFloor(identity)
+
+
+def verify_image(station: TrustSource, image: Image, *, known: FreshnessFloor | None = None) -> list[Check]:
+    """Check an image as far as octets and this station's trust go; ``known`` is None for a file judged alone.
+
+    Never raises on any octets.
+    """
+    return _checks(station, image, _proofs(image), known)
+
+
+def verify_images(station: TrustSource, images: Iterable[Image]) -> list[list[Check]]:
+    """Return the checks of many files, as :func:`verify_image` makes them of each.
+
+    All signatures are checked in a row. Between the other checks of its image, each one took half as long again: the
+    tables of OpenSSL and the Python around them evicted each other from the processor's cache.
+    """
+    proven = [(image, _proofs(image)) for image in images]
+    return [_checks(station, image, proofs, None) for image, proofs in proven]
+
+
+class _SecurityFields(NamedTuple):
+    """Fields of an image's Security TEDS, or why it cannot be parsed (None: there is none), and its signatures."""
+
+    shown: SecurityTeds | NotCanonicalError | None
+    node_key: bool = False
+    datasheet: bool = False
+
+
+def _proofs(image: Image) -> _SecurityFields:
+    """Read the Security TEDS of an image, and check what needs no trust: fields 102 and 100."""
+    octets = image.security
+    if octets is None:
+        return _SecurityFields(None)
+    try:
+        shown = security.decode(octets)
+    except NotCanonicalError as error:
+        return _SecurityFields(error)
+    node_key = node_key_good(image.uuid, shown.node_key, shown.node_key_signature)
+    return _SecurityFields(shown, node_key, shown.signed and datasheet.signature_good(shown, octets, image.uuid))
+
+
+def _checks(station: TrustSource, image: Image, proofs: _SecurityFields, known: FreshnessFloor | None) -> list[Check]:
+    return judge(
+        station, image.uuid, _octets(image, proofs, known), Signers.from_security_teds(proofs.shown), image.security
+    )
+
+
+class Signers(NamedTuple):
+    """Fields 101 to 104 of a Security TEDS, to be checked by today's pins and trust; None if absent."""
+
+    node_key: bytes | None = None
+    node_key_signature: bytes | None = None
+    station_key: bytes | None = None
+    station_key_signature: bytes | None = None
+
+    @classmethod
+    def from_security_teds(cls, shown: SecurityTeds | NotCanonicalError | None) -> Signers:
+        """Those of a Security TEDS that was read; none of one that is absent or not of this profile."""
+        if not isinstance(shown, SecurityTeds):
+            return cls()
+        signed = (shown.station_key, shown.station_key_signature) if shown.signed else (None, None)
+        return cls(shown.node_key, shown.node_key_signature, *signed)
+
+
+def static_checks(image: Image, known: FreshnessFloor | None) -> tuple[list[Check], Signers]:
+    """Return the checks that no later change of trust alters, and the input of :func:`judge` for the others.
+
+    The image's own checks are cached for a moment: both the record of a write and the verdict need them.
+    """
+    said = next((said for asked, said in tuple(_SAID) if asked is image), None)
+    if said is None:
+        proofs = _proofs(image)
+        said = proofs.shown, _by_itself(image, proofs)
+        _SAID.append((image, said))
+    shown, checks = said
+    return [*checks, *_not_older(shown, known)], Signers.from_security_teds(shown)
+
+
+_Shown = SecurityTeds | NotCanonicalError | None
+_SAID: Final[deque[tuple[Image, tuple[_Shown, tuple[Check, ...]]]]] = deque(maxlen=4)
+
+
+def judge(
+    station: TrustSource, uuid: bytes, octets: Iterable[Check], signers: Signers, security_teds: bytes | None
+) -> list[Check]:
+    """All checks of a datasheet: those of its ``octets``, and those of today's pins, bans and trust.
+
+    ``security_teds``: the TEDS itself or its SHA-256, by which the plant's stations name what they signed.
+    """
+    checks = {check.name: check for check in octets}
+    if signers.node_key is not None:
+        if "node key" not in checks:
+            checks["node key"] = _pinned(station, uuid, signers.node_key)
+        checks["not revoked"] = _not_revoked(station, uuid)
+    if signers.station_key is not None:
+        certifier = _certifier(station, uuid, signers)
+        checks |= {check.name: check for check in _signer(station, signers, certifier, security_teds)}
+        checks["station certificate"] = _certificate(station, signers, certifier)
+    return sorted(checks.values(), key=lambda check: _PLACES[check.name])
+
+
+_ORDER: Final = (
+    "form", "canonical form", "algorithms", "node key", "key epoch", "sequence", "not revoked", "signed",
+    "signing station", _PAGES, "station certificate", "signature", "signed TEDS", "every TEDS is signed", "UUID",
+    "possession", _SESSION,
+)  # fmt: skip
+_PLACES: Final = {name: place for place, name in enumerate(_ORDER)}
+ABOUT_THE_REST: Final = frozenset({"form", "signed TEDS", "every TEDS is signed", "UUID"})
+"""Checks of other TEDS than the Security TEDS."""
+
+
+def _octets(image: Image, proofs: _SecurityFields, known: FreshnessFloor | None) -> list[Check]:
+    return [*_by_itself(image, proofs), *_not_older(proofs.shown, known)]
+
+
+def _not_older(shown: _Shown, known: FreshnessFloor | None) -> list[Check]:
+    """Check that a datasheet is not older than what is known of its node."""
+    return [_epoch(shown, known), _sequence(shown, known)] if isinstance(shown, SecurityTeds) else []
+
+
+def _by_itself(image: Image, proofs: _SecurityFields) -> tuple[Check, ...]:
+    """Return the checks of an image that need no other knowledge."""
+    checks, shown = [_form(image)], proofs.shown
+    if shown is None:
+        return (*checks, Check("signed", "failed", "the image has no Security TEDS"))
+    if isinstance(shown, NotCanonicalError):
+        ours = security.has_profile_version(image.blocks[SECURITY])
+        why = shown.message if ours else "the Security TEDS does not follow this profile: shown, never trusted"
+        return (*checks, Check("canonical form", "failed", why))
+    checks += [Check("canonical form", "passed"), _algorithms(shown)]
+    if not proofs.node_key:
+        checks.append(Check("node key", "failed", "field 102 does not sign this key for this UUID"))
+    if not shown.signed:
+        return (*checks, Check("signed", "failed", "this is the initial Security TEDS, which is not signed yet"))
+    checks += [
+        Check("signed", "passed"),
+        _check("signature", proofs.datasheet, _CHANGED),
+        _blocks(image, shown),
+        _unlisted(image, shown),
+        _meta(image),
+    ]
+    return tuple(checks)
+
+
+def possession_check(prove: Callable[[], None]) -> Check:
+    """Run the challenge and return it as a check; a link that fails is raised, not judged."""
+    try:
+        prove()
+    except NotAuthenticError as error:
+        return Check("possession", "failed", error.message)
+    return Check("possession", "passed", "the node signed a fresh challenge")
+
+
+def session_check(opened: str, why: str) -> Check:
+    """Return the check that the TEDS came from the node: ``opened`` is the evidence, ``why`` the reason of a failure.
+
+    Both empty: no key of the node is held here, and signatures alone count.
+    """
+    if opened:
+        return Check(_SESSION, "passed", opened)
+    if why:
+        return Check(_SESSION, "failed", why)
+    return Check(_SESSION, "skipped", "this station holds no key of this node")
+
+
+def unproven(uuid: bytes, why: str) -> UnprovenError:
+    """Return the error (exit 5) if a key of the node is held and the origin is unproven.
+
+    Neither a session nor the node's signature proves it.
+    """
+    return UnprovenError(
+        f"Nothing could be proven about node {uuid.hex()}: {why}.",
+        hint="Data received outside a session may be a replay. Try it on the reader; to take a node over: agree"
+        " --rotate",
+    )
+
+
+def require_authentic(verified: Verification) -> None:
+    """Raise NotAuthenticError (exit 4), or UnprovenError (5), unless the verdict is ``authentic``.
+
+    Names the first failure.
+    """
+    if verified.verdict == "authentic":
+        return
+    failed = {check.name: check for check in reversed(verified.checks) if check.result == "failed"}
+    if verified.verdict == "unproven" and _PAGES in failed:
+        raise UnprovenError(
+            f"Nothing could be proven about the datasheet of node {verified.uuid.hex()}: {failed[_PAGES].why}.",
+            hint="To get the missing pages: registry sync, or registry sync --files DIR from a station that has them",
+        )
+    if verified.verdict == "unproven":
+        raise unproven(verified.uuid, failed[_SESSION].why)
+    told = next((failed[name] for name in _FRESHNESS if name in failed), next(iter(reversed(failed.values()))))
+    raise BadDatasheetError(f"The datasheet is {verified.verdict}: {told.why or told.name}.")
+
+
+def _check(name: str, holds: bool, why: str, good: str = "") -> Check:
+    return Check(name, "passed", good) if holds else Check(name, "failed", why)
+
+
+def _form(image: Image) -> Check:
+    bad = [block for block in image if not datasheet.passes_own_check(block, image.blocks[block])]
+    why = ", ".join(f"TEDS {code} of channel {channel}" for channel, code in bad)
+    return _check("form", not bad, f"length, checksum or class is wrong: {why}", f"{len(image.blocks)} TEDS")
+
+
+def _algorithms(shown: SecurityTeds) -> Check:
+    wrong = [number for number, value in security.OUR_VALUES.items() if shown.values[number] != value]
+    why = "weak or unknown algorithm in field " + ", ".join(map(str, wrong))
+    if other := security.other_wire(shown):
+        why = f"it names {other}"
+    return _check("algorithms", not wrong, why, "ECDSA P-256, SHA-256, AES-128")
+
+
+def _pinned(station: TrustSource, uuid: bytes, node_key: bytes) -> Check:
+    name = "node key"
+    try:
+        station.pins.check(uuid, node_key)
+        entry = station.pins.entry(uuid)
+    except TedsProvisionError as error:
+        return Check(name, "failed", error.message)
+    pinned = "pinned" if entry is not None and entry.fingerprint else "not pinned here"
+    return Check(name, "passed", f"{fingerprint(node_key)[:16]}, {pinned}")
+
+
+_FILE_ALONE = "a file does not show the node's current state"
+
+
+def _epoch(shown: SecurityTeds, known: FreshnessFloor | None) -> Check:
+    name = "key epoch"
+    if known is None:
+        return Check(name, "skipped", _FILE_ALONE)
+    if known.identity is not None and shown.key_epoch > known.identity.epoch:
+        why = f"signed for epoch {shown.key_epoch}, but the node is at {known.identity.epoch}"
+        return Check(name, "failed", why)
+    why = f"signed for epoch {shown.key_epoch}, older than the {known.key_epoch} that this station saw"
+    return _check(name, shown.key_epoch >= known.key_epoch, why, str(shown.key_epoch))
+
+
+def _sequence(shown: SecurityTeds, known: FreshnessFloor | None) -> Check:
+    name = "sequence"
+    if known is None:
+        return Check(name, "skipped", _FILE_ALONE)
+    if known.identity is not None and shown.sequence < known.identity.sequence:
+        own = known.identity.sequence
+        why = f"sequence {shown.sequence} is older than the node's own {own}: an old datasheet was restored"
+        return Check(name, "failed", why)
+    why = f"sequence {shown.sequence} is older than the {known.sequence} that this station saw on the node"
+    return _check(name, shown.sequence >= known.sequence, why, str(shown.sequence))
+
+
+def _not_revoked(station: TrustSource, uuid: bytes) -> Check:
+    revoked = station.policy.revocation(uuid)
+    return _check("not revoked", revoked is None, f"revoked: {revoked.why}" if revoked else "")
+
+
+def _certifier(station: TrustSource, uuid: bytes, signers: Signers) -> bytes | None:
+    """Return the trusted CA that signed field 104, None if none did."""
+    for ca in station.policy.trusted_cas(uuid):
+        if datasheet.is_certified(ca, signers.station_key, signers.station_key_signature):
+            return ca
+    return None
+
+
+def _station(station: TrustSource, signers: Signers, certifier: bytes | None) -> Check:
+    key = signers.station_key or b""
+    digits = fingerprint(key)[:16]
+    return _check(
+        "signing station",
+        certifier is not None or key in station.policy.trusted_stations(),
+        f"station {digits} is neither trusted here nor certified by a trusted CA",
+        digits,
+    )
+
+
+def _signer(
+    station: TrustSource, signers: Signers, certifier: bytes | None, security_teds: bytes | None
+) -> tuple[Check, ...]:
+    """Check that the station that signed counts; in a plant by its roster and pages, which may not be here yet."""
+    octets, key = security_teds or b"", signers.station_key or b""
+    digest = octets if len(octets) == _DIGEST_OCTETS else hashlib.sha256(octets).digest()
+    said = station.policy.signing(certifier, key, digest)
+    if said is None:
+        return (_station(station, signers, certifier),)
+    name, digits = "signing station", fingerprint(key)[:16]
+    if said.result == "unproven":
+        return (Check(name, "skipped", digits), Check(_PAGES, "failed", said.why))
+    why = f"{digits}, {said.why}" if said.why and said.result == "passed" else said.why or digits
+    return (Check(name, said.result, why),)
+
+
+def _certificate(station: TrustSource, signers: Signers, certifier: bytes | None) -> Check:
+    name = "station certificate"
+    if certifier is not None:
+        return Check(name, "passed", f"CA {fingerprint(certifier)[:16]}")
+    if signers.station_key == station.point or signers.station_key not in station.policy.trusted_stations():
+        return Check(name, "failed", "field 104 matches no trusted CA")
+    return Check(name, "skipped", "the station itself is trusted; its CA is not known here")
+
+
+_CHANGED = "field 100 does not verify: the datasheet was changed or belongs to another node"
+
+
+def _blocks(image: Image, shown: SecurityTeds) -> Check:
+    found = datasheet.digests(image.blocks)
+    wrong = [block for block, digest in shown.signed_blocks.items() if found.get(block) != digest]
+    why = ", ".join(f"TEDS {code} of channel {channel} is missing or changed" for channel, code in wrong)
+    return _check("signed TEDS", not wrong, why, f"{len(shown.signed_blocks)} digests")
+
+
+def _unlisted(image: Image, shown: SecurityTeds) -> Check:
+    extra = [block for block in image if block != SECURITY and block not in shown.signed_blocks]
+    why = ", ".join(f"TEDS {code} of channel {channel} is unsigned" for channel, code in extra)
+    return _check("every TEDS is signed", not extra, why)
+
+
+def _meta(image: Image) -> Check:
+    metas = [teds for (_, code), teds in image.blocks.items() if code == AccessCode.META]
+    return _check("UUID", all(datasheet.meta_names(teds, image.uuid) for teds in metas), "the Meta-TEDS names another")

@@ -1,0 +1,209 @@
+"""Many images at once: each judged as ``verify IMAGE`` judges one, on every core (``verify FILES…|DIR``)."""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from teds_provision import teds
+from teds_provision.errors import BadDataError, PolicyError, TedsProvisionError
+from teds_provision.files import read_limited
+from teds_provision.limits import LIMITS
+from teds_provision.portable import cores_to_share
+from teds_provision.provisioning.verify import (
+    Check,
+    TrustSource,
+    Verification,
+    require_authentic,
+    snapshot_trust,
+    verify_images,
+)
+from teds_provision.station.station import Station
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.image import Image
+
+_FEW: Final = 50
+"""So many are judged sooner than another process is ready."""
+_CHUNK: Final = 64
+_TOGETHER: Final = 1 << 20
+"""Octets of image files that are held at a time."""
+
+
+@dataclass(frozen=True)
+class FileVerdict:
+    """Result of one file: its checks, or why it could not be read; ``exit_code`` of a command for it alone."""
+
+    path: Path
+    uuid: str | None = None
+    verdict: str | None = None
+    checks: tuple[Check, ...] = ()
+    warnings: tuple[str, ...] = ()
+    exit_code: int = 0
+    code: str = ""
+    error: str = ""
+
+    def to_json(self) -> dict[str, object]:
+        """One line of the result."""
+        out: dict[str, object] = {"file": str(self.path), "uuid": self.uuid, "scope": "image", "verdict": self.verdict}
+        out["checks"] = [{"name": check.name, "result": check.result, "why": check.why} for check in self.checks]
+        out["warnings"] = list(self.warnings)
+        if self.error:
+            out["error"] = {"code": self.code, "message": self.error}
+        return out
+
+
+@dataclass
+class VerdictTotals:
+    """How many files came to which verdict; ``exit_code`` is that of the worst."""
+
+    files: int = 0
+    verdicts: dict[str, int] = field(default_factory=dict)
+    exit_code: int = 0
+
+    def add(self, verdict: FileVerdict) -> None:
+        """Count one in."""
+        self.files += 1
+        word = verdict.verdict or "unreadable"
+        self.verdicts[word] = self.verdicts.get(word, 0) + 1
+        if verdict.exit_code:
+            self.exit_code = max(self.exit_code, verdict.exit_code, key=_WORST.index)
+
+    def join(self, others: VerdictTotals) -> None:
+        """Count in what was counted elsewhere."""
+        self.files += others.files
+        for word, count in others.verdicts.items():
+            self.verdicts[word] = self.verdicts.get(word, 0) + count
+        self.exit_code = max(self.exit_code, others.exit_code, key=_WORST.index)
+
+    def to_json(self) -> dict[str, object]:
+        """Return the last line."""
+        return {"totals": {"files": self.files, **dict(sorted(self.verdicts.items()))}}
+
+
+Tell = Callable[[FileVerdict], str]
+"""The line of one file, as it is shown; called in whichever process judged it."""
+
+# From good to bad: a harmful calibration, a file that is not there or holds no image, one that is not authentic.
+_WORST: Final = (0, 6, 7, 3, 8, 1, 4)
+
+
+def verify_files(
+    station: Station, files: Sequence[str], tell: Tell, *, processes: int | None = None
+) -> Iterator[tuple[list[str], VerdictTotals]]:
+    """Judge every file, in order, some at a time: yield the lines of ``tell`` for each, and their totals.
+
+    A fault of one is its verdict and stops no other. More than a few files are shared among ``processes`` (as many as
+    there are cores), which format them too: lines are quicker to send than verdicts with all their checks.
+    """
+    workers = min(processes or cores_to_share(), (len(files) + _CHUNK - 1) // _CHUNK)
+    work = _Work(snapshot_trust(station), tell, files)
+    if len(files) <= _FEW or workers <= 1:
+        yield from (work.judge(range(at, at + 1)) for at in range(len(files)))
+        return
+    yield work.judge(range(1))  # what is loaded late is there before there are more processes
+    size = min(_CHUNK, max(1, (len(files) - 1) // (4 * workers)))
+    context = multiprocessing.get_context("fork")  # what is remembered is simply there
+    with context.Pool(workers, initializer=_init_worker, initargs=(work,)) as pool:
+        yield from pool.imap(_judge_chunk, (range(at, min(at + size, len(files))) for at in range(1, len(files), size)))
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What a process needs to judge files and to report them."""
+
+    judging: TrustSource
+    tell: Tell
+    files: Sequence[str]
+
+    def judge(self, places: range) -> tuple[list[str], VerdictTotals]:
+        """Judge the files at these places of the list, which every process has."""
+        lines, totals = [], VerdictTotals()
+        for some in _some([Path(self.files[place]) for place in places]):
+            for found in _judged(self.judging, some):
+                totals.add(found)
+                lines.append(self.tell(found))
+        return lines, totals
+
+
+_work: _Work | None = None
+
+
+def _init_worker(work: _Work) -> None:
+    global _work  # noqa: PLW0603 - set once, in a separate process
+    _work = work
+    gc.freeze()  # the whole program is there before the first image: not looked through again for each few of them
+
+
+def _judge_chunk(places: range) -> tuple[list[str], VerdictTotals]:
+    assert _work is not None
+    return _work.judge(places)
+
+
+_Read = tuple[Path, Image | TedsProvisionError]
+
+
+def _some(paths: Sequence[Path]) -> Iterator[list[_Read]]:
+    """Read images, some at a time: as many as are no burden to hold together."""
+    some: list[_Read] = []
+    octets = 0
+    for path in paths:
+        try:
+            text = read_limited(path, LIMITS.teds_file, "image", failure=BadDataError)
+            octets += len(text)
+            some.append((path, security.require_our_wire(Image.from_json(text))))
+        except TedsProvisionError as error:
+            some.append((path, error))
+        if octets > _TOGETHER:
+            yield some
+            some, octets = [], 0
+    if some:
+        yield some
+
+
+def _judged(judging: TrustSource, some: Sequence[_Read]) -> Iterator[FileVerdict]:
+    """Yield the verdicts of files that were read, in their order."""
+    checks = iter(verify_images(judging, (image for _, image in some if isinstance(image, Image))))
+    for path, image in some:
+        if isinstance(image, Image):
+            yield _verdict(path, image, next(checks))
+        else:
+            yield FileVerdict(path, exit_code=image.exit_code, code=image.code, error=image.message)
+
+
+def _verdict(path: Path, image: Image, checks: Sequence[Check]) -> FileVerdict:
+    verified = Verification(image.uuid, tuple(checks), scope="image")
+    result = FileVerdict(path, image.uuid.hex(), verified.verdict, verified.checks)
+    try:
+        require_authentic(verified)
+        return _with_warnings(result, image)
+    except TedsProvisionError as error:
+        return _ended(result, error)
+
+
+def _with_warnings(result: FileVerdict, image: Image) -> FileVerdict:
+    """Look at the calibrations, as every command does before it trusts a datasheet."""
+    if not any(code == AccessCode.CALIBRATION for _, code in image.blocks):
+        return result  # and the guard is not loaded
+    findings = teds.guard.check_calibration(image.unsigned_blocks())
+    texts = tuple(f"channel {finding.channel}: {finding.message}" for finding in findings)
+    harmful = [text for text, finding in zip(texts, findings, strict=True) if finding.severity == "error"]
+    whole = FileVerdict(result.path, result.uuid, result.verdict, result.checks, texts)
+    return _ended(whole, PolicyError(f"The calibration is refused: {harmful[0]}.")) if harmful else whole
+
+
+def _ended(result: FileVerdict, error: TedsProvisionError) -> FileVerdict:
+    return FileVerdict(
+        result.path,
+        result.uuid,
+        result.verdict,
+        result.checks,
+        result.warnings,
+        error.exit_code,
+        error.code,
+        error.message,
+    )

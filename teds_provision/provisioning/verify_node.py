@@ -1,0 +1,183 @@
+"""Step 7 at a node: whether the session, or the node's own signature, vouches for what was read, and the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from hashlib import sha256
+
+from teds_provision.errors import LinkError, NodeRefusedError, NotAuthenticError
+from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.provisioning import readings
+from teds_provision.provisioning.agree import agreed_elsewhere, proof_of_reset, session_if_keyed
+from teds_provision.provisioning.conversation import HEARD, Conversation
+from teds_provision.provisioning.firmware import keep_firmware, read_firmware
+from teds_provision.provisioning.identify import IdentifiedNode, prove
+from teds_provision.provisioning.readings import NodeVerdict
+from teds_provision.provisioning.teds_read import read_block, read_identity, read_image
+from teds_provision.provisioning.verify import (
+    Check,
+    Verification,
+    freshness_floor_of,
+    possession_check,
+    session_check,
+    verify_image,
+)
+from teds_provision.station.station import Station
+from teds_provision.station.store import utc_now
+from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.image import SECURITY, Image
+
+
+@dataclass(frozen=True)
+class NodeVerification:
+    """A node's TEDS, and what they are worth."""
+
+    image: Image
+    judged: NodeVerdict
+
+    @property
+    def verified(self) -> Verification:
+        """All checks, and the verdict."""
+        return self.judged.verified
+
+    @property
+    def kept(self) -> bool:
+        """True if all but the Security TEDS is as it was read before the node's last start."""
+        return self.judged.origin == "kept"
+
+
+def verify_at_node(station: Station, node: Conversation, who: IdentifiedNode) -> NodeVerification:
+    """Open a session if a key is held, read every TEDS and judge them; raises LinkError and what a read raises.
+
+    A session in which the node answers only that it is busy counts as none: then all is read without it.
+    """
+    why = open_or_say_why(station, node)
+    c = node.open_counter
+    try:
+        image = read_image(node)
+    except NodeRefusedError as refusal:
+        if not (node.sealed and refusal.message.startswith(HEARD)):
+            raise
+        node.forget()
+        why, image = _why(refusal), read_image(node)
+    return NodeVerification(image, verify_node(station, node, image, who.point, why=why, c=c))
+
+
+def verify_in_session(station: Station, node: Conversation, *, by: str) -> NodeVerification:
+    """Judge the TEDS of a node in the session that is open. Raises LinkError, NodeRefusedError.
+
+    If its Security TEDS is octet for octet the one that was read before, and the rest had no fault then, the rest is
+    not read again here: the Security TEDS contains the digest of every other TEDS. c of the session shows whether the
+    node has started since; then the rest's verdict is ``kept``, until it is read (:mod:`.readings`). Everything is
+    judged again all the same: trust, bans and pins may have changed.
+    """
+    identity, c = read_identity(node), node.open_counter
+    keep_firmware(station, node.uuid, read_firmware(node))
+    octets = read_block(node, SECURITY)
+    known = freshness_floor_of(station, node.uuid, identity)
+    image = readings.cached_image_if_current(station, node, octets, known)
+    if image is not None:
+        judged = readings.verdict_of(station, node.uuid)
+        assert judged is not None, "a reading that stands is there"
+        return NodeVerification(image, judged)
+    image = read_image(node)
+    return NodeVerification(image, readings.keep(station, node, image, by=by, known=known, c=c))
+
+
+def open_or_say_why(station: Station, node: Conversation) -> str:
+    """Open a session if a key is held; return why there is none although one is held, else an empty text.
+
+    Raises LinkError, and NodeRefusedError for a refusal in the session.
+    """
+    try:
+        held = session_if_keyed(station, node)
+    except NodeRefusedError as refusal:
+        if node.sealed:
+            raise
+        return _why(refusal)
+    if held is None and station.keys.held(node.uuid) and station.policy.tombstone(node.uuid) is None:
+        elsewhere = agreed_elsewhere(station, node)
+        return "the node does not open a session with any key held here" + (elsewhere and f"; {elsewhere}")
+    return ""
+
+
+def _why(refusal: NodeRefusedError) -> str:
+    return refusal.message.removeprefix(HEARD).rstrip(".")
+
+
+def verify_node(
+    station: Station,
+    node: Conversation,
+    image: Image,
+    point: bytes,
+    *,
+    why: str = "",
+    by: str = "verify",
+    c: bytes | None = None,
+) -> NodeVerdict:
+    """Check what was read off a node, have it prove its key, and keep the reading. Raises only for the link.
+
+    ``why``: why there is no session although a key is held; then nothing of the reading is kept. ``by`` is the command,
+    ``c`` that of the session in which the reading began.
+    """
+    identity = (node.proven or read_identity(node)) if node.sealed else None
+    firmware = read_firmware(node) if node.sealed else None
+    possessed, vouch = possession_check(lambda: prove(node, point)), provenance_check(node, point, why)
+    known = freshness_floor_of(station, node.uuid, identity)
+    if vouch.result == "failed":
+        with station.reading():
+            verified = Verification(node.uuid, (*verify_image(station, image, known=known), possessed, vouch))
+        station.audit("verify", node.uuid, verified.verdict, why=why)
+        return NodeVerdict(verified, "plain", utc_now(), by)
+    more = [possessed] if node.sealed or vouch.result == "skipped" else [possessed, vouch]
+    c = (c or node.open_counter) if node.sealed else None
+    with station.reading():
+        row, judged = readings.judge_reading(station, image, c, by=by, known=known, more=more)
+
+    def record() -> None:
+        with station.durable("verify"):
+            readings.keep_judged(station, row, judged, image)
+            keep_firmware(station, image.uuid, firmware)
+            kept = station.datasheets.reading(image.uuid)
+            if identity is not None or (kept is not None and not kept.in_session):
+                station.nodes.remember(image.uuid, **_facts(image, identity))
+            station.audit("verify", image.uuid, judged.verified.verdict)
+
+    station.run_in_background(record)  # a run prints its result when it is on the disk, and asks the hardware meanwhile
+    return judged
+
+
+def _facts(image: Image, identity: Identity | None) -> dict[str, object]:
+    """Return the facts to record of a node that was read.
+
+    ``identity`` is its Identify in a session, None outside one.
+    """
+    facts: dict[str, object] = {"channels": len({c for c, code in image if code == AccessCode.CHANNEL})}
+    if image.security is not None:
+        facts["teds_sha256"] = sha256(image.security).hexdigest()
+    if identity is not None:
+        facts |= {
+            "state": int(identity.state),
+            "epoch": identity.epoch,
+            "sequence": identity.sequence,
+            "can_address": identity.can_address,
+            "last_seen": utc_now(),
+            "retired": None,
+        }
+    return facts
+
+
+def provenance_check(node: Conversation, point: bytes, why: str) -> Check:
+    """Check that the node itself sent this: in a session, or by its signature that it was reset.
+
+    ``why`` comes from :func:`open_or_say_why`; the check fails if a key is held and neither succeeded.
+    """
+    if node.sealed:
+        return session_check("opened with the key held here", "")
+    if why and node.identity.state == NodeState.FACTORY:
+        try:
+            proof_of_reset(node, point)
+        except (NotAuthenticError, NodeRefusedError, LinkError):
+            return session_check("", f"{why}, and it did not prove that it was reset")
+        return session_check("the node signed that it was reset: it no longer has the key held here", "")
+    return session_check("", why)

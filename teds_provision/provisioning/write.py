@@ -1,0 +1,307 @@
+"""Step 6: stage every TEDS, commit, read back, compare (profile.md, "Writing to flash").
+
+First the charge of the node is checked, as power that fails in the middle helps neither side (operation.md section 7).
+The initial NFC message contains it in plain; over the air the session asks for it (Power, 128.18). On a wired bus nodes
+are fed by the bus, and there is no check. It is a hint: it delays a write, and decides nothing else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import PurePath
+from types import MappingProxyType
+from typing import Final
+
+from teds_provision.errors import (
+    BadDataError,
+    GarbledError,
+    NodeRefusedError,
+    NodeSilentError,
+    NotAuthenticError,
+    PolicyError,
+)
+from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
+from teds_provision.protocol.messages.frames import Reason, update_teds, write_teds
+from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.protocol.operation.commands import POWER, PowerFlag, PowerReply
+from teds_provision.provisioning.build import profile_files_digest
+from teds_provision.provisioning.conversation import Conversation, SessionLostError
+from teds_provision.provisioning.firmware import keep_firmware, read_firmware
+from teds_provision.provisioning.readings import is_known, keep, keep_read
+from teds_provision.provisioning.sign import known_image, node_keys_of, sign
+from teds_provision.provisioning.teds_read import NodeSnapshot, read_block, read_identity, read_image
+from teds_provision.provisioning.verify import freshness_floor_of
+from teds_provision.station.firmware import FirmwareReading
+from teds_provision.station.station import Station
+from teds_provision.station.store import NodeRecord
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.security import SecurityTeds
+from teds_provision.teds.image import SECURITY, BlockId, Image
+
+LEAST_PERCENT: Final = 10
+WRITE_OVERHEAD = 53
+_STARTS = 3
+_LOSSES = 20
+_SMALLEST_PIECE = 48
+
+Progress = Callable[[int, int], None]
+"""``progress(octets written, octets to write)``."""
+Low = Callable[[str], object]
+"""Asks, with a whole sentence, before a node with a low battery is written; raises if the answer is no."""
+
+
+def wait_for_charge(question: str) -> None:
+    """Refuse, as without a question there is no answer. Raises PolicyError."""
+    raise PolicyError(
+        question.removesuffix(" Write it?"), hint="Charge it first (leave it on the reader), or add --yes."
+    )
+
+
+@dataclass(frozen=True)
+class WriteResult:
+    """Result of a write: octets staged (0 if the node had it all), seconds, and what was read back."""
+
+    octets: int
+    seconds: float
+    on_node: Image
+
+
+def write(
+    station: Station,
+    node: Conversation,
+    image: Image,
+    *,
+    present: NodeSnapshot | None = None,
+    progress: Progress | None = None,
+    facts: Mapping[str, object] = MappingProxyType({}),
+    jump: bool = False,
+    low: Low = wait_for_charge,
+) -> WriteResult:
+    """Bring a signed image onto the node, inside the open session, and prove by reading that it is there.
+
+    ``present`` is the node's content as read in this session: equal blocks are not sent again. ``facts`` are recorded
+    of the node once it is written. Raises NodeRefusedError with the node's reason, PolicyError if the image is older
+    than what the node has, or so far ahead that more than one step of 65,536 would be needed without a confirmation
+    (``jump``): that irreversibly uses up the sequence of the node; if ``low`` rejects the node's charge.
+    NotAuthenticError if the read-back differs.
+    """
+    started = time.monotonic()
+    signed = security.decode(image.blocks[SECURITY])
+    if not signed.signed:
+        raise BadDataError("The image is not signed.", hint="Sign it first: teds-provision sign UUID")
+    has = present.image if present is not None else None
+    if (has.security if has is not None else read_block(node, SECURITY)) == image.security:
+        has = has or read_image(node)
+        if all(has.blocks.get(block) == image.blocks[block] for block in image):
+            if not is_known(station, node, has):
+                known = freshness_floor_of(station, image.uuid, node.proven or read_identity(node))
+                with station.durable("write", more_follows=True):
+                    keep(station, node, has, by="write", known=known)
+            return WriteResult(0, time.monotonic() - started, has)
+    identity, firmware = node.proven or read_identity(node), read_firmware(node)
+    _require_newer(station, image.uuid, signed, identity, jump=jump)
+    _require_charge(node, low)
+    octets = 0
+    for step in range(identity.sequence + SEQUENCE_WINDOW, signed.sequence, SEQUENCE_WINDOW):
+        keys = node_keys_of(image.uuid, image.blocks[SECURITY])
+        between = sign(station, keys, image, epoch=identity.epoch, node_sequence=0, sequence=step).image
+        octets += _commit(station, node, between, has, progress)
+        has = between
+    octets += _commit(station, node, image, has, progress)
+    node.proven = replace(identity, sequence=signed.sequence, state=NodeState.PROVISIONED)
+    c = node.open_counter
+    back = read_image(node)
+    _conclude(station, node, image, back, facts, c=c, octets=octets, sequence=signed.sequence, firmware=firmware)
+    return WriteResult(octets, time.monotonic() - started, back)
+
+
+def _tell_written(station: Station, image: Image, known: NodeRecord, sequence: int) -> None:
+    """Report to the plant which datasheet the node has now, and its origin."""
+    octets = image.security
+    if station.plant.joined is not None and octets is not None:
+        station.plant.record_event(
+            "written",
+            image.uuid,
+            epoch=security.decode(octets).key_epoch,
+            sequence=sequence,
+            teds_sha256=hashlib.sha256(octets).hexdigest(),
+            profile=PurePath(known.profile).name if known.profile else None,  # of a file its name, not its path
+            profile_sha256=profile_files_digest(station, known),
+            due=known.due,
+        )
+
+
+def _conclude(
+    station: Station,
+    node: Conversation,
+    image: Image,
+    back: Image,
+    facts: Mapping[str, object],
+    *,
+    c: bytes | None,
+    octets: int,
+    sequence: int,
+    firmware: FirmwareReading | None,
+) -> None:
+    """Record what was read back; raises NotAuthenticError if it is not what was written."""
+    differing = [block for block in image if back.blocks.get(block) != image.blocks[block]]
+
+    identity, profile = node.proven, facts.get("profile")
+    named = profile if isinstance(profile, str) else None
+    c = (c or node.open_counter) if node.sealed else None
+
+    def record() -> None:  # asks the node nothing: the next message may be on its way
+        with station.durable("write", more_follows=True):
+            keep_read(
+                station, back, c, by="write", known=freshness_floor_of(station, image.uuid, identity), profile=named
+            )
+            if differing:
+                station.audit("write", image.uuid, "read-back differs", block=list(differing[0]))
+            else:
+                known = station.nodes.remember(image.uuid, **facts)
+                keep_firmware(station, image.uuid, firmware, signed=True)
+                _tell_written(station, image, known, sequence)
+                # A draft that is on the node now is none any more; a newer trial stays
+                draft = station.datasheets.draft(image.uuid)
+                if draft is not None and draft.image.unsigned_blocks() == image.unsigned_blocks():
+                    station.datasheets.drop_draft(image.uuid)
+                station.audit("write", image.uuid, "done", octets=octets, sequence=sequence)
+
+    station.run_in_background(record)  # the next verification has the node prove its key meanwhile
+    if differing:
+        channel, access_code = differing[0]
+        raise NotAuthenticError(
+            f"TEDS {access_code} of channel {channel} reads back differently from what was written.",
+            hint="Try again. If the error persists, the board's flash is defective.",
+        )
+
+
+def _require_charge(node: Conversation, low: Low) -> None:
+    percent = _percent(node)
+    if percent is not None and percent < LEAST_PERCENT:
+        low(
+            f"The battery of node {node.uuid.hex()} is at {percent} %: the write may fail halfway and have to"
+            " be repeated. Write it?"
+        )
+
+
+def _percent(node: Conversation) -> int | None:
+    """Return per cent, None if it is unknown, or if the node is fed."""
+    if node.charging is not None and node.charging.battery_percent is not None:
+        return node.charging.battery_percent
+    if node.tapped or node.wired or not node.sealed:
+        return None
+    try:
+        power = PowerReply.decode(node.request_idempotent(POWER, "to tell its charge"))
+    except (NodeRefusedError, BadDataError):
+        return None  # it has no battery, or does not measure
+    return power.level if power.flags & PowerFlag.BATTERY else None
+
+
+def _again(station: Station, uuid: bytes) -> str:
+    """How this station gets the image signed against the node as it is now."""
+    roster = station.plant.roster
+    if roster is not None and not roster.has(station.fingerprint, "sign"):
+        return f"Have it signed again: teds-provision sign {uuid.hex()} --by OFFICE --job ID"
+    return f"Sign it again for the node as it is now: teds-provision sign {uuid.hex()} --read-node"
+
+
+def _require_newer(station: Station, uuid: bytes, signed: SecurityTeds, identity: Identity, *, jump: bool) -> None:
+    if signed.sequence <= identity.sequence:
+        raise PolicyError(
+            f"The image has sequence {signed.sequence}; the node is already at {identity.sequence}.",
+            hint=_again(station, uuid),
+        )
+    if signed.key_epoch != identity.epoch:
+        raise PolicyError(
+            f"The image was signed for key epoch {signed.key_epoch}; the node is at {identity.epoch}.",
+            hint=_again(station, uuid),
+        )
+    if signed.sequence > identity.sequence + SEQUENCE_WINDOW and not jump:
+        raise PolicyError(
+            f"The image has sequence {signed.sequence}, far ahead of the node's {identity.sequence}: earlier"
+            " data about this node may have been forged.",
+            hint=f"{_again(station, uuid)}. Or, if you know why: write UUID --sequence-jump --yes",
+        )
+
+
+def _commit(station: Station, node: Conversation, image: Image, has: Image | None, progress: Progress | None) -> int:
+    """Stage what is not there yet and commit; starts over if the session (and the staging with it) is lost."""
+    skip = _blocks_there(station, image, has)
+    for _ in range(_STARTS - 1):
+        try:
+            return _stage_and_commit(station, node, image, skip, progress)
+        except NodeRefusedError as refusal:
+            if refusal.reason != Reason.DIGEST_MISMATCH or not skip:
+                raise
+            skip = set()  # the node does not hold what it was last read to hold: send everything
+            continue
+        except (NodeSilentError, GarbledError):
+            if not node.lives():
+                raise
+        except SessionLostError:
+            pass  # the new session below shows whether only the reply was lost
+        if _is_there(node, image):
+            return 0
+    try:
+        return _stage_and_commit(station, node, image, skip, progress)
+    except SessionLostError as lost:
+        raise lost.cause from lost
+
+
+def _stage_and_commit(
+    station: Station, node: Conversation, image: Image, skip: set[BlockId], progress: Progress | None
+) -> int:
+    octets = _stage(station, node, image, skip, progress)
+    node.request(update_teds(*SECURITY), "the commit")
+    return octets
+
+
+def _blocks_there(station: Station, image: Image, has: Image | None) -> set[BlockId]:
+    """Blocks that need not be sent; the Security TEDS is always sent, for it is what is committed."""
+    has = has or known_image(station, image.uuid)
+    if has is None:
+        return set()
+    return {block for block in image if block != SECURITY and has.blocks.get(block) == image.blocks[block]}
+
+
+def _is_there(node: Conversation, image: Image) -> bool:
+    """In a new session: whether the commit happened, and only its reply was lost."""
+    node.reopen()
+    return read_block(node, SECURITY) == image.security
+
+
+def _stage(station: Station, node: Conversation, image: Image, skip: set[BlockId], progress: Progress | None) -> int:
+    """Write every block but those of ``skip`` into the node's staging; return the octets written.
+
+    The Security TEDS is the last (profile.md, "Writing to flash"): a node that cannot rewind may count on it, and the
+    others go while the sequence is on its way to the disk, which the signature waits for. If frames are lost the pieces
+    shrink: a short one comes through where a long one never would.
+    """
+    piece = node.identity.max_message - WRITE_OVERHEAD
+    blocks = [block for block in sorted(image, key=lambda block: block == SECURITY) if block not in skip]
+    total = sum(len(image.blocks[block]) for block in blocks)
+    done, losses = 0, 0
+    for channel, access_code in blocks:
+        teds = image.blocks[channel, access_code]
+        offset = 0
+        if (channel, access_code) == SECURITY:
+            station.flush()
+        while offset < len(teds):
+            part = teds[offset : offset + piece]
+            try:
+                node.request(write_teds(channel, access_code, offset, part), f"TEDS {access_code} of channel {channel}")
+            except (NodeSilentError, GarbledError):
+                losses += 1
+                if losses > _LOSSES or not node.lives():
+                    raise
+                piece = max(_SMALLEST_PIECE, min(piece, len(part)) // 2)
+                continue
+            offset += len(part)
+            done += len(part)
+            if progress is not None:
+                progress(done, total)
+    return done

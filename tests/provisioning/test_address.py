@@ -1,0 +1,78 @@
+"""Another CAN address: by tap, in a session, never plainly over the bus of a keyed node."""
+
+from __future__ import annotations
+
+import pytest
+
+from teds_provision.errors import NodeRefusedError, NodeSilentError
+from teds_provision.protocol.messages.identity import Identity
+from teds_provision.provisioning.commands import set_address
+from teds_provision.station.station import Station
+from tests.bench import Board, MemoryLink, talk
+
+from .test_provision import run
+
+
+def test_a_tapped_node_takes_another_address_and_keeps_it(station: Station, board: Board) -> None:
+    with talk(board) as node:
+        assert set_address(station, node, 0x21)
+    board.power_on()
+    assert board.state.can_address == 0x21
+    record = station.nodes.get(board.uuid)
+    assert record is not None
+    assert record.can_address == 0x21
+    with talk(board) as node:
+        assert not set_address(station, node, 0x21), "again there is nothing to do"
+
+
+def test_over_the_bus_it_takes_a_session(station: Station, board: Board) -> None:
+    run(station, board)
+    with talk(board, MemoryLink(board, via="can", tapped=False)) as node:
+        assert set_address(station, node, 0x22)
+    assert board.state.can_address == 0x22
+
+
+def test_over_the_bus_without_a_key_it_is_refused(station: Station, board: Board) -> None:
+    with talk(board, MemoryLink(board, via="can", tapped=False)) as node, pytest.raises(NodeRefusedError):
+        set_address(station, node, 0x23)
+    assert board.state.can_address != 0x23
+
+
+class OneBus(MemoryLink):
+    """A line on a bus, where somebody else may be asked as well."""
+
+    def beside(self, source: int) -> MemoryLink:
+        return self
+
+    def everyone(self) -> bytes:
+        return b""
+
+    def there(self, address: int) -> Identity | None:
+        identity = self.board.tim.identity()
+        return identity if identity.can_address == address else None
+
+    def begin(self, octets: int) -> bytes:
+        return b""
+
+    address = 0
+
+
+def test_a_board_that_moves_at_once_and_loses_its_reply_is_found_at_the_new_address(
+    station: Station, board: Board
+) -> None:
+    run(station, board)
+    link = OneBus(board, via="can", tapped=False, lose_reply=3)  # c, Open, Set CAN address
+    with talk(board, link) as node:
+        assert set_address(station, node, 0x22)
+    record = station.nodes.get(board.uuid)
+    assert record is not None
+    assert record.can_address == 0x22
+
+
+def test_a_node_that_is_not_at_the_new_address_is_silent(station: Station, board: Board) -> None:
+    run(station, board)
+    with talk(board, OneBus(board, via="can", tapped=False, lose_request=3)) as node, pytest.raises(NodeSilentError):
+        set_address(station, node, 0x22)
+    record = station.nodes.get(board.uuid)
+    assert record is not None
+    assert record.can_address != 0x22

@@ -1,0 +1,161 @@
+"""A calibration is kept for the channel that it was made for, and for no other."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import CalibrationMisfitError
+from teds_provision.handover.life import plan_takeover, take_over
+from teds_provision.provisioning.board_type import WrongBoardError
+from teds_provision.provisioning.build import BuildOrder, build
+from teds_provision.provisioning.datasheet_edit import plan_sheet, write_sheet
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import ProvisionResult, provision
+from teds_provision.station.station import Station
+from teds_provision.teds.calibration import Calibration, read_calibrations
+from teds_provision.teds.calibration.samples import SampleForm
+from teds_provision.teds.channel import Channel, ChannelKind
+from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.guard import misfit
+from teds_provision.teds.profile import load_profile
+from teds_provision.teds.sheet import Sheet
+from teds_provision.teds.units import parse_unit
+from tests.bench import Board, talk
+
+ANGLE = "magnetic-angular-position-sensor"
+DEGREES = "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n"
+
+
+def provisioned(station: Station, board: Board, order: BuildOrder) -> ProvisionResult:
+    with talk(board) as node:
+        return provision(station, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
+
+
+@pytest.fixture
+def calibrated(station: Station, board: Board, tmp_path: Path) -> Path:
+    """A board that is a calibrated angle sensor."""
+    path = tmp_path / "angle.csv"
+    path.write_text(DEGREES)
+    provisioned(station, board, BuildOrder(ANGLE, path))
+    return path
+
+
+@pytest.mark.parametrize("profile", ["temperature-sensor", "gripper", "load-cell"])
+def test_degrees_are_never_published_as_something_else(
+    station: Station, board: Board, calibrated: Path, profile: str
+) -> None:
+    before = board.state
+    with pytest.raises(CalibrationMisfitError, match="channel 1") as refused:
+        provisioned(station, board, BuildOrder(profile, retype=True))
+    assert (refused.value.exit_code, refused.value.code) == (6, "calibration-misfit")
+    assert "--no-calibration" in refused.value.hint
+    with pytest.raises(CalibrationMisfitError):
+        build(station, board.uuid, BuildOrder(profile, retype=True))
+    assert board.state == before, "nothing is written"
+
+
+def test_without_the_calibration_the_new_type_is_built(station: Station, board: Board, calibrated: Path) -> None:
+    built = build(station, board.uuid, BuildOrder("load-cell", drop_calibration=True, retype=True))
+    assert (1, AccessCode.CALIBRATION) not in built.image.blocks
+
+
+def test_the_same_type_keeps_it(station: Station, board: Board, calibrated: Path) -> None:
+    built = build(station, board.uuid, BuildOrder(ANGLE, name="slew"))
+    assert (1, AccessCode.CALIBRATION) in built.image.blocks
+    assert any("keeps its calibration" in text for text in built.warnings)
+
+
+def test_points_beyond_the_raw_range_are_kept_by_the_type_that_took_them(
+    station: Station, board: Board, tmp_path: Path
+) -> None:
+    path = tmp_path / "force.csv"
+    path.write_text("# date: 2026-10-01\nraw,value [N]\n0,-1000\n16777215,1000\n")
+    assert provisioned(station, board, BuildOrder("load-cell", path)).verified.verdict == "authentic"
+    built = build(station, board.uuid, BuildOrder("load-cell", name="left cell"))
+    assert (1, AccessCode.CALIBRATION) in built.image.blocks
+
+
+def test_a_draft_that_was_never_written_is_kept_for_its_own_type_alone(
+    station: Station, board: Board, calibrated: Path
+) -> None:
+    build(station, board.uuid, BuildOrder(ANGLE, calibrated))
+    with pytest.raises(CalibrationMisfitError):
+        build(station, board.uuid, BuildOrder("load-cell", retype=True))
+
+
+def test_a_spare_of_the_same_type_takes_the_calibration_with_its_unit(
+    station: Station, board: Board, calibrated: Path
+) -> None:
+    spare = Board(uuid=bytes.fromhex("5eed0000000000000001"))
+    provisioned(station, spare, BuildOrder(ANGLE))
+    take_over(station, plan_takeover(station, board.uuid, spare.uuid, copy_calibration=True), None)
+    draft = station.datasheets.draft(spare.uuid)
+    assert draft is not None
+    channel = Sheet.from_image(draft.image).channel(1)
+    assert channel is not None
+    assert channel.calibration is not None
+    assert channel.calibration.unit.text == "°"
+    assert channel.value_problem == ""
+
+
+def test_a_datasheet_by_document_does_not_carry_a_calibration_to_another_unit(
+    station: Station, board: Board, calibrated: Path
+) -> None:
+    """As PUT /teds writes it: the board's calibration beside a channel that is another one."""
+    with talk(board) as node:
+        blocks = dict(station.datasheets.datasheet(board.uuid).unsigned_blocks())  # type: ignore[union-attr]
+        blocks[1, AccessCode.CHANNEL] = load_profile("load-cell").build(board.uuid).blocks[1, AccessCode.CHANNEL]
+        with pytest.raises(WrongBoardError, match="in rad, not in N"):
+            write_sheet(station, node, blocks, SilentReporter())
+        with pytest.raises(CalibrationMisfitError):
+            write_sheet(station, node, blocks, SilentReporter(), retype=True)
+        del blocks[1, AccessCode.CALIBRATION]
+        with pytest.raises(WrongBoardError):
+            plan_sheet(station, node, blocks)
+        assert plan_sheet(station, node, blocks, retype=True).changes
+    assert station.datasheets.draft(board.uuid) is None, "nothing was begun"
+
+
+def angle() -> tuple[Calibration, Channel]:
+    profile = load_profile(ANGLE)
+    made = read_calibrations(DEGREES, "angle.csv", profile)
+    sheet = Sheet.from_blocks(profile.build(bytes(10), calibration=made).blocks)
+    return sheet.calibrations[1], sheet.channels[0]
+
+
+def test_what_is_compared() -> None:
+    calibration, had = angle()
+    form = had.sample
+    assert form is not None
+    assert misfit(calibration, had, had, load_profile(ANGLE).channel(1)) == ""
+    assert misfit(calibration, had, replace(had, name="other", uncertainty=0.1), None) == ""
+    for change, words in (
+        ({"kind": ChannelKind.ACTUATOR}, "another type of channel (sensor, not actuator)"),
+        ({"kind": ChannelKind.EVENT_SENSOR}, "event sensor"),
+        ({"units": parse_unit("m").units}, "values in rad, and these are in m"),
+        ({"sample": replace(form, model=3)}, "fraction"),
+        ({"sample": SampleForm(0, 4)}, "4 octets"),
+        ({"sample": replace(form, bits=12)}, "covers raw 0 to 65535"),
+        ({"high": math.radians(90)}, "beyond the high limit"),
+        ({"low": math.radians(10)}, "beyond the low limit"),
+        ({"described": False}, "no such channel"),
+    ):
+        assert words in misfit(calibration, had, replace(had, **change), None), change  # type: ignore[arg-type]
+    narrow = replace(had, sample=replace(form, bits=12))
+    assert "gives raw 0 to 65535" in misfit(calibration, narrow, had, None)
+    assert misfit(calibration, replace(had, described=False), had, None) == "nothing says for what channel it was made"
+
+
+def test_a_method_that_the_type_asks_for_is_compared() -> None:
+    calibration, had = angle()
+    own = load_profile(ANGLE).channel(1)
+    assert own is not None
+    asks = replace(own, calibration=replace(own.calibration, method="linear"))
+    assert calibration.method != "linear" or misfit(calibration, had, had, asks) == ""
+    other = replace(own, calibration=replace(own.calibration, method="steps"))
+    assert "expects the method steps" in misfit(calibration, had, had, other)

@@ -1,0 +1,50 @@
+"""A node with a low battery is not written without a word; its charge decides nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from teds_provision.errors import PolicyError
+from teds_provision.links.hints import Charging
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import ProvisionResult, provision
+from teds_provision.provisioning.write import Low, wait_for_charge
+from teds_provision.station.station import Station
+from tests.answers import Answers
+from tests.bench import Board, contact
+
+ANGLE = "magnetic-angular-position-sensor"
+
+
+def run(
+    station: Station, board: Board, percent: int | None, low: Low = wait_for_charge, name: str = "a"
+) -> ProvisionResult:
+    charging = None if percent is None else Charging("wanted", percent)
+    there = replace(contact(board), charging=charging)
+    with Conversation(there, notice=lambda _notice: None) as node:
+        order = BuildOrder(profile=ANGLE, name=name)
+        return provision(station, node, order, operator=Answers(low_battery=low), reporter=SilentReporter())
+
+
+def test_below_ten_per_cent_nothing_is_written_without_a_word(station: Station, board: Board) -> None:
+    with pytest.raises(PolicyError, match="is at 9 %") as refused:
+        run(station, board, 9)
+    assert "Charge it first" in refused.value.hint
+    assert board.state.sequence == 0
+    asked: list[str] = []
+    assert run(station, board, 9, asked.append).verified.verdict == "authentic"
+    assert asked[0].endswith("Write it?")
+
+
+@pytest.mark.parametrize("percent", [10, 100, None])
+def test_with_enough_nobody_is_asked(station: Station, board: Board, percent: int | None) -> None:
+    assert run(station, board, percent).verified.verdict == "authentic"
+
+
+def test_what_is_not_written_needs_no_charge(station: Station, board: Board) -> None:
+    run(station, board, 50)
+    assert run(station, board, 1).verified.verdict == "authentic", "reading and verifying go on"

@@ -1,0 +1,310 @@
+"""The firmware that a node reports: when it is read, what a type demands, and what is shown beside the verdict."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from teds_provision.doctor.checks import System
+from teds_provision.doctor.fleet import nodes
+from teds_provision.protocol.messages.firmware import ABOUT, FirmwareFlag, FirmwareReport
+from teds_provision.protocol.messages.frames import Reply
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.tim import Tim
+from teds_provision.provisioning import commands
+from teds_provision.provisioning.agree import agree, require_session
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.firmware import (
+    FirmwareError,
+    firmware_warning,
+    keep_firmware,
+    read_firmware,
+    require_good_firmware,
+)
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.inventory import inventory
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import ProvisionResult, add_to_whitelist, provision
+from teds_provision.provisioning.verify_node import verify_at_node
+from teds_provision.station.firmware import FirmwareReading, firmware_of, state_of
+from teds_provision.station.station import Station
+from teds_provision.teds.profile.firmware import FirmwareDemand
+from tests.bench import Board, MemoryLink, contact
+from tests.cli.shell import call
+from tests.e2e.desk import ANGLE
+
+OLD = FirmwareReport("nrf/angle", (1, 1, 0), 3, bytes([1]) * 32)
+GOOD = FirmwareReport("nrf/angle", (1, 2, 0), 3, bytes([2]) * 32)
+TRIAL = FirmwareReport("nrf/angle", (1, 2, 0), 3, bytes([2]) * 32, FirmwareFlag.ON_TRIAL)
+DEMAND = FirmwareDemand("*/angle", "1.2.0", ("1.3.0", "1.4.0+7", "aa" * 32))
+
+
+@dataclass
+class FirmwareBoard(Board):
+    """A board whose firmware reports; ``report`` None: it was built without About."""
+
+    report: FirmwareReport | None = GOOD
+
+    def power_on(self) -> None:
+        super().power_on()
+        self.tim = Tim(self.key, self.flash, lambda: self.seconds, firmware=self if self.report else None)
+
+    def about(self) -> FirmwareReport | None:
+        return self.report
+
+    def locate(self, seconds: int) -> None:
+        raise AssertionError("it was asked for nothing else")
+
+
+def asked(link: MemoryLink) -> int:
+    """Plain questions for its firmware that went over a link."""
+    return link.frames.count(ABOUT.encode())
+
+
+def met(board: Board, link: MemoryLink) -> Conversation:
+    return Conversation(contact(board, link), notice=lambda _notice: None)
+
+
+def on_bus(board: Board) -> MemoryLink:
+    """The wired bus of a board that was built without NFC."""
+    return MemoryLink(board, via="can", tapped=board.tim.flash.state == NodeState.FACTORY)
+
+
+def profile(folder: Path, table: str) -> str:
+    path = folder / "angle.toml"
+    path.write_text(f'extends = "{ANGLE}"\ntitle = "Angle"\n[channel.1.calibration]\nrequired = false\n{table}')
+    return str(path)
+
+
+def given(station: Station, board: Board, wanted: str | None, *, link: MemoryLink | None = None) -> ProvisionResult:
+    with met(board, link or on_bus(board)) as node:
+        order = BuildOrder(wanted)
+        return provision(station, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
+
+
+# -- reading ---------------------------------------------------------------------------------------------------------
+
+
+def test_it_is_asked_once_in_plain_and_once_in_a_session(station: Station) -> None:
+    board = FirmwareBoard()
+    link = on_bus(board)
+    with met(board, link) as node:
+        assert read_firmware(node) == read_firmware(node) == FirmwareReading(GOOD, sealed=False)
+        assert asked(link) == 1
+        who = identify(station, node)
+        add_to_whitelist(station, node, who)
+        agree(station, node, who)
+        before = link.count
+        board.report = OLD
+        assert read_firmware(node) == read_firmware(node) == FirmwareReading(OLD, sealed=True)
+        assert link.count == before + 1
+
+
+def test_a_keyed_board_is_asked_plainly_on_its_wired_bus_alone(station: Station) -> None:
+    board = FirmwareBoard()
+    given(station, board, ANGLE)
+    reader, bus = MemoryLink(board), on_bus(board)
+    with met(board, reader) as node:
+        assert read_firmware(node) is None
+        assert reader.count == 0
+    with met(board, bus) as node:
+        assert read_firmware(node) == FirmwareReading(GOOD, sealed=False)
+
+
+@pytest.mark.parametrize("octets", [None, b"", bytes(42), GOOD.encode()[:41], b"\2" + GOOD.encode()[1:]])
+def test_a_board_that_does_not_report_works_as_before(station: Station, octets: bytes | None) -> None:
+    """Refusal 1, or another form or length: firmware not reported. A refusal costs one question."""
+    board = FirmwareBoard(report=None)
+
+    def forged(_count: int, reply: bytes) -> bytes:
+        return reply if octets is None or link.frames[-1] != ABOUT.encode() else Reply(True, octets).encode()
+
+    link = MemoryLink(board, via="can", tamper=forged)
+    with met(board, link) as node:
+        assert read_firmware(node, once=True) == FirmwareReading(None, sealed=False)
+        assert asked(link) == 1
+    done = given(station, board, ANGLE)
+    assert done.verified.verdict == "authentic"
+    assert done.firmware == FirmwareReading(None, sealed=True)
+    (known,) = inventory(station, [board.uuid])
+    assert known["firmware"] == {
+        "text": None, "version": None, "build": None, "image": None,
+        "state": "unjudged", "from": "session", "changed": False,
+    }  # fmt: skip
+
+
+# -- what a type demands -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("report", "state"),
+    [
+        (None, "not-reported"),
+        (FirmwareReport("nrf/force", (1, 3, 0), 0), "bad"),
+        (FirmwareReport("nrf/force", (1, 0, 0), 0, bytes([0xAA]) * 32), "bad"),
+        (FirmwareReport("nrf/angle", (1, 4, 0), 7), "bad"),
+        (FirmwareReport("nrf/angle", (1, 4, 0), 8), "good"),
+        (FirmwareReport("nrf/force", (1, 0, 0), 0), "other"),
+        (FirmwareReport("nrf/angle", (1, 1, 65535), 9, flags=FirmwareFlag.ON_TRIAL), "outdated"),
+        (FirmwareReport("nrf/angle", (1, 2, 0), 0, flags=FirmwareFlag.ON_TRIAL | FirmwareFlag.PENDING), "on-trial"),
+        (FirmwareReport("nrf/angle", (1, 10, 0), 0, flags=FirmwareFlag.PENDING), "pending"),
+        (GOOD, "good"),
+    ],
+)
+def test_the_first_state_that_applies(report: FirmwareReport | None, state: str) -> None:
+    assert state_of(DEMAND, report) == state
+    assert state_of(None, report) == "unjudged"
+
+
+TABLE = '[firmware]\ntext = "*/angle"\nminimum = "1.2.0"\n'
+
+
+@pytest.mark.parametrize("report", [OLD, None, FirmwareReport("nrf/force", (2, 0, 0))])
+def test_a_board_with_other_firmware_is_refused_before_it_becomes_ours(
+    station: Station, tmp_path: Path, report: FirmwareReport | None
+) -> None:
+    board = FirmwareBoard(report=report)
+    with pytest.raises(FirmwareError) as caught:
+        given(station, board, profile(tmp_path, TABLE))
+    assert (caught.value.code, caught.value.exit_code) == ("firmware", 6)
+    assert f"provision {board.uuid.hex()} --firmware IMAGE" in caught.value.hint, "it is not on the whitelist yet"
+    assert (board.state.state, station.pins.entry(board.uuid)) == (NodeState.FACTORY, None)
+
+
+def test_a_plain_report_never_permits(station: Station, tmp_path: Path) -> None:
+    """Anyone on the bus can answer a plain question; the session shows what runs, and nothing is signed."""
+    board = FirmwareBoard(report=OLD)
+
+    def forged(_count: int, reply: bytes) -> bytes:
+        return Reply(True, GOOD.encode()).encode() if link.frames[-1] == ABOUT.encode() else reply
+
+    link = MemoryLink(board, via="can", tamper=forged)
+    with pytest.raises(FirmwareError, match="outdated"):
+        given(station, board, profile(tmp_path, TABLE), link=link)
+    assert board.state.state == NodeState.KEYED
+    assert asked(link) == 1
+    board.report = GOOD
+    done = given(station, board, profile(tmp_path, TABLE))
+    assert done.verified.verdict == "authentic"
+
+
+def test_a_type_without_the_table_asks_nothing_before_the_session(station: Station) -> None:
+    board = FirmwareBoard(report=OLD)
+    link = on_bus(board)
+    assert given(station, board, ANGLE, link=link).verified.verdict == "authentic"
+    assert asked(link) == 0
+
+
+# -- beside the verdict ------------------------------------------------------------------------------------------------
+
+
+def state(station: Station, board: Board) -> tuple[str, bool]:
+    known = firmware_of(station, board.uuid)
+    assert known is not None
+    return known.state, known.changed
+
+
+def look(station: Station, board: Board) -> str:
+    with met(board, on_bus(board)) as node:
+        return verify_at_node(station, node, identify(station, node)).verified.verdict
+
+
+def test_another_image_stands_beside_the_verdict_until_it_is_signed_anew_or_accepted(
+    station: Station, tmp_path: Path
+) -> None:
+    board, wanted = FirmwareBoard(), profile(tmp_path, TABLE)
+    given(station, board, wanted)
+    assert state(station, board) == ("good", False)
+    board.report = TRIAL
+    look(station, board)
+    assert state(station, board) == ("on-trial", False), "the same image"
+    board.report = FirmwareReport("nrf/angle", (1, 2, 0), 3, bytes([9]) * 32)
+    assert look(station, board) == "authentic", "the verdict covers the datasheet"
+    assert state(station, board) == ("good", True)
+    given(station, board, wanted)
+    assert state(station, board) == ("good", True), "nothing was signed"
+    with met(board, on_bus(board)) as node:
+        require_session(station, node)
+        keep_firmware(station, board.uuid, read_firmware(node), signed=True)
+    assert state(station, board) == ("good", False)
+    board.report = OLD
+    look(station, board)
+    assert state(station, board) == ("outdated", True)
+
+
+def test_a_plain_report_replaces_none_of_a_session(station: Station) -> None:
+    board = FirmwareBoard()
+    given(station, board, ANGLE)
+    keep_firmware(station, board.uuid, FirmwareReading(OLD, sealed=False))
+    kept = station.firmware_reports.get(board.uuid)
+    assert kept is not None
+    assert (kept.report, kept.in_session, kept.signed) == (GOOD.encode(), True, GOOD.encode())
+
+
+def test_a_report_that_another_program_wrote_does_not_count(station: Station) -> None:
+    board = FirmwareBoard()
+    given(station, board, ANGLE)
+    station.flush()
+    with closing(sqlite3.connect(station.home / "store.sqlite3")) as file, file:
+        file.execute("UPDATE firmware SET report = ?", (OLD.encode(),))
+    assert station.firmware_reports.get(board.uuid) is None
+
+
+def test_doctor_and_nodes_name_what_a_type_does_not_accept_and_what_changed(station: Station, tmp_path: Path) -> None:
+    board = FirmwareBoard()
+    given(station, board, profile(tmp_path, TABLE))
+    station.flush()
+    assert [finding.result for finding in nodes(System(station.home))] == ["ok"]
+    board.report = OLD
+    look(station, board)
+    station.flush()
+    told = {finding.why for finding in nodes(System(station.home)) if finding.result == "warning"}
+    assert told == {
+        f"1 with firmware that their type does not accept: {board.uuid.hex()}.",
+        f"1 whose firmware changed since calibration: {board.uuid.hex()}.",
+    }
+    assert "firmware outdated; firmware changed since calibration" in call(station.home, "nodes").out
+
+
+@pytest.mark.parametrize(
+    ("report", "warns"),
+    [
+        (GOOD, ""),
+        (TRIAL, "its firmware is on-trial"),
+        (OLD, "its firmware is outdated, and firmware changed since calibration"),
+        (FirmwareReport("nrf/angle", (1, 9, 0), 0, bytes([8]) * 32), "firmware changed since calibration"),
+    ],
+)
+def test_a_measurement_warns_or_refuses(station: Station, tmp_path: Path, report: FirmwareReport, warns: str) -> None:
+    board = FirmwareBoard()
+    given(station, board, profile(tmp_path, TABLE))
+    board.report = report
+    with met(board, on_bus(board)) as node:
+        require_session(station, node)
+        known = firmware_of(station, board.uuid, read_firmware(node))
+    assert firmware_warning(known) == warns
+    refused = "its firmware is" in warns
+    with pytest.raises(FirmwareError) if refused else nullcontext():
+        require_good_firmware(board.uuid, known)
+
+
+@pytest.mark.parametrize("report", [GOOD, None])
+def test_it_costs_identify_one_more_round_trip(
+    station: Station, monkeypatch: pytest.MonkeyPatch, report: FirmwareReport | None
+) -> None:
+    def exchanges() -> int:
+        board = FirmwareBoard(report=report)
+        link = on_bus(board)
+        with met(board, link) as node:
+            commands._identified(station, node, False)
+        return link.count
+
+    with_it = exchanges()
+    monkeypatch.setattr(commands, "read_firmware", lambda _node, *, once: None)
+    assert with_it == exchanges() + 1

@@ -1,0 +1,330 @@
+"""One row of reading for each node, and one verdict judged from it wherever it is shown (cli.md, "One verdict").
+
+What would have found the faults: a kept copy beside octets that nobody read (a changed calibration stayed "authentic"
+in ncap), a Security TEDS alone taken for a whole datasheet, a stranger's plain answer beside a reading in a session.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.errors import BadDatasheetError, NotAuthenticError
+from teds_provision.measure.background_reread import BackgroundReread
+from teds_provision.measure.verified_session import open_trusted
+from teds_provision.provisioning import readings
+from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.inventory import inventory
+from teds_provision.provisioning.operator import AcceptingOperator
+from teds_provision.provisioning.sign import known_node_keys
+from teds_provision.provisioning.teds_read import read_image
+from teds_provision.provisioning.verify import possession_check
+from teds_provision.provisioning.verify_node import NodeVerification, verify_at_node, verify_in_session, verify_node
+from teds_provision.station.station import Station
+from teds_provision.station.store import NodeReading, RevocationRecord, utc_now
+from teds_provision.teds.codec.frame import frame, unframe
+from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.image import SECURITY
+from tests.bench import Board, MemoryLink, talk
+from tests.handover.desk import Pair, provisioned
+
+NAME = (0, AccessCode.NAME)
+
+
+@pytest.fixture
+def board(station: Station) -> Board:
+    made = Board()
+    provisioned(station, made)
+    return made
+
+
+def over_the_bus(board: Board) -> MemoryLink:
+    return MemoryLink(board, via="can", tapped=False)
+
+
+def changed_in_flash(board: Board, block: tuple[int, int] = NAME, *, restart: bool = True) -> None:
+    """One octet of a TEDS, its checksum mended: what a debugger does, or a flash cell."""
+    body = bytearray(unframe(board.state.blocks[block]))
+    body[-1] ^= 1
+    board.flash.commit(replace(board.state, blocks={**board.state.blocks, block: frame(bytes(body))}))
+    if restart:
+        board.power_on()
+
+
+def looked(station: Station, board: Board) -> NodeVerification:
+    """What a measurement does before it claims anything."""
+    with talk(board, over_the_bus(board)) as node:
+        require_session(station, node)
+        return verify_in_session(station, node, by="measure")
+
+
+def verified(station: Station, board: Board) -> str:
+    with talk(board) as node:
+        return verify_at_node(station, node, identify(station, node)).verified.verdict
+
+
+def shown(station: Station, board: Board) -> tuple[str | None, str | None]:
+    """The verdict as every screen has it: of the one node, and of it in a list."""
+    judged = readings.verdict_of(station, board.uuid)
+    (listed,) = inventory(station, [board.uuid])
+    word = None if judged is None else judged.verified.verdict
+    assert listed["verdict"] == word
+    assert listed["reading"] == (judged and {"from": judged.origin, "at": judged.at, "by": judged.by})
+    return word, judged and judged.origin
+
+
+# -- what stands in the row ------------------------------------------------------------------------------------------
+
+
+def test_the_row_names_the_digest_of_each_teds_the_command_and_the_session(station: Station, board: Board) -> None:
+    row = station.datasheets.reading(board.uuid)
+    assert row is not None
+    assert (row.by, row.whole, row.in_session) == ("provision", True, True)
+    image = station.datasheets.datasheet(board.uuid)
+    assert image is not None
+    assert set(readings.digests_of(row)) == set(image.blocks)
+    assert shown(station, board) == ("authentic", "session")
+
+
+def test_a_security_teds_alone_is_no_datasheet(station: Station) -> None:
+    board = Board()
+    with talk(board) as node:
+        identify(station, node)
+    assert station.datasheets.datasheet(board.uuid) is None
+    assert shown(station, board) == (None, None)
+    assert known_node_keys(station, board.uuid).key == board.key.point, "who builds knows its key all the same"
+
+
+@pytest.mark.parametrize("mode", ["copy", "move"])
+def test_a_station_that_imported_the_key_measures_at_once(tmp_path: Path, mode: str) -> None:
+    """Identify had kept the Security TEDS alone, and the measurement took it for the whole: "TEDS 1 … is absent"."""
+    pair = Pair.make(tmp_path)
+    provisioned(pair.north, pair.board)
+    path, _ = pair.export(mode)
+    pair.take(path)
+    with talk(pair.board, over_the_bus(pair.board)) as node:
+        identify(pair.south, node)
+    found = looked(pair.south, pair.board)
+    assert (found.verified.verdict, found.judged.origin) == ("authentic", "session")
+    assert shown(pair.south, pair.board) == ("authentic", "session")
+
+
+def test_a_kept_image_that_lacks_a_teds_of_field_108_is_none(station: Station, board: Board) -> None:
+    image = station.datasheets.datasheet(board.uuid)
+    assert image is not None
+    station.datasheets.put(replace(image, blocks={NAME: image.blocks[NAME], SECURITY: image.blocks[SECURITY]}))
+    assert station.datasheets.datasheet(board.uuid) is None
+    assert looked(station, board).verified.verdict == "authentic"
+    assert station.datasheets.datasheet(board.uuid) == image
+
+
+# -- kept, and read again --------------------------------------------------------------------------------------------
+
+
+def test_a_kept_image_stands_for_no_row_but_the_one_that_was_read_of_it_in_a_session(
+    station: Station, board: Board
+) -> None:
+    row = station.datasheets.reading(board.uuid)
+    assert row is not None
+    other = row.digests[:-1] + bytes([row.digests[-1] ^ 1])
+    for changed in (replace(row, digests=other), replace(row, c=None)):
+        station.datasheets.forget_reading(board.uuid)
+        assert station.datasheets._put_reading(changed)
+        found = looked(station, board)
+        assert not found.kept, "all of it was read"
+        again = station.datasheets.reading(board.uuid)
+        assert again is not None
+        assert again.digests == row.digests, "it was read"
+        assert (found.verified.verdict, found.judged.origin) == ("authentic", "session")
+        assert shown(station, board) == ("authentic", "session")
+
+
+def test_in_the_same_power_up_nothing_is_read_again(station: Station, board: Board) -> None:
+    link = over_the_bus(board)
+    with talk(board, link) as node:
+        require_session(station, node)
+        verify_in_session(station, node, by="measure")
+    assert link.count <= 6, "c, Open, Identify, one TEDS, Close"
+    assert shown(station, board) == ("authentic", "session")
+
+
+def test_after_a_restart_the_rest_is_kept_until_somebody_reads_it(station: Station, board: Board) -> None:
+    board.power_on()
+    found = looked(station, board)
+    assert (found.verified.verdict, found.kept) == ("authentic", True)
+    kept = {check.name for check in found.verified.checks if check.to_json().get("from") == "kept"}
+    assert kept == {"form", "signed TEDS", "every TEDS is signed", "UUID"}
+    assert shown(station, board) == ("authentic", "kept")
+    assert looked(station, board).kept, "another session of that power-up has not read it either"
+    assert verified(station, board) == "authentic"
+    assert shown(station, board) == ("authentic", "session")
+
+
+def test_verify_reads_all_and_every_screen_says_what_it_found(station: Station, board: Board) -> None:
+    """The kept copy had stood in: verify said not authentic, ncap, API and page "Authentic, 15 of 15"."""
+    changed_in_flash(board)
+    assert looked(station, board).kept
+    assert verified(station, board) == "not authentic"
+    assert shown(station, board) == ("not authentic", "session")
+    for _ in range(2):  # in this power-up, and after another restart: what spoke against it is not forgotten
+        assert looked(station, board).verified.verdict == "not authentic"
+        with talk(board, over_the_bus(board)) as node, pytest.raises(NotAuthenticError):
+            open_trusted(station, node, by="sample")
+        board.power_on()
+
+
+def test_a_node_that_was_mended_is_authentic_again(station: Station, board: Board) -> None:
+    changed_in_flash(board)
+    assert verified(station, board) == "not authentic"
+    provisioned(station, board)
+    assert shown(station, board) == ("authentic", "session")
+    assert not looked(station, board).kept
+
+
+def test_another_security_teds_makes_everything_be_read(station: Station, board: Board) -> None:
+    with talk(board) as node:
+        from teds_provision.provisioning.progress import SilentReporter
+        from teds_provision.provisioning.provision import provision
+
+        provision(station, node, BuildOrder(name="other"), operator=AcceptingOperator(), reporter=SilentReporter())
+    assert shown(station, board) == ("authentic", "session")
+    image = station.datasheets.datasheet(board.uuid)
+    assert image is not None
+    assert {(0, code) for _, code in image} >= {NAME}
+
+
+@given(first=st.integers(0, 2**64 - 1), opens=st.integers(0, 2**64 - 1))
+def test_c_tells_a_restart(first: int, opens: int) -> None:
+    row = NodeReading(bytes(10), utc_now(), "verify", first.to_bytes(8, "big"), True, b"")
+    later = ((first + opens) % 2**64).to_bytes(8, "big")
+    assert row.is_of_this_start(later) == (opens < 2**32)
+
+
+# -- who may change it -----------------------------------------------------------------------------------------------
+
+
+def test_what_is_said_in_no_session_changes_no_row(station: Station, board: Board) -> None:
+    """A stranger on the bus answers for the node: the row that was read in a session stays, and so does the verdict."""
+    before = station.datasheets.reading(board.uuid)
+    changed_in_flash(board)
+    with talk(board) as node:
+        who = identify(station, node)
+        plain = verify_node(station, node, read_image(node), who.point, why="the node does not open a session")
+    assert plain.verified.verdict == "unproven"
+    assert plain.origin == "plain"
+    assert station.datasheets.reading(board.uuid) == before
+    assert shown(station, board) == ("authentic", "session")
+
+
+def test_a_reading_in_no_session_is_replaced_by_any(station: Station) -> None:
+    row = NodeReading(bytes(10), "2026-01-01T00:00:00Z", "verify", None, True, b"")
+    assert station.datasheets.keep_reading(row)
+    assert station.datasheets.keep_reading(replace(row, by="other"))
+    assert station.datasheets.keep_reading(replace(row, by="measure", c=bytes(8)))
+    assert not station.datasheets.keep_reading(replace(row, by="late"))
+    assert station.datasheets.reading(bytes(10)) == replace(row, by="measure", c=bytes(8))
+
+
+def test_a_row_that_no_reading_of_ours_made_is_never_authentic(station: Station) -> None:
+    station.datasheets.keep_reading(NodeReading(bytes(10), utc_now(), "x", bytes(8), True, b""))
+    judged = readings.verdict_of(station, bytes(10))
+    assert judged is not None
+    assert judged.verified.verdict == "unsigned"
+
+
+def test_a_ban_of_today_is_in_the_verdict_of_a_reading_of_yesterday(station: Station, board: Board) -> None:
+    station.policy.deny(RevocationRecord(board.uuid, None, "stolen", "{}"))
+    assert shown(station, board) == ("not authentic", "session")
+    judged = readings.verdict_of(station, board.uuid)
+    assert judged is not None
+    assert [check.name for check in judged.verified.checks if check.result == "failed"] == ["not revoked"]
+    station.policy.lift(board.uuid)
+    assert shown(station, board) == ("authentic", "session")
+
+
+def test_trust_that_ends_is_in_the_verdict_of_what_was_read_before(tmp_path: Path) -> None:
+    pair = Pair.make(tmp_path)
+    provisioned(pair.north, pair.board)
+    path, _ = pair.export("copy")
+    pair.take(path)
+    assert looked(pair.south, pair.board).verified.verdict == "authentic"
+    pair.south.policy.distrust("north")
+    pair.south.policy.end_ca(pair.north.ca)
+    assert shown(pair.south, pair.board) == ("not authentic", "session")
+
+
+def test_a_reset_forgets_the_reading(station: Station, board: Board) -> None:
+    from teds_provision.provisioning.agree import reset_node
+
+    with talk(board) as node:
+        reset_node(station, node, identify(station, node))
+    assert shown(station, board) == (None, None)
+
+
+def test_a_board_that_was_replaced_under_its_uuid_has_no_reading(station: Station, board: Board) -> None:
+    station.pins.unpin(board.uuid)
+    assert station.datasheets.reading(board.uuid) is None
+
+
+# -- behind a measurement --------------------------------------------------------------------------------------------
+
+
+def read_behind(station: Station, board: Board) -> list[str]:
+    """The rest of a node read as the keeper does; the outcomes of its steps, the last one an error where it raised."""
+    bus = SimpleNamespace(reading=threading.Lock())
+    with talk(board, over_the_bus(board)) as node:
+        trusted = open_trusted(station, node, by="ncap")
+        rest = BackgroundReread(station, trusted, bus, by="ncap")  # type: ignore[arg-type]
+        rest._due = 0.0
+        steps = 0
+        while rest.step():
+            steps += 1
+            assert bus.reading.locked(), "one node of a bus at a time"
+            rest._due = 0.0
+        assert not bus.reading.locked()
+        return ["step"] * steps
+
+
+def test_the_rest_is_read_behind_the_measurement(station: Station, board: Board) -> None:
+    board.power_on()
+    assert looked(station, board).kept
+    assert len(read_behind(station, board)) >= len(board.state.blocks)
+    assert shown(station, board) == ("authentic", "session")
+    row = station.datasheets.reading(board.uuid)
+    assert row is not None
+    assert row.by == "ncap"
+
+
+def test_a_change_that_is_found_behind_a_measurement_ends_it(station: Station, board: Board) -> None:
+    changed_in_flash(board)
+    with pytest.raises(BadDatasheetError, match=r"since .* do not count"):
+        read_behind(station, board)
+    assert shown(station, board) == ("not authentic", "session")
+
+
+def test_a_bus_that_another_node_is_read_on_is_waited_for(station: Station, board: Board) -> None:
+    board.power_on()
+    bus = SimpleNamespace(reading=threading.Lock())
+    link = over_the_bus(board)
+    with talk(board, link) as node, bus.reading:
+        rest = BackgroundReread(station, open_trusted(station, node, by="ncap"), bus, by="ncap")  # type: ignore[arg-type]
+        rest._due, asked = 0.0, link.count
+        assert rest.step()
+        assert link.count == asked
+
+
+def test_a_node_without_its_key_is_not_authentic_by_any_row(station: Station, board: Board) -> None:
+    """A failed challenge is part of what was read: it stays in the row."""
+    with talk(board) as node:
+        require_session(station, node)
+        failed = possession_check(lambda: (_ for _ in ()).throw(NotAuthenticError("It does not hold the key.")))  # type: ignore[arg-type, return-value]
+        readings.keep(station, node, read_image(node), by="verify", known=None, more=[failed])
+    assert shown(station, board) == ("not authentic", "session")

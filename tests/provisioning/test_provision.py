@@ -1,0 +1,313 @@
+"""From tap to verified datasheet: done once, repeated, interrupted anywhere, cut anywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import (
+    LinkError,
+    NodeRefusedError,
+    NodeSilentError,
+    NotAuthenticError,
+    NotWhitelistedError,
+    PolicyError,
+    TedsProvisionError,
+)
+from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, TedsFunction
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.build import BuildOrder, merged
+from teds_provision.provisioning.identify import IdentifiedNode
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.provision import ProvisionResult, provision
+from teds_provision.provisioning.write import write
+from teds_provision.station.station import Station
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.frame import frame
+from teds_provision.teds.image import SECURITY
+from tests.answers import Answers
+from tests.bench import Board, MemoryLink, make_station, talk
+
+ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")
+
+
+def accept(who: IdentifiedNode) -> None:
+    """Whoever lies on the reader."""
+
+
+def run(
+    station: Station,
+    board: Board,
+    link: MemoryLink | None = None,
+    order: BuildOrder = ANGLE,
+    accept: Callable[[IdentifiedNode], None] = accept,
+) -> ProvisionResult:
+    with talk(board, link) as node:
+        return provision(station, node, order, operator=Answers(accept=accept), reporter=SilentReporter())
+
+
+def results(done: ProvisionResult) -> dict[str, str]:
+    return {step.name: step.result for step in done.steps}
+
+
+def test_a_new_node_ends_authentic(station: Station, board: Board) -> None:
+    done = run(station, board)
+    assert done.verified.verdict == "authentic"
+    assert list(results(done)) == ["identify", "whitelist", "agree", "build", "sign", "write", "verify", "check"]
+    assert set(results(done).values()) == {"done", "skipped"}, "this board does not measure: nobody asks its hardware"
+    assert board.state.state == NodeState.PROVISIONED
+    record = station.nodes.get(board.uuid)
+    assert record is not None
+    assert (record.sequence, record.epoch) == (1, 1)
+
+
+def test_a_finished_node_has_nothing_to_do(station: Station, board: Board) -> None:
+    run(station, board)
+    before = board.state
+    again = run(station, board)
+    expected = {"identify": "done", "verify": "done", "check": "skipped"}
+    assert results(again) == {name: expected.get(name, "nothing to do") for name in results(again)}
+    assert board.state == before
+
+
+def test_a_small_node_takes_its_datasheet_in_many_segments(station: Station) -> None:
+    board = Board(max_message=1024)
+    link = MemoryLink(board)
+    assert run(station, board, link).verified.verdict == "authentic"
+    assert max(map(len, link.frames)) <= 1024
+
+
+def test_without_a_yes_an_unknown_node_is_left_alone(station: Station, board: Board) -> None:
+    def no(who: IdentifiedNode) -> None:
+        raise NotWhitelistedError("no")
+
+    with pytest.raises(NotWhitelistedError):
+        run(station, board, accept=no)
+    assert board.state.state == NodeState.FACTORY
+    assert station.pins.whitelist() == []
+
+
+def test_over_the_bus_of_a_node_without_nfc(station: Station, board: Board) -> None:
+    assert run(station, board, MemoryLink(board, via="can", tapped=True)).verified.verdict == "authentic"
+    entry = station.pins.entry(board.uuid)
+    assert entry is not None
+    assert entry.assurance == "bus"
+
+
+def test_an_identified_node_may_be_written_over_the_other_link(station: Station, board: Board) -> None:
+    run(station, board)
+    renamed = replace(ANGLE, name="crane slew")
+    done = run(station, board, MemoryLink(board, via="can", tapped=False), renamed)
+    assert (results(done)["agree"], results(done)["write"]) == ("nothing to do", "done")
+    assert board.state.sequence == 2
+
+
+def exchanges_of_a_whole_run(tmp_path: Path) -> int:
+    link = MemoryLink(Board())
+    run(make_station(tmp_path / "count"), link.board, link)
+    return link.count - 1  # the last one closes the session
+
+
+@pytest.mark.parametrize("half", ["lose_request", "lose_reply"])
+def test_cut_at_every_message_the_same_command_carries_on(tmp_path: Path, half: str) -> None:
+    for lost in range(1, exchanges_of_a_whole_run(tmp_path) + 1):
+        station, board = make_station(tmp_path / f"{half}{lost}"), Board()
+        with pytest.raises(NodeSilentError):
+            run(station, board, MemoryLink(board, **{half: lost}))  # type: ignore[arg-type]
+        assert run(station, board).verified.verdict == "authentic", f"{half} {lost}"
+        assert [record.state for record in station.keys.keys_of(board.uuid)] == ["active"]
+        station.close()
+
+
+@pytest.mark.parametrize("when", ["die_before", "die_after"])
+@pytest.mark.parametrize("commit", [1, 2])
+def test_power_cut_at_every_flash_commit(station: Station, board: Board, when: str, commit: int) -> None:
+    if commit == 2:  # the first is the key, the second the datasheet
+        run(station, board, accept=accept)
+        board.flash.state = replace(board.flash.state, provisioned=False)
+        board.power_on()
+    setattr(board.flash, when, True)
+    with pytest.raises(NodeSilentError):
+        run(station, board, order=replace(ANGLE, name="another") if commit == 2 else ANGLE)
+    assert run(station, board).verified.verdict == "authentic"
+
+
+def test_a_session_lost_in_the_middle_starts_the_staging_over(station: Station, board: Board) -> None:
+    class Forgetful(MemoryLink):
+        def exchange(self, frame: bytes) -> bytes:
+            if self.count == 14:
+                board.tim.link_lost(self.via)
+            return super().exchange(frame)
+
+    assert run(station, board, Forgetful(board)).verified.verdict == "authentic"
+
+
+def test_a_node_that_is_always_busy_ends_with_the_link(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("teds_provision.provisioning.conversation.BUSY_SECONDS", 0.3)
+    monkeypatch.setattr("teds_provision.provisioning.conversation.BUSY_PAUSE", 0.05)
+    busy = bytes([0, 0, 1, Reason.BUSY])
+    with pytest.raises(TedsProvisionError):
+        run(station, board, MemoryLink(board, tamper=lambda n, reply: busy))
+    assert run(station, board).verified.verdict == "authentic"
+
+
+@pytest.mark.parametrize("garbage", [b"", b"\x01", b"\x01\x00\x05abc", b"\x01\x00\x00", bytes(400)])
+def test_garbage_is_an_error_of_ours_and_changes_nothing(station: Station, board: Board, garbage: bytes) -> None:
+    for count in range(1, 12):
+        with pytest.raises(TedsProvisionError):
+            run(station, board, MemoryLink(board, tamper=lambda n, reply, at=count: garbage if n >= at else reply))
+    assert run(station, board).verified.verdict == "authentic"
+
+
+def test_read_only_teds_are_signed_as_they_are(station: Station, board: Board) -> None:
+    phy = frame(bytes.fromhex("0304050d01010a01010b0400000001"))
+    board.flash.state = replace(board.state, blocks={(0, 13): phy}, read_only=frozenset({(0, 13)}))
+    board.power_on()
+    assert run(station, board).verified.verdict == "authentic"
+    assert (0, 13) in security.decode(board.state.blocks[SECURITY]).signed_blocks
+
+
+def test_a_sequence_far_behind_is_caught_up_in_steps_once_a_person_says_so(station: Station, board: Board) -> None:
+    run(station, board)
+    station.nodes.remember(board.uuid, sequence=200_000)
+    with pytest.raises(PolicyError, match="far ahead"):
+        run(station, board, order=replace(ANGLE, name="far ahead"))
+    draft = station.datasheets.draft(board.uuid)
+    assert draft is not None
+    with talk(board) as node:
+        require_session(station, node)
+        write(station, node, draft.image, jump=True)
+    assert board.state.sequence == 200_001
+    assert station.datasheets.draft(board.uuid) is None
+
+
+def test_a_node_reset_by_hand_is_provisioned_again(station: Station, board: Board) -> None:
+    run(station, board)
+    board.tim.reset_by_hand()
+    done = run(station, board)
+    assert done.verified.verdict == "authentic"
+    assert (board.state.epoch, board.state.sequence) == (2, 2)
+
+
+def test_a_revoked_node_is_refused(station: Station, board: Board) -> None:
+    from teds_provision.station.store import RevocationRecord
+
+    run(station, board)
+    station.policy.deny(RevocationRecord(board.uuid, None, "stolen", ""))
+    with pytest.raises(PolicyError, match="stolen"):
+        run(station, board)
+
+
+def _must_not_be_asked(question: str, _refusal: PolicyError) -> None:
+    raise AssertionError(question)
+
+
+def test_another_owners_station_is_refused(station: Station, board: Board, tmp_path: Path) -> None:
+    run(station, board)
+    before, stranger = board.state, make_station(tmp_path / "stranger")
+    with pytest.raises(PolicyError, match="belongs to another owner's CA"):
+        run(stranger, board)
+    with talk(board) as node, pytest.raises(PolicyError, match="belongs to another owner's CA"):
+        provision(stranger, node, ANGLE, operator=Answers(take_over=_must_not_be_asked), reporter=SilentReporter())
+    assert stranger.pins.entry(board.uuid) is None
+    assert board.state == before
+
+
+def test_a_broken_flash_is_told(station: Station, board: Board) -> None:
+    board.flash.fail = True
+    with pytest.raises(NodeRefusedError) as refused:
+        run(station, board)
+    assert refused.value.reason == Reason.FLASH_FAILURE
+
+
+def test_a_read_back_that_differs_is_not_believed(station: Station, board: Board) -> None:
+    run(station, board)
+    commit = board.flash.commit
+
+    def corrupting(state):  # type: ignore[no-untyped-def]
+        commit(state)
+        state.blocks[0, 12] = state.blocks[0, 12][:-3] + b"\0" + state.blocks[0, 12][-2:]
+
+    board.flash.commit = corrupting  # type: ignore[method-assign]
+    with pytest.raises(NotAuthenticError, match="reads back differently"):
+        run(station, board, order=replace(ANGLE, name="renamed"))
+
+
+def test_the_link_error_is_a_link_error() -> None:
+    assert issubclass(NodeSilentError, LinkError)
+
+
+@pytest.mark.parametrize("orders", ["no such profile", "no profile", "broken calibration", "no calibration file"])
+def test_a_wrong_order_changes_nothing(station: Station, board: Board, tmp_path: Path, orders: str) -> None:
+    broken = tmp_path / "angle.csv"
+    broken.write_text("raw,value\n1,one\n")
+    order = {
+        "no such profile": replace(ANGLE, profile="no-such-sensor"),
+        "no profile": BuildOrder(),
+        "broken calibration": replace(ANGLE, calibration=broken),
+        "no calibration file": replace(ANGLE, calibration=tmp_path / "none.csv"),
+    }[orders]
+    with pytest.raises(TedsProvisionError) as wrong:
+        run(station, board, order=order)
+    assert wrong.value.exit_code in (2, 3, 8)
+    assert board.state.state == NodeState.FACTORY
+    assert station.pins.entry(board.uuid) is None
+
+
+def test_a_run_writes_as_little_as_its_promises_need(station: Station, board: Board) -> None:
+    """At most 8 durable commits for a whole provisioning; an idle one writes at most 4 rows and commits twice."""
+    said: list[str] = []
+    changes, rows = ("INSERT", "UPDATE", "DELETE", "REPLACE"), set[str]()
+
+    def told(statement: str) -> None:  # the trace repeats a statement that returns rows
+        if not (said and said[-1] == statement):
+            said.append(statement)
+
+    def commits() -> int:
+        made, dirty = 0, False
+        for statement in said:
+            dirty = dirty or statement.startswith(changes)
+            if statement.startswith("COMMIT"):
+                made, dirty = made + dirty, False
+        return made
+
+    station._store._connection.set_trace_callback(told)
+    run(station, board)
+    assert 0 < commits() <= 8
+    said.clear()
+    run(station, board, order=BuildOrder())
+    rows = {statement for statement in said if statement.startswith(changes)}
+    assert commits() <= 2
+    assert 0 < len(rows) <= 4, rows
+
+
+def test_nothing_is_read_twice_that_says_nothing_new(station: Station, board: Board) -> None:
+    """Identify is asked once in the session; the Security TEDS is read once before it and once after the commit."""
+    asked: list[tuple[int, int, bytes]] = []
+    handle = board.tim._dispatch
+
+    def counted(command: Command, origin: Any) -> Reply:
+        asked.append((command.command_class, command.function, command.payload[:1]))
+        return handle(command, origin)
+
+    board.tim._dispatch = counted  # type: ignore[method-assign]
+    assert run(station, board).verified.verdict == "authentic"
+    assert asked.count((128, Function.IDENTIFY, b"")) == 1, asked
+    assert asked.count((1, TedsFunction.READ, bytes([128]))) == 2, asked
+    asked.clear()
+    run(station, board, order=BuildOrder())
+    assert asked.count((128, Function.IDENTIFY, b"")) == 1, asked
+    assert asked.count((1, TedsFunction.READ, bytes([128]))) == 2, asked
+
+
+def test_what_is_said_of_several_channels_is_one_sentence() -> None:
+    each = [f"Channel {number} has no calibration: raw values cannot be turned into N." for number in (1, 2, 3)]
+    assert merged(each) == ("Channels 1 to 3 have no calibration: raw values cannot be turned into N.",)
+    assert merged(each[::2]) == ("Channels 1, 3 have no calibration: raw values cannot be turned into N.",)

@@ -1,0 +1,332 @@
+"""The sheet of a batch: what is wrong with it, and what a person should know of it, told before the first board."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import (
+    BadDataError,
+    NodeBusyError,
+    NodeSilentError,
+    NoNodeError,
+    PolicyError,
+    VaultLockedError,
+)
+from teds_provision.links import Contact, LinkSettings
+from teds_provision.provisioning.batch import BatchRun, ProvisionRequest
+from teds_provision.provisioning.batch_sheet import (
+    BatchSheet,
+    BoardResult,
+    DeclinedError,
+    Progress,
+    ReportHead,
+    SheetRow,
+    read_sheet,
+    write_report,
+)
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.operator import Operator
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.station.station import Station
+from tests.bench import Board, contact
+from tests.pace import PATIENCE
+
+
+def read(station: Station, folder: Path, text: str | bytes) -> BatchSheet:
+    file = folder / "boards.csv"
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_sheet(station, file, BuildOrder(profile="load-cell"))
+
+
+def test_a_mistake_of_many_lines_is_told_once_with_all_of_them(station: Station, tmp_path: Path) -> None:
+    rows = "".join(f",b{number},none.csv\n" for number in range(30))
+    with pytest.raises(BadDataError) as told:
+        read(station, tmp_path, f"uuid,name,calibration\n{rows}")
+    assert told.value.message.count("There is no calibration file") == 1
+    assert told.value.message.startswith("boards.csv:2, 3, 4, ")
+    assert "and 10 more: There is no" in told.value.message
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_a_spreadsheet_separates_by_comma_semicolon_or_tab(station: Station, tmp_path: Path, delimiter: str) -> None:
+    sheet = read(station, tmp_path, f"\ufeffuuid{delimiter}name\r\n{delimiter}left knee\r\n")
+    assert [row.prepared.order.name for row in sheet.rows] == ["left knee"]
+
+
+def test_a_sheet_that_is_not_utf8_is_told_with_the_line_and_the_cure(station: Station, tmp_path: Path) -> None:
+    with pytest.raises(BadDataError, match=r"boards.csv:3: it is not UTF-8 .*CSV UTF-8"):
+        read(station, tmp_path, b"uuid,name\n,a\n,caf\xe9\n,b\n,c\n")
+
+
+def test_rows_without_the_calibration_that_their_type_asks_for_are_told_before_the_tap(
+    station: Station, tmp_path: Path
+) -> None:
+    (tmp_path / "cal.csv").write_text("# date: 2026-11-20\nraw,value [N]\n4194304,-500\n12582912,500\n")
+    sheet = read(station, tmp_path, "name,calibration,profile\na,,\nb,cal.csv,\nc,,\nd,,limit-switch\n")
+    assert [warning for warning in sheet.warnings if "type requires" in warning] == [
+        "Rows 1, 3: the type requires a calibration, but the sheet gives none."
+    ]
+
+
+def test_a_name_is_one_line(station: Station, tmp_path: Path) -> None:
+    with pytest.raises(BadDataError, match="one line of printable characters"):
+        read(station, tmp_path, 'uuid,name\n,"a\nb"\n')
+
+
+@pytest.mark.parametrize("columns", ["uuid,name,fingerprint", "fingerprint,name,uuid"])
+def test_a_label_scanned_into_a_cell_says_uuid_and_key(station: Station, tmp_path: Path, columns: str) -> None:
+    """Under a Russian layout here; the other cell is empty, or says the same."""
+    uuid, key = "8d4d9da65281f7000000", "0123456789abcdef" * 4
+    label = f"TEDS1:{uuid}:{key}".upper().translate(str.maketrans("ABCDEFTS:", "ФИСВУАЕЫЖ"))
+    same = uuid if columns.endswith("uuid") else key[:32]
+    for other in ("", same):
+        (row,) = read(station, tmp_path, f"{columns}\n{label},a,{other}\n").rows
+        assert (row.uuid, row.fingerprint) == (bytes.fromhex(uuid), key)
+    with pytest.raises(BadDataError, match="and the label in"):
+        read(station, tmp_path, f"{columns}\n{label},a,{'ab' * (len(same) // 2)}\n")
+
+
+def board_of(number: int) -> bytes:
+    return bytes([number]) * 10
+
+
+def test_rows_go_to_boards_in_the_order_of_the_taps_and_to_a_spare_at_last(station: Station, tmp_path: Path) -> None:
+    """A board that failed keeps its row for another try; its spare was told that no row is left."""
+    progress = Progress(station.home, read(station, tmp_path, "name\na\nb\nc\n"))
+    for number, error in ((1, None), (2, NodeSilentError("It was pulled.")), (3, None)):
+        row = progress.row_for(board_of(number), "")
+        assert row is not None
+        assert row.number == number
+        progress.assign_row(row, board_of(number))
+        progress.rows[number].result = "failed" if error else "passed"
+        if error:
+            progress.note(row, BoardResult(board_of(number), 1.0, error=error, row=number))
+    progress.save()
+    again = Progress(station.home, progress.sheet)
+    assert [row.number for row in again.open] == [2]
+    assert again.next_row is not None
+    assert again.board_of(again.next_row) == board_of(2).hex()
+    for board in (2, 9):  # the same one again, or its spare
+        row = again.row_for(board_of(board), "")
+        assert row is not None
+        assert row.number == 2
+    assert again.row_for(board_of(9), "", busy={2}) is None, "another reader is at work on it"
+
+
+def test_two_runs_of_one_sheet_lose_each_other_no_board_and_share_no_row(station: Station, tmp_path: Path) -> None:
+    """Each wrote the whole sheet as it knew it: what the other had done was open again."""
+    sheet = read(station, tmp_path, "name\na\nb\nc\n")
+    one, other = Progress(station.home, sheet), Progress(station.home, sheet)
+    first, second, third = sheet.rows
+    one.assign_row(first, board_of(1))
+    assert other.row_for(board_of(2), "") is first, "it does not know yet"
+    with pytest.raises(NodeBusyError, match="by another run of this sheet"):
+        other.assign_row(first, board_of(2))
+    assert other.row_for(board_of(2), "") is second
+    other.assign_row(second, board_of(2))
+    other.note(second, BoardResult(board_of(2), 1.0, error=NodeSilentError("It was pulled."), row=2))
+    one.note(first, BoardResult(board_of(1), 1.0, error=NodeSilentError("It was pulled."), row=1))
+    one.assign_row(third, board_of(3))
+    again = Progress(station.home, sheet)
+    assert [again.board_of(row) for row in sheet.rows] == [board_of(number).hex() for number in (1, 2, 3)]
+    assert [again.rows[number].result for number in (1, 2)] == ["failed", "failed"]
+    assert one.rows[2].result == "failed"
+
+
+def test_a_spare_gets_no_row_before_those_that_had_no_board(station: Station, tmp_path: Path) -> None:
+    progress = Progress(station.home, read(station, tmp_path, "name\na\nb\n"))
+    progress.assign_row(progress.sheet.rows[0], board_of(1))
+    progress.note(progress.sheet.rows[0], BoardResult(board_of(1), 1.0, error=NodeSilentError("It was pulled."), row=1))
+    row = progress.row_for(board_of(2), "")
+    assert row is not None
+    assert row.number == 2
+
+
+CERTIFICATE = "# date: 2026-11-20\nraw,value [N]\n4194304,-500\n12582912,{high}\n"
+
+
+def finished(station: Station, folder: Path, text: str) -> Progress:
+    """A sheet of one row that has passed, kept on the disk."""
+    progress = Progress(station.home, read(station, folder, text))
+    progress.assign_row(progress.sheet.rows[0], board_of(1))
+    progress.rows[1].result = "passed"
+    progress.save()
+    return progress
+
+
+def test_a_row_is_done_again_after_its_calibration_profile_or_name_changed(station: Station, tmp_path: Path) -> None:
+    """The digest of the cells stayed the same: a corrected file of the same name was reported as passed."""
+    (station.home / "profiles").mkdir()
+    base, own, file = station.home / "profiles/base.toml", station.home / "profiles/own.toml", tmp_path / "cal.csv"
+    base.write_text('name = "base"\nextends = "load-cell"\n')
+    own.write_text('name = "own"\nextends = "base"\n')
+    file.write_text(CERTIFICATE.format(high=500))
+    text = "name,calibration,profile\na,cal.csv,own\n"
+    finished(station, tmp_path, text)
+    assert Progress(station.home, read(station, tmp_path, text)).open == []
+
+    file.write_text(CERTIFICATE.format(high=490))
+    again = Progress(station.home, read(station, tmp_path, text))
+    assert [(row.number, again.board_of(row)) for row in again.open] == [(1, board_of(1).hex())]
+    assert again.again == ("Row 1: provisioned again, because the calibration changed.",)
+    file.write_text(CERTIFICATE.format(high=500))
+    assert Progress(station.home, read(station, tmp_path, text)).open == [], "it is as it was"
+
+    base.write_text('name = "base"\nextends = "load-cell"\n[channel.1]\nuncertainty = 0.4\n')
+    assert Progress(station.home, read(station, tmp_path, text)).again == (
+        "Row 1: provisioned again, because the profile changed.",
+    )
+    base.write_text('name = "base"\nextends = "load-cell"\n')
+    renamed = Progress(station.home, read(station, tmp_path, text.replace("a,", "b,", 1)))
+    assert renamed.again == ("Row 1: provisioned again, because the sheet changed.",)
+
+
+def test_a_row_stays_done_when_rows_before_it_are_added_removed_or_sorted(station: Station, tmp_path: Path) -> None:
+    """Progress was matched by the number of the row: one line more at the top opened every finished row again."""
+    progress = Progress(station.home, read(station, tmp_path, "name\na\nb\nc\n"))
+    for row in progress.sheet.rows[:2]:
+        progress.assign_row(row, board_of(row.number))
+        progress.rows[row.number].result = "passed"
+    progress.save()
+    for text, open_rows, boards in (
+        ("name\nnew\na\nb\nc\n", [1, 4], [None, 1, 2, None]),
+        ("name\nc\nb\na\n", [1], [None, 2, 1]),
+        ("name\nb\n", [], [2]),
+    ):
+        later = Progress(station.home, read(station, tmp_path, text))
+        assert ([row.number for row in later.open], later.again) == (open_rows, ()), text
+        had = [None if number is None else board_of(number).hex() for number in boards]
+        assert [later.board_of(row) for row in later.sheet.rows] == had, text
+
+
+def test_equal_rows_that_moved_are_each_done_once(station: Station, tmp_path: Path) -> None:
+    progress = Progress(station.home, read(station, tmp_path, "uuid,profile\n,load-cell\n,load-cell\n"))
+    for row in progress.sheet.rows:
+        progress.assign_row(row, board_of(row.number))
+        progress.rows[row.number].result = "passed"
+    progress.save()
+    rows = "uuid,profile\n,limit-switch\n,load-cell\n,load-cell\n,load-cell\n"
+    later = Progress(station.home, read(station, tmp_path, rows))
+    assert [row.number for row in later.open] == [1, 4]
+    boards = {later.board_of(row) for row in later.sheet.rows[1:3]}
+    assert boards == {board_of(1).hex(), board_of(2).hex()}
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_row_finished_by_an_older_version_is_done_again_if_its_board_differs(
+    station: Station, tmp_path: Path, same: bool
+) -> None:
+    progress = finished(station, tmp_path, "name\na\n")
+    (kept,) = (station.home / "batches").glob("*.json")
+    told = json.loads(kept.read_text())
+    for member in ("content", "again"):
+        del told["rows"]["1"][member]
+    kept.write_text(json.dumps(told))
+    asked: list[bytes] = []
+
+    def has_it(row: SheetRow, uuid: bytes) -> bool:
+        asked.append(uuid)
+        return same
+
+    again = Progress(station.home, progress.sheet, has_it)
+    assert (asked, len(again.open)) == ([board_of(1)], 0 if same else 1)
+    assert ("the datasheet differs" in "".join(again.again)) is not same
+
+
+def test_a_board_that_is_turned_away_takes_no_row(station: Station, tmp_path: Path) -> None:
+    """Row 1 was bound to the first board that came; whoever has the name in fact got the name of row 2."""
+    progress = Progress(station.home, read(station, tmp_path, "name\na\nb\nc\n"))
+    first, second, _ = progress.sheet.rows
+    progress.turn_away(first, board_of(1))
+    progress.note(first, BoardResult(board_of(1), 1.0, error=NodeSilentError("Its name is another's."), row=1))
+    assert progress.row_for(board_of(1), "") is first, "held there again it is tried for the same row"
+    assert progress.row_for(board_of(2), "") is second
+    assert progress.next_row is second
+    later = Progress(station.home, progress.sheet)
+    assert later.row_for(board_of(5), "") is later.sheet.rows[0], "nobody has it"
+
+
+def test_a_no_is_no_try_of_a_board(station: Station, tmp_path: Path) -> None:
+    """A board that passed when it was held there again counted as one that needed two tries."""
+    progress = Progress(station.home, read(station, tmp_path, "name\na\n"))
+    (row,) = progress.sheet.rows
+    progress.note(row, BoardResult(board_of(1), 1.0, error=DeclinedError("You said no."), row=1))
+    assert (progress.rows[1].result, progress.rows[1].tries) == ("skipped", 0)
+    progress.rows[1].result = ""
+    progress.note(row, BoardResult(board_of(1), 1.0, row=1))
+    assert (progress.rows[1].result, progress.rows[1].tries, progress.rows[1].first) == ("passed", 1, True)
+    assert progress.totals().first_pass == 1.0
+
+
+def test_a_batch_to_which_no_board_came_says_so(station: Station, tmp_path: Path) -> None:
+    """It said "0 passed, 0 failed, 2 skipped", and not why."""
+    progress = Progress(station.home, read(station, tmp_path, "name\na\nb\n"))
+    progress.ran_out("was tapped within 30 s")
+    error = progress.totals().error
+    assert isinstance(error, NoNodeError)
+    assert error.message == "0 passed, 0 failed, 2 skipped. No board was tapped within 30 s for row 1, 2."
+
+
+def test_the_report_for_people_says_yield_and_leaves_out_what_was_not_reached(station: Station, tmp_path: Path) -> None:
+    progress = Progress(station.home, read(station, tmp_path, "name\n<b>\nb\n"))
+    progress.assign_row(progress.sheet.rows[0], bytes(10))
+    progress.note(progress.sheet.rows[0], BoardResult(bytes(10), 1.23, error=NodeSilentError("It is <silent>."), row=1))
+    about = ReportHead("bench <1>", "ab" * 32, "Ada", "teds-provision 9")
+    write_report(tmp_path / "day.html", progress, about)
+    text = (tmp_path / "day.html").read_text()
+    assert "<th>first-pass yield</th><td>0.0%</td>" in text
+    assert "<th>skipped or not reached</th><td>1</td>" in text
+    assert "&lt;b&gt;" in text
+    assert "It is &lt;silent&gt;." in text
+    assert "<td>not reached</td><td>0</td><td></td><td></td><td></td><td></td></tr>" in text
+    for fact in ("bench &lt;1&gt;", "ab" * 32, "Ada", "teds-provision 9", "@page{size:A4 landscape"):
+        assert fact in text
+    write_report(tmp_path / "day.csv", progress, about)
+    assert "first_pass,0.0000" in (tmp_path / "day.csv").read_text()
+
+
+def test_boards_that_are_finished_when_the_vault_is_locked_are_counted(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process changed the passphrase while nodes of a bus were worked on: finished ones are reported."""
+    boards = BatchRun(station, LinkSettings("can"), ProvisionRequest(everyone=True), SilentReporter())
+    contacts = [on_reader_number(number) for number in range(4)]
+    locked, begun = threading.Event(), threading.Barrier(4)
+
+    def board(contact: Contact, place: str, _operator: Operator) -> BoardResult:
+        uuid = contact.identity.uuid
+        begun.wait(PATIENCE)  # what has not begun when the vault is locked does not begin any more
+        if uuid == contacts[0].identity.uuid:
+            locked.set()
+            raise VaultLockedError("The vault is locked.")
+        locked.wait(PATIENCE)
+        time.sleep(0.05)  # the error is there first
+        return BoardResult(uuid, 0.1, None, PolicyError("refused"), None, place)
+
+    monkeypatch.setattr(boards, "_board", board)
+    came: list[bytes] = []
+    everyone = boards._side_by_side(SixAtOnce(), contacts, Operator())  # type: ignore[arg-type]
+    with pytest.raises(VaultLockedError):
+        came.extend(ended.uuid for ended in everyone)
+    assert sorted(came) == sorted(contact.identity.uuid for contact in contacts[1:])
+
+
+class SixAtOnce:
+    """A fixture for a bus on which six nodes are worked on at once."""
+
+    place = "can:test"
+
+    class capabilities:
+        max_parallel = 6
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def on_reader_number(number: int) -> Contact:
+    return contact(Board(uuid=board_of(number + 1)))

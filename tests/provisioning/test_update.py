@@ -1,0 +1,468 @@
+"""Firmware update: what an update proves before it keeps an image, what it refuses, and every way to be interrupted."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import cbor2
+import pytest
+
+from teds_provision.errors import (
+    BoardLostError,
+    DowngradeError,
+    NodeRefusedError,
+    NodeSilentError,
+    NotAuthenticError,
+    PolicyError,
+    RevertedError,
+    WrongImageError,
+)
+from teds_provision.links import LinkSettings
+from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.messages.frames import Function, Reason, refusal, security_command
+from teds_provision.protocol.messages.smp import UPLOAD, SmpPacket, decode_packet
+from teds_provision.provisioning.agree import reset_node
+from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.progress import SilentReporter
+from teds_provision.provisioning.update import UpdateOrder, plan_update
+from teds_provision.station.firmware import firmware_of
+from teds_provision.station.station import Station
+from teds_provision.teds.image import SECURITY
+from tests.bench import PASSPHRASE
+
+from .update_bench import Owner, StationKilled, UpdateBench
+
+
+@pytest.fixture(scope="module")
+def owner(tmp_path_factory: pytest.TempPathFactory) -> Owner:
+    return Owner(tmp_path_factory.mktemp("owner"))
+
+
+@pytest.fixture
+def bench(owner: Owner, tmp_path: Path) -> Iterator[UpdateBench]:
+    bench = UpdateBench.copy_of(owner, tmp_path)
+    yield bench
+    bench.close()
+
+
+def test_a_new_image_is_proven_kept_and_nothing_else_changes(bench: UpdateBench, owner: Owner) -> None:
+    flash = bench.node.tim.flash
+    done = bench.update(owner.new)
+    assert (done.result, done.before, done.octets, done.error) == ("updated", "1.0.0", len(owner.new.octets), None)
+    assert bench.runs == ("1.1.0", False, False)
+    assert bench.node.tim.flash == flash
+    exchanges = bench.exchanges
+    again = bench.update(owner.new)
+    assert (again.result, again.octets) == ("already", 0)
+    assert bench.exchanges - exchanges < 12
+    assert [entry.outcome for entry in bench.station.audit_log.entries() if entry.act == "update"] == ["updated"]
+
+
+def test_a_node_that_an_older_store_signed_shows_the_change_too(bench: UpdateBench, owner: Owner) -> None:
+    bench.station.firmware_reports.forget(bench.uuid)
+    assert bench.update(owner.new).result == "updated"
+    known = firmware_of(bench.station, bench.uuid)
+    assert known is not None
+    assert known.changed
+    bench.update(owner.old, allow_downgrade=True)
+    known = firmware_of(bench.station, bench.uuid)
+    assert known is not None
+    assert not known.changed, "the image under which it was signed runs again"
+
+
+def test_a_plan_waits_for_the_command_that_is_using_the_board(bench: UpdateBench, owner: Owner) -> None:
+    waits = threading.Event()
+    bench.station.notice = lambda _text: waits.set()
+    bench.station.unlock()
+    with bench.patched(), ThreadPoolExecutor(1) as pool:
+        with bench.station.node_lock(bench.uuid):
+            plan = pool.submit(
+                plan_update,
+                bench.station,
+                LinkSettings("can", via_chosen=True),
+                bench.uuid,
+                UpdateOrder(owner.new),
+                SilentReporter(),
+            )
+            assert waits.wait(60)
+            assert bench.exchanges == 0, "it leaves the session of the other command alone"
+        assert plan.result(60).stage == "upload"
+
+
+@pytest.mark.parametrize(
+    ("board", "refused"),
+    [("other/board", True), (None, True), ("virtual", False), ("virtual/finger", False), ("finger", True)],
+)
+def test_an_image_for_another_board_needs_a_person(
+    bench: UpdateBench, owner: Owner, board: str | None, refused: bool
+) -> None:
+    image = owner.image("1.1.1", counter=1, board=board)
+    done = bench.update(image)
+    assert (done.result, type(done.error)) == (("refused", WrongImageError) if refused else ("updated", type(None)))
+    if refused:
+        assert bench.runs == ("1.0.0", False, False)
+        assert bench.update(image, other_board=True).result == "updated"
+
+
+def test_an_older_image_needs_a_word_and_the_counter_may_still_stop_it(bench: UpdateBench, owner: Owner) -> None:
+    assert bench.update(owner.image("2.0.0", counter=2)).result == "updated"
+    older = owner.image("1.9.0", counter=2)
+    done = bench.update(older)
+    assert (done.result, type(done.error), done.octets) == ("refused", DowngradeError, 0)
+    assert bench.update(older, allow_downgrade=True).result == "updated"
+    done = bench.update(owner.image("1.8.0", counter=1), allow_downgrade=True)
+    assert (done.result, type(done.error)) == ("reverted", RevertedError)
+    assert bench.runs == ("1.9.0", False, False)
+
+
+def test_another_owners_image_never_starts(bench: UpdateBench, owner: Owner) -> None:
+    done = bench.update(owner.image("6.0.0", owner.rival, counter=9))
+    assert (done.result, type(done.error)) == ("reverted", RevertedError)
+    assert "owner's key" in done.error.hint if done.error else False
+    assert bench.runs == ("1.0.0", False, False)
+    assert bench.update(owner.new).result == "updated"
+
+
+def test_another_image_on_trial_or_pending_is_left_alone(bench: UpdateBench, owner: Owner) -> None:
+    other = owner.image("1.0.5", counter=1)
+    slots = bench.node._slots
+    assert slots is not None
+    slots.write(0, other.octets)
+    assert slots.start_next(other.digest)
+    done = bench.update(owner.new)
+    assert (done.result, type(done.error)) == ("refused", PolicyError)
+    bench.node.restart()
+    assert bench.runs == ("1.0.5", True, False)
+    done = bench.update(owner.new)
+    assert (done.result, type(done.error)) == ("refused", PolicyError)
+    assert bench.runs == ("1.0.5", True, False)
+    assert bench.update(other).result == "updated", "the update that it belongs to goes on"
+
+
+def test_a_board_on_trial_is_not_decommissioned_before_it_has_ended(bench: UpdateBench, owner: Owner) -> None:
+    """It could forget its key under one image and have it again under the other."""
+    slots = bench.node._slots
+    assert slots is not None
+    slots.write(0, owner.new.octets)
+    assert slots.start_next(owner.new.digest)
+    bench.node.restart()
+    assert bench.runs == ("1.1.0", True, False)
+    flash = bench.node.tim.flash
+    bench.station.unlock()
+
+    def reset() -> None:
+        with Conversation(bench.contact(), notice=lambda _notice: None) as node:
+            reset_node(bench.station, node, identify(bench.station, node))
+
+    with pytest.raises(NodeRefusedError) as refused:
+        reset()
+    assert refused.value.reason == Reason.BUSY
+    assert bench.node.tim.flash == flash
+    assert bench.station.keys.held(bench.uuid)
+    bench.node.restart()
+    assert bench.runs == ("1.0.0", False, False)
+    reset()
+    assert bench.node.in_factory_state()
+    assert bench.station.firmware_reports.get(bench.uuid) is None, "the next owner's board is another one"
+
+
+def test_a_board_that_never_returns_is_lost_and_the_same_call_goes_on_later(bench: UpdateBench, owner: Owner) -> None:
+    bench.node.when_restarted(lambda: setattr(bench, "present", False))
+    done = bench.update(owner.new, wait=0.5)
+    assert (done.result, type(done.error)) == ("lost", BoardLostError)
+    bench.present = True
+    assert bench.runs == ("1.1.0", True, False)
+    assert bench.update(owner.new).result == "updated"
+    assert bench.runs == ("1.1.0", False, False)
+
+
+def test_a_board_that_lost_power_on_trial_runs_its_old_image_and_takes_the_new_one_again(
+    bench: UpdateBench, owner: Owner
+) -> None:
+    bench.node.when_restarted(bench.power_on)
+    done = bench.update(owner.new)
+    assert (done.result, type(done.error)) == ("reverted", RevertedError)
+    assert bench.runs == ("1.0.0", False, False)
+    done = bench.update(owner.new)
+    assert (done.result, done.octets) == ("updated", 0), "the image is in the other slot already"
+
+
+@pytest.mark.parametrize(
+    ("sabotage", "why"),
+    [
+        ("datasheet", "shows another datasheet"),
+        ("key", "cannot prove that it holds the key"),
+        ("values", "gives a valid value"),
+        ("confirms itself", "confirmed itself before it was proven"),
+    ],
+)
+def test_an_image_that_does_not_prove_itself_is_reverted(
+    bench: UpdateBench, owner: Owner, sabotage: str, why: str
+) -> None:
+    node, flash, key = bench.node, bench.node.tim.flash, bench.node.tim.key
+    board, slots = node.board, node._slots
+    assert board is not None
+    assert slots is not None
+    read = board.read
+
+    def spoil() -> None:
+        """Do what the new image does wrong, and undo it when the old one runs."""
+        new = slots.running.version_text == "1.1.0"
+        if sabotage == "datasheet":
+            other = {**flash.blocks, SECURITY: flash.blocks[SECURITY][:-2] + b"xx"}
+            node.tim._flash = replace(flash, blocks=other) if new else flash
+        elif sabotage == "key":
+            node.tim.key = SoftwareKey.generate() if new else key
+        elif sabotage == "values":
+            mute = lambda channel, tick: (read(channel, tick)[0], False)  # noqa: E731
+            board.read = mute if new else read  # type: ignore[method-assign]
+        elif new:
+            slots.confirm()
+
+    bench.node.when_restarted(spoil)
+    done = bench.update(owner.new)
+    assert why in str(done.error)
+    if sabotage == "confirms itself":
+        assert (done.result, type(done.error)) == ("refused", PolicyError)
+        assert "keeps the new image" in str(done.error)
+        return
+    assert (done.result, type(done.error)) == ("reverted", RevertedError)
+    assert bench.runs == ("1.0.0", False, False)
+
+
+# -- interruptions: at every exchange, at either end, before and after it ----------------------------------------------
+
+
+def _request_lost(bench: UpdateBench, at: int) -> None:
+    def cut(number: int) -> None:
+        if number == at:
+            raise NodeSilentError("The request was lost.")
+
+    bench.cut = cut
+
+
+def _reply_lost(bench: UpdateBench, at: int) -> None:
+    def answered(number: int) -> None:
+        if number == at:
+            raise NodeSilentError("The reply was lost.")
+
+    bench.answered = answered
+
+
+def _station_killed(bench: UpdateBench, at: int) -> None:
+    def cut(number: int) -> None:
+        if number == at:
+            raise StationKilled
+
+    bench.cut = cut
+
+
+def _station_killed_after(bench: UpdateBench, at: int) -> None:
+    def answered(number: int) -> None:
+        if number == at:
+            raise StationKilled
+
+    bench.answered = answered
+
+
+def _node_off(bench: UpdateBench, at: int) -> None:
+    def cut(number: int) -> None:
+        if number == at:
+            bench.power_on()
+
+    bench.cut = cut
+
+
+def _node_off_after(bench: UpdateBench, at: int) -> None:
+    def answered(number: int) -> None:
+        if number == at:
+            bench.power_on()
+            raise NodeSilentError("The board lost power with its reply.")
+
+    bench.answered = answered
+
+
+INTERRUPTIONS = (
+    _request_lost,
+    _reply_lost,
+    _station_killed,
+    _station_killed_after,
+    _node_off,
+    _node_off_after,
+)
+
+
+def exchanges_of(owner: Owner, folder: Path) -> int:
+    """How many exchanges an update without interruption takes."""
+    bench = UpdateBench.copy_of(owner, folder)
+    assert bench.update(owner.long).result == "updated"
+    bench.close()
+    return bench.exchanges
+
+
+def interrupted(owner: Owner, folder: Path, interruption: Callable[[UpdateBench, int], None], at: int) -> None:
+    """Interrupt an update, look at what is left, and run the same call again until it ends well."""
+    bench = UpdateBench.copy_of(owner, folder)
+    flash, old, new = bench.node.tim.flash, "1.0.0", owner.long
+    interruption(bench, at)
+    first = "killed"
+    with suppress(StationKilled):
+        first = bench.update(new, wait=2.0).result
+    bench.cut = bench.answered = lambda number: None
+    assert bench.node.tim.flash == flash, "key, datasheet, address, epoch and sequence"
+    assert bench.runs[0] in (old, new.version_text)
+    assert first != "updated" or bench.runs == (new.version_text, False, False)
+    bench.station.close()
+    bench.station = Station.open(folder / "home", ask=lambda prompt, confirm: PASSPHRASE)
+    again = [bench.update(new, wait=2.0)]
+    if again[0].result == "reverted":  # power failed on trial, and nothing had been told
+        again.append(bench.update(new, wait=2.0))
+    assert again[-1].result in ("updated", "already"), (again, first)
+    assert bench.runs == (new.version_text, False, False)
+    assert bench.node.tim.flash == flash
+    bench.node.restart()
+    assert bench.runs == (new.version_text, False, False), "it stays over a restart"
+    bench.close()
+
+
+@pytest.mark.parametrize("interruption", INTERRUPTIONS, ids=lambda how: how.__name__.strip("_"))
+def test_an_update_that_is_interrupted_resumes(
+    owner: Owner, tmp_path: Path, interruption: Callable[[UpdateBench, int], None]
+) -> None:
+    last = exchanges_of(owner, tmp_path)
+    for at in range(2 + INTERRUPTIONS.index(interruption), last + 1, 9):
+        interrupted(owner, tmp_path / str(at), interruption, at)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("interruption", INTERRUPTIONS, ids=lambda how: how.__name__.strip("_"))
+def test_an_update_resumes_after_an_interruption_at_any_exchange(
+    owner: Owner, tmp_path: Path, interruption: Callable[[UpdateBench, int], None]
+) -> None:
+    for at in range(1, exchanges_of(owner, tmp_path) + 1):
+        interrupted(owner, tmp_path / str(at), interruption, at)
+
+
+# -- hostile boards and a hostile bus ----------------------------------------------------------------------------------
+
+
+class HostileManager:
+    """The manager of a board whose replies to uploads a test replaces; all else is the real one's."""
+
+    def __init__(self, bench: UpdateBench, reply: Callable[[SmpPacket, int], bytes]) -> None:
+        manage = bench.node.tim._manage
+        assert manage is not None
+        self._real, self._reply, self.uploads = manage._manager, reply, 0
+        manage._manager = self  # type: ignore[assignment]
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._real, name)
+
+    def manage(self, octets: bytes) -> bytes:
+        packet = decode_packet(octets)
+        if packet.command != UPLOAD:
+            return self._real.manage(octets)
+        self.uploads += 1
+        assert self.uploads < 50, "the station follows a board that never takes the image"
+        return self._reply(packet, self.uploads)
+
+
+def said(**values: object) -> Callable[[SmpPacket, int], bytes]:
+    return lambda packet, number: packet.reply(cbor2.dumps(values)).encode()
+
+
+HOSTILE: dict[str, tuple[Callable[[SmpPacket, int], bytes], type[Exception], int]] = {
+    "an offset that never moves": (said(off=0), NotAuthenticError, 3),
+    "an offset that goes to and fro": (
+        lambda packet, number: packet.reply(cbor2.dumps({"off": 100 + number % 2})).encode(),
+        NotAuthenticError,
+        5,
+    ),
+    "an offset beyond the image": (said(off=10**6), NotAuthenticError, 1),
+    "a negative offset": (said(off=-1), NotAuthenticError, 1),
+    "no offset": (said(), NotAuthenticError, 1),
+    "an offset that is text": (said(off="9"), NotAuthenticError, 1),
+    "a CBOR tag": (
+        lambda packet, number: packet.reply(bytes.fromhex("a1636f6666c24101")).encode(),
+        NotAuthenticError,
+        1,
+    ),
+    "a floating number": (said(off=1.5), NotAuthenticError, 1),
+    "something after the map": (lambda packet, number: packet.reply(b"\xa0\xa0").encode(), NotAuthenticError, 1),
+    "no map": (lambda packet, number: packet.reply(b"\xff").encode(), NotAuthenticError, 1),
+    "half a packet": (lambda packet, number: packet.reply(b"\xa0").encode()[:5], NotAuthenticError, 1),
+    "the reply to another request": (
+        lambda packet, number: packet._replace(sequence=packet.sequence ^ 1).reply(b"\xa1\x63off\x05").encode(),
+        NotAuthenticError,
+        1,
+    ),
+    "other octets than were sent": (said(off=9728, match=False), NotAuthenticError, 1),
+    "SMP's error of version 1": (said(rc=8), PolicyError, 1),
+    "SMP's error of version 2": (said(err={"group": 1, "rc": 30}), PolicyError, 1),
+    "an error that nobody knows": (said(err={"group": 1, "rc": 250}), PolicyError, 1),
+}
+
+
+@pytest.mark.parametrize("hostile", HOSTILE)
+def test_a_board_that_answers_nonsense_ends_the_update_soon(bench: UpdateBench, owner: Owner, hostile: str) -> None:
+    reply, error, most = HOSTILE[hostile]
+    manager = HostileManager(bench, reply)
+    image = owner.long
+    if hostile == "other octets than were sent":
+        manager._reply = said(off=len(image.octets), match=False)
+    done = bench.update(image)
+    assert (done.result, type(done.error)) == ("refused", error), done.error
+    assert manager.uploads <= most
+    assert bench.runs == ("1.0.0", False, False)
+
+
+@pytest.mark.parametrize("octet", [3, 12, -1])
+def test_a_bus_that_alters_replies_decides_nothing(owner: Owner, tmp_path: Path, octet: int) -> None:
+    """Each seventh exchange has one octet of its reply changed; what is sealed then opens no more."""
+    for at in range(3, 40, 7):
+        bench = UpdateBench.copy_of(owner, tmp_path / str(at))
+        flash = bench.node.tim.flash
+
+        def changed(_request: bytes, reply: bytes, bench: UpdateBench = bench, at: int = at) -> bytes:
+            if bench.exchanges != at or len(reply) < 13:
+                return reply
+            wrong = bytearray(reply)
+            wrong[octet] ^= 0x40
+            return bytes(wrong)
+
+        bench.changed = changed
+        done = bench.update(owner.new, wait=2.0)
+        assert bench.node.tim.flash == flash
+        assert done.result != "updated" or bench.runs == ("1.1.0", False, False)
+        bench.changed = lambda request, reply: reply
+        again = bench.update(owner.new, wait=2.0)
+        assert again.result in ("updated", "already"), (at, done, again)
+        bench.close()
+
+
+def test_a_recorded_update_cannot_be_played_again_and_without_the_key_there_is_none(
+    bench: UpdateBench, owner: Owner
+) -> None:
+    frames: list[bytes] = []
+
+    def record(request: bytes, reply: bytes) -> bytes:
+        frames.append(request)
+        return reply
+
+    bench.changed = record
+    assert bench.update(owner.new).result == "updated"
+    assert bench.update(owner.old, allow_downgrade=True).result == "updated"
+    before = bench.runs
+    for frame in frames:
+        if frame[3] in (Function.SEALED, Function.OPEN):
+            bench.node.request("can:f1", frame, tapped=False)
+    plain = security_command(Function.MANAGE, bytes.fromhex("0a00000100000705a0"))
+    assert bench.node.request("can:f2", plain.encode(), tapped=False) == refusal(Reason.NOT_PERMITTED).encode()
+    assert bench.runs == before
+    assert before[0] == "1.0.0"

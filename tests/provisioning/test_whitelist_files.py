@@ -1,0 +1,283 @@
+"""Whitelists of other people: every form that is read, every mistake that is named, nothing by half."""
+
+from __future__ import annotations
+
+import json
+import string
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from teds_provision.errors import BadDataError, KeyMismatchError, NotFoundError, PolicyError
+from teds_provision.provisioning.whitelist import (
+    FORMATS,
+    ListedNode,
+    add,
+    plan_addition,
+    read_whitelist,
+    remove,
+    render,
+)
+from teds_provision.station.station import Station
+from teds_provision.station.store import RevocationRecord, WhitelistEntry
+from tests.pace import costs_at_most
+
+ONE, TWO = bytes.fromhex("8d4d9da65281f7000000"), bytes.fromhex("8d4d9da65281f7000001")
+KEY, OTHER = "ab" * 32, "cd" * 32
+
+
+def read(folder: Path, text: str, name: str = "list.txt") -> list[ListedNode]:
+    path = folder / name
+    path.write_text(text)
+    return read_whitelist(path)
+
+
+def pairs(listed: list[ListedNode]) -> list[tuple[bytes, str | None]]:
+    return [(entry.uuid, entry.fingerprint) for entry in listed]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f'<whitelist><transducer uuid="0x{ONE.hex()}" fingerprint="{KEY}"/>'
+        f'<transducer uuid="{TWO.hex()}"/></whitelist>',
+        f"<w:whitelist xmlns:w='u'><w:tim UUID='0X{ONE.hex().upper()}' Fingerprint='{KEY}'/>"
+        f"<w:tim uuid='{TWO.hex()}'/></w:whitelist>",
+        f"<a><transducer><uuid>0x{ONE.hex()}</uuid><fingerprint>{KEY}</fingerprint></transducer>"
+        f"<transducer><uuid>{TWO.hex()}</uuid></transducer></a>",
+        f"uuid,fingerprint\n{ONE.hex()},{KEY}\n{TWO.hex()},\n",
+        f"name;UUID;Fingerprint\nfinger;0x{ONE.hex()};{KEY.upper()}\n\n# a remark\n;{TWO.hex()};\n",
+        f"{ONE.hex()},{KEY}\n{TWO.hex()}\n",
+        json.dumps({"whitelist": [{"uuid": ONE.hex(), "fingerprint": KEY}, {"uuid": TWO.hex(), "fingerprint": None}]}),
+        json.dumps([{"UUID": "0x" + ONE.hex(), "fingerprint": KEY}, TWO.hex()]),
+    ],
+)
+def test_entries_with_and_without_a_key_are_read_from_every_form(tmp_path: Path, text: str) -> None:
+    assert pairs(read(tmp_path, text)) == [(ONE, KEY), (TWO, None)]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"<whitelist><uuid>0x{ONE.hex()}</uuid><uuid>{TWO.hex()}</uuid></whitelist>",
+        f"<whitelist><transducer>\n 0x{ONE.hex()}\n</transducer><transducer>{TWO.hex()}</transducer></whitelist>",
+        f"<uuids>0x{ONE.hex()}\n0x{TWO.hex()}</uuids>",
+        f"<ncap><list><entry><id>0x{ONE.hex()}</id></entry><x>0x{TWO.hex()}</x></list><note>hello</note></ncap>",
+        f"{ONE.hex()}\n0x{TWO.hex()}\n",
+        json.dumps([ONE.hex(), f"0x{TWO.hex()}"]),
+        f"\ufeff{ONE.hex()}\r\n{TWO.hex()}\r\n",
+    ],
+)
+def test_a_bare_list_of_uuids_is_read(tmp_path: Path, text: str) -> None:
+    assert pairs(read(tmp_path, text)) == [(ONE, None), (TWO, None)]
+
+
+@pytest.mark.parametrize("text", ["<whitelist/>", "uuid,fingerprint\n", '{"whitelist": []}'])
+def test_an_empty_whitelist_is_one(tmp_path: Path, text: str) -> None:
+    assert read(tmp_path, text) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "places"),
+    [
+        (f'<whitelist>\n<transducer uuid="12"/>\n<transducer uuid="{ONE.hex()}" fingerprint="ab"/></whitelist>',
+         [":2: uuid: expected 20 hex digits", ":3: fingerprint: expected 32 to 64 hex digits"]),
+        ("<whitelist>\n\n<transducer/></whitelist>", [":3: uuid: expected 20 hex digits, not nothing"]),
+        (f"uuid\n{ONE.hex()}\nzz\n", [":3: uuid"]),
+        (f"uuid,name\n{ONE.hex()},a,b\n", [":2: row: 3 cells for 2 columns"]),
+        (f'[\n"{ONE.hex()}",\n{{"uuid": "{TWO.hex()}",\n "fingerprint": 7}},\n 4]',
+         [":3: fingerprint: expected a string", ":5: entry"]),
+        (f"{ONE.hex()},{KEY}\n{ONE.hex()},{OTHER}\n", [":2: fingerprint: line 1 has the same UUID with another key"]),
+        (f"{ONE.hex()}{'00' * 6}\n", [":1: uuid"]),
+        (f"uuid,name\n{ONE.hex()},a\x1bb\n", [":2: name"]),
+        ("<whitelist>\n<a></whitelist>", [":2: this is not XML"]),
+        ("<html><p>404</p></html>", ["no UUID in this document"]),
+        ('{"whitelist": 3}', ["whitelist: expected a list"]),
+        ('{"whitelist": [', [":1: this is not JSON"]),
+        ("[" * 100_000, ["list.txt"]),
+        ("<a>" * 40, ["nested too deeply"]),
+        (f"<r><uuid>{ONE.hex()}</uuid><uuid>{TWO.hex()}</uuid><fingerprint>{KEY}</fingerprint></r>",
+         ["belongs to none"]),
+    ],
+)  # fmt: skip
+def test_every_wrong_line_is_named(tmp_path: Path, text: str, places: list[str]) -> None:
+    with pytest.raises(BadDataError) as caught:
+        read(tmp_path, text)
+    for place in places:
+        assert place in caught.value.message
+    assert "list.txt" in caught.value.message
+
+
+def test_the_first_ten_of_many_wrong_lines_are_shown(tmp_path: Path) -> None:
+    with pytest.raises(BadDataError, match=r"list\.txt:10: .*and 20 more") as caught:
+        read(tmp_path, "x\n" * 30)
+    assert "list.txt:11" not in caught.value.message
+
+
+BOMB = '<!DOCTYPE a [<!ENTITY a "aaaaaaaaaa">' + "".join(
+    f'<!ENTITY {chr(98 + n)} "{f"&{chr(97 + n)};" * 10}">' for n in range(8)
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        BOMB + "]><whitelist><uuid>&i;</uuid></whitelist>",
+        '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]><whitelist><uuid>&x;</uuid></whitelist>',
+        '<!DOCTYPE whitelist SYSTEM "http://127.0.0.1:1/x.dtd"><whitelist/>',
+        "<!DOCTYPE whitelist><whitelist/>",
+    ],
+)
+def test_entity_bombs_and_external_entities_are_refused(tmp_path: Path, text: str) -> None:
+    with costs_at_most(1.0), pytest.raises(BadDataError, match="DTD"):
+        read(tmp_path, text)
+
+
+def test_a_missing_file_and_other_encodings_are_told(tmp_path: Path) -> None:
+    with pytest.raises(NotFoundError):
+        read_whitelist(tmp_path / "none.xml")
+    with pytest.raises(NotFoundError, match="is a folder"):
+        read_whitelist(tmp_path)
+    (tmp_path / "latin.csv").write_bytes(b"uuid,name\n\xe4")
+    with pytest.raises(BadDataError, match=r"latin\.csv:2: the text is not UTF-8"):
+        read_whitelist(tmp_path / "latin.csv")
+
+
+NAMES = st.text(alphabet=string.printable[:95] + "äß€&<>\"'", min_size=1, max_size=20).map(str.strip).filter(bool)
+ENTRIES = st.lists(
+    st.builds(
+        WhitelistEntry,
+        uuid=st.binary(min_size=10, max_size=10),
+        fingerprint=st.none() | st.binary(min_size=32, max_size=32).map(bytes.hex),
+        assurance=st.sampled_from(["tap", "bus", "uuid", "import"]),
+        name=st.none() | NAMES,
+    ),
+    unique_by=lambda entry: entry.uuid,
+    max_size=8,
+)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@given(entries=ENTRIES)
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_what_is_exported_is_read_back(tmp_path: Path, form: str, entries: list[WhitelistEntry]) -> None:
+    path = tmp_path / f"out.{form}"
+    path.write_text("".join(render(entries, form)))
+    read_back = {(entry.uuid, entry.fingerprint, entry.name) for entry in read_whitelist(path)}
+    assert read_back == {(entry.uuid, entry.fingerprint, entry.name) for entry in entries}
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@given(octets=st.binary(max_size=200) | st.text(alphabet='<>/"=&;[]{}:, \n0x8d4fuidlst', max_size=120).map(str.encode))
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_no_octets_make_anything_but_entries_or_one_of_our_errors(tmp_path: Path, form: str, octets: bytes) -> None:
+    path = tmp_path / "junk"
+    path.write_bytes(octets)
+    try:
+        listed = read_whitelist(path, form)
+    except BadDataError:
+        return
+    assert all(len(entry.uuid) == 10 for entry in listed)
+
+
+@pytest.mark.slow
+def test_ten_thousand_entries_are_quick(tmp_path: Path, station: Station) -> None:
+    entries = [WhitelistEntry(number.to_bytes(10, "big"), KEY, assurance="tap") for number in range(10_000)]
+    for form in FORMATS:
+        (tmp_path / f"big.{form}").write_text("".join(render(entries, form)))
+    with costs_at_most(6):  # 1 s on a quiet machine; each looked up among all, one by one, took minutes
+        listed = [read_whitelist(tmp_path / f"big.{form}") for form in FORMATS]
+        assert len(listed[0]) == len(listed[1]) == len(listed[2]) == 10_000
+        add(station, plan_addition(station, listed[0]), source="big.xml")
+    assert len(station.pins.whitelist()) == 10_000
+    assert plan_addition(station, listed[1]).write == ()
+
+
+@pytest.mark.slow
+def test_more_entries_than_a_whitelist_has_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadDataError, match="more than 250000 entries"):
+        read(tmp_path, "".join(f"{number:020x}\n" for number in range(250_001)))
+
+
+# -- trust -------------------------------------------------------------------------------------------------------------
+
+
+def put(station: Station, *listed: ListedNode) -> None:
+    add(station, plan_addition(station, listed), source="test")
+
+
+def test_a_pinned_key_is_never_replaced_and_one_conflict_refuses_all(station: Station) -> None:
+    put(station, ListedNode(1, ONE, KEY))
+    with pytest.raises(KeyMismatchError, match="pinned to the key abababababababab") as caught:
+        plan_addition(station, [ListedNode(1, TWO), ListedNode(2, ONE, OTHER)])
+    assert caught.value.exit_code == 6
+    assert station.pins.entry(TWO) is None
+
+
+def test_an_unpinned_entry_gains_a_key_and_keeps_the_rest(station: Station) -> None:
+    put(station, ListedNode(1, ONE, name="finger"))
+    before = station.pins.entry(ONE)
+    assert before is not None
+    assert before.assurance == "uuid"
+    put(station, ListedNode(1, ONE, KEY, "thumb"))
+    after = station.pins.entry(ONE)
+    assert after is not None
+    assert (after.fingerprint, after.name, after.assurance, after.added) == (KEY, "finger", "import", before.added)
+    assert plan_addition(station, [ListedNode(1, ONE), ListedNode(2, ONE, KEY)]).write == ()
+
+
+def test_the_key_that_a_node_has_proved_counts_as_pinned(station: Station) -> None:
+    station.nodes.remember(ONE, point=station.point)
+    with pytest.raises(KeyMismatchError):
+        plan_addition(station, [ListedNode(1, ONE, KEY)])
+    put(station, ListedNode(1, ONE, station.fingerprint))
+    assert remove(station, ONE)
+    assert not remove(station, ONE)
+    put(station, ListedNode(1, ONE, KEY))  # the board was replaced
+
+
+def test_removing_keeps_epoch_and_sequence(station: Station) -> None:
+    station.nodes.remember(ONE, point=station.point, epoch=3, sequence=9)
+    put(station, ListedNode(1, ONE))
+    remove(station, ONE)
+    known = station.nodes.get(ONE)
+    assert known is not None
+    assert (known.point, known.epoch, known.sequence) == (None, 3, 9)
+
+
+def test_a_revoked_node_is_not_whitelisted_again(station: Station) -> None:
+    station.policy.deny(RevocationRecord(ONE, None, "stolen", "{}"))
+    with pytest.raises(PolicyError, match="stolen"):
+        plan_addition(station, [ListedNode(1, ONE)])
+
+
+def test_a_list_of_many_pages_is_held_against_what_is_known_on_each(station: Station) -> None:
+    """Pages end at 500: the entries on the last one count as those on the first."""
+    listed = [ListedNode(number, number.to_bytes(10, "big"), KEY) for number in range(1201)]
+    add(station, plan_addition(station, listed[:1000]), source="test")
+    plan = plan_addition(station, listed)
+    assert (plan.new, plan.unchanged, len(plan.write)) == (201, 1000, 201)
+    other = [*listed[:999], ListedNode(999, listed[999].uuid, OTHER), *listed[1000:]]
+    with pytest.raises(KeyMismatchError, match=listed[999].uuid.hex()):
+        plan_addition(station, other)
+
+
+def test_an_eui_64_gets_the_uuid_of_the_written_rule_in_every_format(tmp_path: Path) -> None:
+    """The NCAP of the second paper lists transducers by 8 octets (its Figure 4)."""
+    for name, text in {
+        "list.xml": '<whitelist><transducer uuid="0x0011223344556677" fingerprint="" /></whitelist>',
+        "text.xml": "<UUIDs><UUID>00-11-22-33-44-55-66-77</UUID></UUIDs>",
+        "several.xml": "<whitelist>0x0011223344556677 0x8d4d9da65281f7000000</whitelist>",
+        "list.csv": "uuid,name\n00:11:22:33:44:55:66:77,arm\n",
+        "list.json": '["0011223344556677"]',
+    }.items():
+        (tmp_path / name).write_text(text)
+        found = read_whitelist(tmp_path / name)
+        assert found[0].uuid.hex() == "fffe0011223344556677", name
+    assert found[0].uuid != bytes.fromhex("00000011223344556677")
+    for wrong in ("00112233445566", "001122334455667788"):
+        (tmp_path / "wrong.csv").write_text(f"uuid\n{wrong}\n")
+        with pytest.raises(BadDataError, match="20 hex digits"):
+            read_whitelist(tmp_path / "wrong.csv")
