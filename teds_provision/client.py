@@ -330,11 +330,11 @@ class Client:
         return found
 
     def groups(self) -> list[Group]:
-        """Return the measurement groups."""
+        """Return the groups of nodes that are measured together."""
         return list(self.request("GET", "/groups")["groups"])
 
     def measurements(self) -> list[Measurement]:
-        """Return the measurements."""
+        """Return the measurements that the service keeps, running or not."""
         return list(self.request("GET", "/measurements")["measurements"])
 
     def measure(self, *uuids: str, **settings: Unpack[MeasurementMembers]) -> Measurement:

@@ -420,7 +420,7 @@ class Probe:
         return self.line.capabilities.tapped
 
     def identity(self) -> Identity:
-        """Identify, asked now."""
+        """Send Identify now and return the node's answer."""
         try:
             return Identity.decode(self.good(IDENTIFY))
         except BadDataError as error:

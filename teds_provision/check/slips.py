@@ -47,7 +47,7 @@ class Slip(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """For a person."""
+        """Return the slip as one sentence for the report."""
         return f"A known slip fits: {self.words}."
 
 

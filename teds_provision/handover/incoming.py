@@ -355,7 +355,7 @@ class _Judge:
         self._turn_to([])
 
     def judge_nodes(self, nodes: Iterable[BundledNode]) -> Iterator[PlannedNode]:
-        """Judge every node."""
+        """Decide for each node of the bundle whether its key is taken, and why not."""
         for page in chunks(nodes):
             self._turn_to(page)
             for node in page:

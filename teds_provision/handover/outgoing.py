@@ -435,7 +435,7 @@ def _one_ca(station: Station, order: ExportOrder, nodes: Chosen) -> bytes:
 
 
 def _with_ca(station: Station, nodes: Chosen) -> Iterator[tuple[LeavingNode, bytes]]:
-    """Each node with the CA that it keeps."""
+    """Return each node with the CA that it keeps."""
     own = station.ca
     for page in chunks(nodes):
         kept = station.keys.cas_among([node.uuid for node in page])

@@ -51,7 +51,7 @@ class Sighting:
         return self.identity.uuid
 
     def contact(self) -> Contact:
-        """Return a link to it."""
+        """Return a link to the node that was seen."""
         return self.port.contact(self.address, self.identity)
 
 
@@ -62,7 +62,7 @@ class SightingSink(Protocol):
     """How often a node that had been seen, or was never looked for, became missing."""
 
     def add_sighting(self, sighting: Sighting) -> None:
-        """Take a sighting."""
+        """Add a node that was seen, or what is new about one that is known."""
 
     def conflict(self, place: str, address: int, error: AddressConflictError) -> None:
         """Record that two nodes answer under one address: nothing is opened there."""

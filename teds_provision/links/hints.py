@@ -56,5 +56,5 @@ class BleAddress:
 
     @property
     def text(self) -> str:
-        """``C1:D8:57:00:01:01``."""
+        """Return a Bluetooth address in its usual form, ``C1:D8:57:00:01:01``."""
         return ":".join(f"{octet:02X}" for octet in self.octets)

@@ -345,7 +345,7 @@ class WallClock:
         return cls(offset / 1e9, width / 2e9)
 
     def unix(self, monotonic: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Unix seconds."""
+        """Return the present time in Unix seconds."""
         return monotonic + self.offset
 
 

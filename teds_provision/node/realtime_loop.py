@@ -35,7 +35,7 @@ class RealtimeLoop:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Begin."""
+        """Start the loop in its thread."""
         self._thread = threading.Thread(target=self._run, name="pulse", daemon=True)
         self._thread.start()
 

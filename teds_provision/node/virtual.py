@@ -448,7 +448,7 @@ class VirtualNode:
     # -- slow parts ------------------------------------------------------------------------------------------------
 
     def _work(self) -> None:
-        """One point operation."""
+        """Wait as long as the board needs for one operation on the curve."""
         self._sleep(self._delays.crypto)
 
     def _verify(self, point: bytes, message: bytes, signature: bytes) -> bool:

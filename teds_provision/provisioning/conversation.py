@@ -345,4 +345,4 @@ def _carry(link: Link, frame: bytes, within: float | None) -> bytes:
 
 
 def _nothing() -> None:
-    """There is nothing to release."""
+    """Do nothing: this conversation holds no lock."""

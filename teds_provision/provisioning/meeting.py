@@ -359,7 +359,7 @@ class IdleStop(threading.Event):
         return self._asked or super().is_set() or self._is_over()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait for either."""
+        """Wait up to ``timeout`` seconds; return True if a stop was requested or the time is over."""
         end = None if timeout is None else time.monotonic() + timeout
         while not self.is_set():
             left = _LOOK_SECONDS if end is None else min(_LOOK_SECONDS, end - time.monotonic())

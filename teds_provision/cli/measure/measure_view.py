@@ -82,7 +82,7 @@ class StdoutEvents(ThreadedSink):
             )  # fmt: skip
 
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
-        """Nothing to open."""
+        """Do nothing: a screen needs no preparation."""
 
     def _process_item(self, item: Item) -> None:
         if isinstance(item, Block):
@@ -155,12 +155,12 @@ class LiveTable:
                 self._newest[block.uuid, number] = (value, float(block.time[-1]), count + len(block.time), since)
 
     def facts(self, facts: Sequence[ChannelFacts]) -> None:
-        """Names and units."""
+        """Show the names and units of a node's channels."""
         with self._guard:
             self._facts.update((channel_facts.key, channel_facts) for channel_facts in facts)
 
     def report(self, report: NodeReport) -> None:
-        """State of a node."""
+        """Show the state of a node."""
         with self._guard:
             self._reports[report.uuid] = report
 

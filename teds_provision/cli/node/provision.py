@@ -524,7 +524,7 @@ class BatchState(Protocol):
         """True if a job counts them, and no sheet: any board may be the next one."""
 
     def row(self, number: int) -> SheetRow:
-        """Return the row of that number."""
+        """Return the row of the sheet with this number, counted from 1."""
 
     def board_of(self, row: SheetRow) -> str | None:
         """UUID of the board that had a row before."""

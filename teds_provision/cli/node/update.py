@@ -332,7 +332,7 @@ class _ProgressTable:
         self._put(board.uuid, board.result, why)
 
     def close(self) -> None:
-        """Leave the table as it is."""
+        """End the display; the last table stays on the screen."""
         self._live.stop()
 
     def _put(self, uuid: bytes, doing: str, detail: str) -> None:

@@ -352,7 +352,7 @@ def _options(spec: CanSpec) -> dict[str, Any]:
 
 
 def _not_opened(spec: CanSpec, error: Exception) -> NoReaderError:
-    """Why a bus does not open, and the cure."""
+    """Return the error for a bus that does not open: the reason and what to do."""
     number = _number(error) if spec.interface == "socketcan" else None
     if number == errno.EAFNOSUPPORT:
         return NoReaderError(

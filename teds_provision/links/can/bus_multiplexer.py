@@ -198,7 +198,7 @@ class AddressConflicts:
 
     @property
     def hint(self) -> str:
-        """The cure."""
+        """Return what the user can do about it."""
         free = 0xF2 if self._own == 0xF1 else 0xF1
         return f"Give each station its own address, 0xF1 to 0xF7: add source=0x{free:02X} to --can of one of them."
 

@@ -116,7 +116,7 @@ class _LeanExchange:
         self._index = 0
 
     def exchange(self, target: Any, data: bytes, timeout: float) -> Any:
-        """As ``nfc.clf.pn53x.Device.send_cmd_recv_rsp``."""
+        """Send a command and return the response, as ``nfc.clf.pn53x.Device.send_cmd_recv_rsp``."""
         microseconds = int(timeout * 1e6)
         index = next((n + 1 for n in range(_MOST_INDEX) if microseconds >> n <= 100), _MOST_INDEX)
         rates = (target.brty_send, target.brty_recv)

@@ -56,7 +56,7 @@ class RecordingSummary:
     _next: dict[tuple[str, int, tuple[int, ...]], int] = field(default_factory=dict)
 
     def add_entry(self, entry: Entry) -> None:
-        """One entry."""
+        """Count one entry of the recording."""
         if isinstance(entry, Block):
             self._block(entry)
         elif isinstance(entry, GroupRows):

@@ -69,7 +69,7 @@ class Sink(Protocol):
 
     @property
     def stats(self) -> SinkStats:
-        """A snapshot."""
+        """Return the counters of this sink as they are now."""
 
     def open(self, facts: Sequence[ChannelFacts], station: StationFacts) -> None:
         """Begin; ``facts`` are those of the channels that are known by now."""

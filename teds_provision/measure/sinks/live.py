@@ -122,7 +122,7 @@ class TopicSink(ThreadedSink):
 
     @abstractmethod
     def _scalar(self, topic: str, meaning: Meaning, stamp: float, frame: str, value: float, variance: float) -> None:
-        """One value by its meaning."""
+        """Publish one value as the message of its quantity."""
 
     @abstractmethod
     def _fields(self, topic: str, kind: str, stamp: float, frame: str, fields: Mapping[str, FieldValue]) -> None:
@@ -150,7 +150,7 @@ class TopicSink(ThreadedSink):
 
     @abstractmethod
     def _diagnose(self, stamp: float, statuses: Sequence[DiagnosticEntry]) -> None:
-        """One DiagnosticArray."""
+        """Publish the states of the nodes as one DiagnosticArray."""
 
     @property
     def _node(self) -> str:

@@ -57,7 +57,7 @@ def look(station: Station, node: Conversation) -> NodeInspection:
 
 
 def _in_session(station: Station, node: Conversation) -> NodeInspection | None:
-    """In a session, as before a measurement."""
+    """Inspect the node in a session, with the checks of a measurement."""
     if session_if_keyed(station, node) is None:
         return None
     looked = verify_in_session(station, node, by="ncap")

@@ -149,7 +149,7 @@ class LinkWatch:
         self._thread = threading.Thread(target=self._run, name=f"watch {place}", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread that watches the link."""
         self._thread.start()
 
     def stop(self) -> None:

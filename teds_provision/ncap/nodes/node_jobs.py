@@ -64,7 +64,7 @@ class NodeLocks:
                 self._frozen.add(uuid)
 
     def release(self, uuid: str) -> None:
-        """End."""
+        """Release the node for other jobs."""
         with self._news:
             self._holders.pop(uuid, None)
             measured = uuid in self._frozen

@@ -102,7 +102,7 @@ class _NoClock:
     """The clock of a node that is elsewhere."""
 
     def now(self) -> float:
-        """Return the beginning."""
+        """Return 0: the time of this node never advances here."""
         return 0.0
 
     def own_clock(self) -> None:

@@ -128,7 +128,7 @@ class Guard:
     _slowed: int = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request or WebSocket."""
+        """Judge one request or WebSocket before it reaches the application (ASGI)."""
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return

@@ -188,7 +188,7 @@ class ManagedFirmware:
         return self.manager.report()
 
     def locate(self, seconds: int) -> None:
-        """Blink."""
+        """Make the board blink or beep."""
         self.located(seconds)
 
 

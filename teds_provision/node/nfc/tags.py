@@ -83,7 +83,7 @@ class NdefApplication:
         return self._in_application(apdu) if self._open else _NOT_ALLOWED
 
     def _in_application(self, apdu: bytes) -> bytes:
-        """Files, once the application is selected."""
+        """Answer the commands on files after the NDEF application was selected."""
         instruction = apdu[1]
         if instruction == _SELECT:
             name = _data(apdu)

@@ -283,7 +283,7 @@ def make_stream(argument: str, places: Sequence[SourceChannel], tell: Tell) -> S
 
 
 def make_socket(argument: str, places: Sequence[SourceChannel], tell: Tell) -> UnixSocket:
-    """``unix:/run/user/1000/hand.sock``."""
+    """Listen on a socket named as ``unix:/run/user/1000/hand.sock``."""
     if not argument:
         raise UsageError("unix: needs a path.", hint="Write --source unix:/tmp/hand.sock.")
     return UnixSocket(places, tell, Path(argument))

@@ -262,7 +262,7 @@ def _reply_layout(ok: bool, payload: bytes, request: Message | None) -> tuple[st
 
 
 def _layout_guessed(ok: bool, payload: bytes) -> tuple[str, str]:
-    """Layout and name by the form alone."""
+    """Guess layout and name from the octets alone."""
     if len(payload) == 12 and int.from_bytes(payload[2:6], "big") <= int.from_bytes(payload[8:12], "big"):
         return STATUS, "Reply to Query or Update TEDS"
     if len(payload) >= 4:

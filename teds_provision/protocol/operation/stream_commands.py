@@ -99,7 +99,7 @@ class SubscribeReply:
 
 
 def stop(stream: int) -> Command:
-    """Stop (128.15)."""
+    """Return the command that stops the stream (128.15)."""
     return security_command(Function.STOP, bytes([stream]))
 
 

@@ -92,7 +92,7 @@ class StreamPlan:
         return self.subscribe.n * self.subscribe.period
 
     def command(self) -> Command:
-        """Subscribe."""
+        """Return the Subscribe command."""
         return self.subscribe.command()
 
     def accept(self, payload: bytes, now: TickBounds, *, after: int = 0) -> SubscribeReply:

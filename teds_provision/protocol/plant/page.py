@@ -83,7 +83,7 @@ def open_page(octets: bytes, registry: str, find_key: Callable[[str], bytes | No
 
 
 def _heads(value: object) -> dict[str, tuple[int, str]]:
-    """Those of the heads that are of their form."""
+    """Return the heads that have the right form."""
     if not isinstance(value, dict) or len(value) > MOST_HEADS:
         return {}
     return {

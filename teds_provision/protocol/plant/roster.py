@@ -47,7 +47,7 @@ class Member:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Of its key."""
+        """Return the fingerprint of its key."""
         return fingerprint(self.point)
 
 
@@ -64,7 +64,7 @@ class RemovedMember:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Of its key."""
+        """Return the fingerprint of its key."""
         return fingerprint(self.point)
 
 

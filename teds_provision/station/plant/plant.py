@@ -193,7 +193,7 @@ class Plant:
         return self._read[1]
 
     def held_roster(self) -> RosterRow | None:
-        """Return the roster that counts."""
+        """Return the roster that this station acts by, None before the first one."""
         return self._store.read_one(_roster, "SELECT version, hash, octets, held, at, mac FROM rosters WHERE held = 1")
 
     def rosters(self) -> list[RosterRow]:

@@ -147,7 +147,7 @@ def _is_table(name: str, columns: list[str]) -> bool:
 
 
 def _pages(source: RowSource, widths: list[int]) -> Iterator[tuple[int, list[tuple[Any, ...]]]]:
-    """Give rows in pages of one table."""
+    """Yield the rows of a table in pages."""
     current, page = 0, list[tuple[Any, ...]]()
     while True:
         number, length = _HEAD.unpack(source.read(_HEAD.size))

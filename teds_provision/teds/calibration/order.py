@@ -199,7 +199,7 @@ def _multinomial(order: CalibrationOrder, channel: ChannelProfile, method: Metho
 
 
 def _input(order: CalibrationOrder, table: TomlTable, channel: ChannelProfile) -> CalibrationInput:
-    """One ``[[inputs]]`` table."""
+    """Read one ``[[inputs]]`` table."""
     inner = CalibrationOrder(order.file, table.where.line)
     for key, entry in table.entries.items():
         if isinstance(entry, TomlTable) or key not in ("channel", "key", "degree", "boundaries", "offsets"):

@@ -159,7 +159,7 @@ class McapWriter:
         self._into_chunk(records)
 
     def add_message(self, channel: int, sequence: int, time: int, data: bytes) -> None:
-        """One message."""
+        """Append one message to the present chunk."""
         head = MESSAGE_HEAD.pack(MESSAGE, 22 + len(data), channel, sequence & 0xFFFFFFFF, time, time)
         self.add_messages(channel, head + data, [time])
 

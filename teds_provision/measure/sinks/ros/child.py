@@ -78,7 +78,7 @@ class ChildSink(TopicSink):
 
     @abstractmethod
     def _environment(self) -> dict[str, str]:
-        """Return the child's environment."""
+        """Return the environment of the child process."""
 
     def _begin(self) -> None:
         self._start()

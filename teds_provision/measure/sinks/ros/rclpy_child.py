@@ -112,7 +112,7 @@ class Bridge:
         )
 
     def topic(self, line: dict[str, Any]) -> None:
-        """Advertise."""
+        """Create the publisher of a topic."""
         kind = self.type_of(line["type"])
         made = self.node.create_publisher(kind, line["topic"], self.qos(latched=line["latch"]))
         self.publishers[line["id"]] = made, kind
@@ -164,7 +164,7 @@ class Bridge:
         publisher.publish(message)
 
     def text(self, line: dict[str, Any]) -> None:
-        """Words."""
+        """Publish a text on a topic."""
         publisher, message = self.message(line)
         message.data = line["v"]
         publisher.publish(message)

@@ -205,7 +205,7 @@ class Bridge:
         publisher.publish(message)
 
     def text(self, line: dict[str, Any]) -> None:
-        """Words."""
+        """Publish a text on a topic."""
         publisher = self.publishers[line["id"]]
         publisher.publish(publisher.kind(line["v"]))
 
