@@ -345,7 +345,7 @@ class WallClock:
         return cls(offset / 1e9, width / 2e9)
 
     def unix(self, monotonic: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the present time in Unix seconds."""
+        """Return Unix seconds for monotonic ones."""
         return monotonic + self.offset
 
 

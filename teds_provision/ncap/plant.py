@@ -236,7 +236,7 @@ class PlantWatch:
                 self._stop.wait(EVERY if self._told[0] == "unreachable" else _SOON)
 
     def _publish_state(self, state: str, why: str) -> None:
-        """Log one line for each change of state."""
+        """Publish an event for each change of state."""
         if (state, why) != self._told:
             self._told = state, why
             self._live.event("registry", state=state, why=why)
