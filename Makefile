@@ -37,7 +37,7 @@ types: $(VENV)/.dev
 # Three times the cores: half of the time that a test takes is waiting for a node, a reader, a lock (4 on two cores: 47 %).
 # What holds a rule about time then runs two at a time: it waits for five sixths of its time.
 WORKERS ?= 6
-USUAL := not soak and not machine and not rclpy
+USUAL := not soak and not machine and not rclpy and not nightly
 # Of what fails, up to three tests that run other processes get a second try, alone (tests/second_try.py).
 unit: $(VENV)/.dev
 	@mkdir -p build && rm -f build/not-tested build/second-tries
@@ -297,6 +297,7 @@ docs: $(VENV)/.dev
 
 # Before a release: the gate, and what proves the same at greater length.
 test-all: test bench-short .venv-mujoco/.made
+	$(BIN)/python -m pytest -n 2 --dist worksteal -rsR --hypothesis-profile=gate -m nightly
 	$(BIN)/python -m pytest tests/release tests/plant/test_returned_pages.py tests/ncap/test_by_topics.py tests/node/test_examples.py -m soak -rs
 
 .venv-mujoco/.made:

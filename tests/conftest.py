@@ -24,6 +24,7 @@ from hypothesis import HealthCheck, settings
 from teds_provision.station.station import Station
 from tests.bench import Board, make_station
 from tests.firmware.c_node import OFFERS
+from tests.nightly import REFUSED, refusals
 from tests.passphrase_costs import lower_costs
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -86,12 +87,14 @@ def node_kind() -> str:
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Let a rule about time be held by the best of three tries, as ``best_of`` does; every try is told (``-rR``).
 
     Nothing but these is tried again: a rule that says nothing about time fails at once. What needs of a node what the
-    one in C lacks is left out there.
+    one in C lacks is left out there. What is out of the gate names a test in it that holds the same rule.
     """
+    if not any("::" in word for word in config.args):  # files are collected whole
+        config.stash[REFUSED] = refusals(items)
     items[:] = [item for item in items if not _in_c(item) or _needed(item) <= OFFERS]
     for item in items:
         if item.get_closest_marker("realtime"):

@@ -38,7 +38,7 @@ FILES = 14
 IN_C = "firmware"
 LEAST, MOST = 20.0, 90.0
 """Seconds that the tests of one mutant get, whatever the time that is left says."""
-MARKS = "not slow and not soak and not machine and not realtime"
+MARKS = "not slow and not nightly and not soak and not machine and not realtime"
 COMPILING = 90.0
 _FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+?(?:\[.*?\])?)(?: - .*)?$", re.MULTILINE)
 

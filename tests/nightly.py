@@ -1,0 +1,45 @@
+"""Hold the mark ``nightly``: its reason names a test of the gate that holds the same rule.
+
+A test moves out of the gate only if its rule is still held there, by a cheaper test. The reason begins with the id of
+that test, or with those of several: ``@pytest.mark.nightly("tests/x.py::test_y holds this rule")``. Each must be there
+and in the gate, as far as its file is among what is collected: ``make test`` collects everything.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+
+import pytest
+
+OUTSIDE = ("nightly", "soak", "machine", "rclpy")
+REFUSED = pytest.StashKey[list[str]]()
+_ID = re.compile(r"tests/[\w/]+\.py::\w+(?:\[[^\]]*\])?")
+
+
+def reasons(item: pytest.Item) -> Iterator[str]:
+    """Yield the reason of each mark ``nightly`` of a test; "" for one without."""
+    for mark in item.iter_markers("nightly"):
+        yield str(mark.args[0]) if mark.args else ""
+
+
+def refusals(items: Sequence[pytest.Item]) -> list[str]:
+    """Return what is wrong with the marks of tests that were collected, a line each.
+
+    An id without brackets stands for all cases of its test, of which one at least is in the gate.
+    """
+    files = {item.nodeid.partition("::")[0] for item in items}
+    gate = [item.nodeid for item in items if not any(item.get_closest_marker(mark) for mark in OUTSIDE)]
+    there = {*gate, *(name.partition("[")[0] for name in gate)}
+    wrong = []
+    for item in items:
+        for reason in reasons(item):
+            names = _ID.findall(reason)
+            if not names or not reason.startswith(names[0]):
+                wrong.append(f"{item.nodeid}: the reason of its mark nightly begins with no test")
+            wrong += [
+                f"{item.nodeid}: its rule is not held in the gate by {name}"
+                for name in names
+                if name not in there and name.partition("::")[0] in files
+            ]
+    return wrong
