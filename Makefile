@@ -95,6 +95,7 @@ SECONDS ?= 20
 bench-ncap: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.ncap --seconds $(SECONDS)
 	$(BIN)/python -m benchmarks.newcomers
+	$(BIN)/python -m benchmarks.crowd
 
 bench-page: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.page --seconds $(SECONDS)

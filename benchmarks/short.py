@@ -16,6 +16,7 @@ import benchmarks
 
 LEAST: dict[str, tuple[tuple[str, ...], ...]] = {
     "commands": (("--nodes", "5"),),
+    "crowd": (("--nodes", "5"),),
     "entered": ((),),
     "handover": (("20",),),
     "limits": (),

@@ -165,6 +165,11 @@ class MemoryNode:
         self._now()
         return int(self._library.memory_start(self._board))
 
+    def joins_bus(self) -> None:
+        """Its CAN controller is on the bus, after a start: it announces itself soon."""
+        self._now()
+        self._library.memory_can_start(self._board)
+
     def start_cut(self, step: int, *, torn: bool) -> int:
         """Power comes, and fails at this step of flash."""
         self._now()

@@ -34,7 +34,8 @@ _BEFORE = 3e-5
 """Seconds before the time up to which a sleep is trusted. To sleep on for nothing until then ended 10 to 15 µs late, at
 every change of direction of a bus; no other thread is held up for longer than this."""
 _LONGEST_QUEUE: Final = 10.0
-_UNTIL: Final = struct.Struct("@d")
+_UNTIL: Final = struct.Struct("@dd")
+"""When the wire is free again, and the seconds for which it was taken since it exists."""
 _THREAD = threading.local()
 _NO_BIT = 0  # before the first bit of a frame; else 1 + 4 · the last bit + (equal bits so far, 1 to 4) - 1
 
@@ -126,13 +127,18 @@ class Wire:
         with self._turn:
             fcntl.lockf(self._file, fcntl.LOCK_EX)
             try:
-                (taken,) = _UNTIL.unpack(self._shared[:])
+                taken, busy = _UNTIL.unpack(self._shared[:])
                 if taken - begin < _LONGEST_QUEUE:  # else of a clock that started again
                     begin = max(begin, taken)
-                self._shared[:] = _UNTIL.pack(begin + duration)
+                self._shared[:] = _UNTIL.pack(begin + duration, busy + duration)
             finally:
                 fcntl.lockf(self._file, fcntl.LOCK_UN)
         return begin + duration
+
+    @property
+    def busy_seconds(self) -> float:
+        """Wire time of all frames of all senders since the first of the present users came."""
+        return float(_UNTIL.unpack(self._shared[:])[1])
 
     def close(self) -> None:
         """Leave it; the last one takes the file away."""

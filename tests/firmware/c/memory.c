@@ -737,6 +737,11 @@ void memory_fixed(memory_board *board, uint8_t channel, uint8_t code, const uint
     board->config.fixed = board->fixed;
 }
 
+void memory_can_start(memory_board *board)
+{
+    teds_can_start(&board->node, board->now);
+}
+
 void memory_lost(memory_board *board, uint8_t link)
 {
     teds_node_link_lost(&board->node, link);

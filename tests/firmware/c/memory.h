@@ -115,6 +115,8 @@ int memory_put(memory_board *board, uint8_t flags, uint8_t address, uint32_t epo
                size_t length);
 /* A TEDS of the firmware, from the next start on; `octets` stay where they are. */
 void memory_fixed(memory_board *board, uint8_t channel, uint8_t code, const uint8_t *octets, uint16_t length);
+/* Its controller is on the bus; after a start. */
+void memory_can_start(memory_board *board);
 void memory_lost(memory_board *board, uint8_t link);
 void memory_move(memory_board *board, uint8_t address);
 int memory_by_hand(memory_board *board);

@@ -408,6 +408,7 @@ def test_two_senders_on_one_paced_bus_take_turns(group: str) -> None:
         thread.join()
     assert time.perf_counter() - began >= 40 * classic_bits(frame.identifier, frame.data) / 125_000
     wire = pacing.Wire(spec.wire)
+    assert wire.busy_seconds == pytest.approx(40 * classic_bits(frame.identifier, frame.data) / 125_000)
     for bus in senders:
         bus.close()
     assert wire._path.exists(), "somebody is still on it"

@@ -1,0 +1,160 @@
+"""200 nodes in C on one bus: provisioned together, then switched on together under a station that measures all.
+
+``python -m benchmarks.crowd [--nodes 200] [--only 500|FD]``: the nodes in one process (``tests/firmware/crowd.py``), a
+paced bus whose senders add up how long their frames take the wire, `provision --all` and `ncap run --measure all
+--mqtt` as a user starts them, a mosquitto on loopback. A row is the time from the start of the conversation with the
+first node until the last node has its verdict, or from power-on to the last node's first value, to the wire time of
+all frames until then. Beside it: the processor time of the station and of the nodes' one process meanwhile.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.commands import PROVISION, Rows, finished, started, station
+from benchmarks.machine import line as machine
+from benchmarks.newcomers import MOSQUITTO, Topics, until
+from teds_provision import client
+from teds_provision.links.can.pacing import Wire
+from teds_provision.links.can.spec import parse_spec
+from teds_provision.links.ports import free_port
+
+ALL_AIM, MEASURE_AIM = 1.15, {"500 kbit/s": 1.2, "FD 500k/2M": 1.5}
+_TICKS = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass
+class Nodes:
+    """The nodes' process, and their UUIDs."""
+
+    process: subprocess.Popen[str]
+    uuids: list[str]
+
+    def ask(self, word: str) -> float:
+        """Send it a word; return its processor time so far."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(word + "\n")
+        self.process.stdin.flush()
+        return float(self.process.stdout.readline())
+
+
+@contextmanager
+def crowd(link: str, count: int) -> Iterator[Nodes]:
+    """Run the nodes for the block; they have power."""
+    command = [sys.executable, "-m", "tests.firmware.crowd", link, str(count), "measuring"]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        yield Nodes(process, json.loads(process.stdout.readline()))
+    finally:
+        process.kill()
+        process.wait(20)
+
+
+def worked(pid: int) -> float:
+    """Seconds of processor time of a running process."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / _TICKS
+
+
+def provisioned(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kind: str) -> None:
+    """``provision --all``."""
+    listed = home.parent / "list.csv"
+    listed.write_text("uuid\n" + "".join(f"{uuid}\n" for uuid in nodes.uuids))
+    finished(started(home, "whitelist", "import", str(listed)))
+    time.sleep(1.0)  # Announces
+    cpu, busy = nodes.ask("cpu"), wire.busy_seconds
+    process = started(home, *PROVISION, "--all", "--via", "can", "--can", link)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    threading.Thread(target=process.stderr.read, daemon=True).start()
+    while wire.busy_seconds == busy:
+        time.sleep(0.001)
+    began, passed, own = time.monotonic(), 0, 0.0
+    for text in process.stdout:
+        passed += json.loads(text).get("verdict") == "authentic"
+        if passed == len(nodes.uuids):
+            break
+    took, taken = time.monotonic() - began, wire.busy_seconds - busy
+    own = worked(process.pid)
+    process.communicate()
+    rows.tell(f"provision --all, {passed} of {len(nodes.uuids)} nodes in C, {kind}", took, "s")
+    rows.tell("  the wire time of all frames", taken, "s")
+    rows.tell("  ratio", took / taken, "×", aim=ALL_AIM)
+    rows.tell("  processor time of the station", own, "s")
+    rows.tell("  of the nodes' one process", nodes.ask("cpu") - cpu, "s")
+
+
+def measured(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kind: str) -> None:
+    """``ncap run --measure all``, and power for all nodes at once."""
+    nodes.ask("off")
+    with ExitStack() as stack:
+
+        def process(process: subprocess.Popen[str]) -> subprocess.Popen[str]:
+            stack.callback(process.wait, 30)
+            stack.callback(process.terminate)
+            return process
+
+        port = free_port()
+        (home.parent / "broker.conf").write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\n")
+        broker = [str(MOSQUITTO), "-c", str(home.parent / "broker.conf")]
+        process(subprocess.Popen(broker, stderr=subprocess.DEVNULL, text=True))
+        words = ("ncap", "run", "--measure", "all", "--rate", "1", "--mqtt", f"mqtt://127.0.0.1:{port}")
+        ncap = process(started(home, *words, "--can", link))
+        assert ncap.stdout is not None
+        assert ncap.stderr is not None
+        ncap.stdout.readline()
+        for stream in (ncap.stdout, ncap.stderr):
+            threading.Thread(target=stream.read, daemon=True).start()
+        topics = Topics(port)
+        stack.callback(topics.close)
+        here = stack.enter_context(client.connect(home=home))
+        time.sleep(2.0)
+        cpu, own, busy, began = nodes.ask("cpu"), worked(ncap.pid), wire.busy_seconds, time.monotonic()
+        nodes.ask("on")
+        until(lambda: len(topics.first) >= len(nodes.uuids), why=f"{len(nodes.uuids)} nodes: {len(topics.first)} came")
+        took, taken = max(topics.first.values()) - began, wire.busy_seconds - busy
+        own, cpu = worked(ncap.pid) - own, nodes.ask("cpu") - cpu
+        states = [report["state"] for report in here.measurements()[0]["nodes"]]
+        rows.tell(f"{len(nodes.uuids)} switched on together, {kind}: last first value", took, "s")
+        rows.tell("  the wire time of all frames until then", taken, "s")
+        rows.tell("  ratio", took / taken, "×", aim=MEASURE_AIM[kind])
+        rows.tell("  processor time of the station", own, "s")
+        rows.tell("  of the nodes' one process", cpu, "s")
+        rows.tell("  half of them had a value after", sorted(topics.first.values())[len(nodes.uuids) // 2] - began, "s")
+        rows.tell("  running", states.count("running"), "")
+
+
+def main(words: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--nodes", type=int, default=200)
+    parser.add_argument("--only", default="", help="500 or FD")
+    options = parser.parse_args(words)
+    if MOSQUITTO is None:
+        raise SystemExit("mosquitto is not installed: apt-get install mosquitto")
+    rows = Rows()
+    for kind, more in (("500 kbit/s", ""), ("FD 500k/2M", "&fd=1")):
+        if options.only not in kind:
+            continue
+        link = f"udp_multicast:239.74.163.13?port={free_port()}{more}&pace=1"
+        wire = Wire(parse_spec(link).wire)
+        with station(quick=True) as home, crowd(link, options.nodes) as nodes:
+            provisioned(rows, home, link, nodes, wire, kind)
+            measured(rows, home, link, nodes, wire, kind)
+        wire.close()
+
+
+if __name__ == "__main__":
+    print(machine())
+    main()
