@@ -26,6 +26,7 @@ from urllib.parse import quote, urlencode, urlsplit
 
 from teds_provision.errors import EXIT_CODES, LinkError, PolicyError, TedsProvisionError, UsageError
 from teds_provision.files import short_path
+from teds_provision.shapes.problem import problem_in
 
 if TYPE_CHECKING:
     from teds_provision.api.answers import (
@@ -157,9 +158,7 @@ class Client:
             raise LinkError("The base station's answer is not valid JSON.") from error
         if status < 400:
             return value
-        told = value.get("error", {}) if isinstance(value, dict) else {}
-        message = str(told.get("message") or f"The base station answered {status}.")
-        raise ApiError(status, str(told.get("code", "failed")), message, str(told.get("hint", "")))
+        raise ApiError(status, **problem_in(value, otherwise=f"The base station answered {status}."))
 
     def _ask(
         self, method: str, path: str, body: str | bytes | None, if_match: str | None = None

@@ -10,26 +10,13 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 from teds_provision.api.bodies import Mode
 from teds_provision.shapes.measurement import MeasurementSettings
 from teds_provision.shapes.metadata import Meta
+from teds_provision.shapes.problem import Problem
 
 Uuid = Annotated[str, Meta(pattern="^[0-9a-f]{20}$", description="20 hex digits")]
 Time = Annotated[float, Meta(description="unix seconds")]
 _FirmwareOrigin = TypedDict("_FirmwareOrigin", {"from": Literal["session", "plain"]})
 _UpdateFrom = TypedDict("_UpdateFrom", {"from": Annotated[str, Meta(description="the version before")] | None})
 _Origin = TypedDict("_Origin", {"from": Literal["session", "kept", "plain"]})  # a keyword of Python
-
-
-class Problem(TypedDict):
-    """An error and its remedy."""
-
-    code: str
-    message: str
-    hint: str
-
-
-class Error(TypedDict):
-    """A refusal."""
-
-    error: Problem
 
 
 class Check(TypedDict):

@@ -8,6 +8,7 @@ from typing import Any, Final
 from teds_provision import __version__
 from teds_provision.api import answers, bodies
 from teds_provision.api.schema import Schema, schema_of
+from teds_provision.shapes.problem import Error
 
 API: Final = "/api/v1"
 MOST_NODES: Final = 1000
@@ -171,7 +172,7 @@ def document() -> dict[str, Any]:
     paths: dict[str, dict[str, Any]] = {}
     for operation in OPERATIONS:
         paths.setdefault(operation.path, {})[operation.method.lower()] = _operation(operation, named)
-    error = schema_of(answers.Error, named)
+    error = schema_of(Error, named)
     return {
         "openapi": "3.1.0",
         "info": {

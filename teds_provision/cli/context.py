@@ -25,6 +25,7 @@ from teds_provision.errors import (
 )
 from teds_provision.lazy import late
 from teds_provision.sanitize import sanitize, sanitize_json
+from teds_provision.shapes.problem import problem_of
 
 if TYPE_CHECKING:
     import json
@@ -135,8 +136,7 @@ class App:
             if error is not None:
                 raise error
             return
-        told = {"code": error.code, "message": error.message, "hint": error.hint}
-        self.emit({**result, "error": told})
+        self.emit({**result, "error": problem_of(error)})
         raise click.exceptions.Exit(error.exit_code)
 
     def console(self, *, stderr: bool = False) -> Console:
@@ -164,8 +164,7 @@ class App:
         self.live_line()
         known = {name: value for name, value in of.items() if value is not None}
         if self.json:
-            told = {"code": error.code, "message": error.message, "hint": error.hint}
-            print(to_json({**known, "error": told}), flush=True)
+            print(to_json({**known, "error": problem_of(error)}), flush=True)
         else:
             where = ", ".join(f"row {value}" if name == "row" else str(value) for name, value in known.items())
             at = f" ({where})" if where else ""

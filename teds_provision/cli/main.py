@@ -25,6 +25,7 @@ from teds_provision.errors import (
     TedsProvisionError,
 )
 from teds_provision.lazy import install_command, late, missing_packages, package_of
+from teds_provision.shapes.problem import Error, Problem
 
 if TYPE_CHECKING:
     import difflib
@@ -322,7 +323,7 @@ def _fail(arguments: list[str], exit_code: int, code: str, message: str, hint: s
         App.current.live_line()  # removes it before any other output
     if _wants(arguments, "--json"):
         with contextlib.suppress(OSError):
-            print(json.dumps({"error": {"code": code, "message": message, "hint": hint}}), flush=True)
+            print(json.dumps(Error(error=Problem(code=code, message=message, hint=hint))), flush=True)
     else:
         _print_message(message if exit_code == INTERRUPTED else f"Error: {message}")
         if hint:

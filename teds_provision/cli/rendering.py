@@ -16,6 +16,7 @@ import click
 from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.provisioning.progress import FAILED, NOTHING, SKIPPED, Reporter, SilentReporter, StepResult
 from teds_provision.sanitize import sanitize
+from teds_provision.shapes.problem import problem_of
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -94,7 +95,7 @@ def print_json_list(name: str, entries: Iterable[dict[str, Any]]) -> None:
             out.write(f", {encode(entry)}" if number else encode(entry))
     except TedsProvisionError as error:
         failed = error
-    told = {"code": failed.code, "message": failed.message, "hint": failed.hint} if failed is not None else None
+    told = problem_of(failed) if failed is not None else None
     out.write(f'], "error": {encode(told)}}}\n' if told is not None else "]}\n")
     out.flush()
     if failed is not None:

@@ -16,14 +16,15 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from teds_provision import client, vault
 from teds_provision.errors import LinkError, TedsProvisionError
 from teds_provision.links.ports import free_port
+from teds_provision.shapes.problem import problem_in
 from teds_provision.station.station import initialise
 
 RATE: Final = 50.0
@@ -135,8 +136,8 @@ def _run(*words: str) -> None:
 
 def _failure(said: bytes) -> TedsProvisionError:
     """Return the error of a child process, from its line of JSON."""
-    try:
-        error: dict[str, Any] = json.loads(said)["error"]
-        return TedsProvisionError(str(error["message"]), hint=str(error["hint"]))
-    except (ValueError, KeyError, TypeError):
-        return TedsProvisionError("The base station of the demo did not start.")
+    body: object = None
+    with suppress(ValueError):
+        body = json.loads(said)
+    problem = problem_in(body, otherwise="The base station of the demo did not start.")
+    return TedsProvisionError(problem["message"], hint=problem["hint"])

@@ -16,7 +16,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -42,6 +42,7 @@ from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.provisioning.teds_read import read_image
 from teds_provision.provisioning.verify import require_authentic
 from teds_provision.provisioning.verify_node import verify_node
+from teds_provision.shapes.problem import problem_in
 from teds_provision.station.station import Station, initialise
 from teds_provision.station.store import TrustRecord
 
@@ -366,8 +367,8 @@ def _ready(process: subprocess.Popen[str]) -> bytes:
 
 def _failure(what: str, said: str) -> LinkError:
     """Return the error from a node process's stdout: an error as JSON, or nothing readable."""
-    try:
-        error = json.loads(said)["error"]
-        return LinkError(f"{what}: {error['message']}", hint=error["hint"])
-    except (ValueError, KeyError, TypeError):
-        return LinkError(f"{what}: {said.strip() or 'no answer'}")
+    body: object = None
+    with suppress(ValueError):
+        body = json.loads(said)
+    problem = problem_in(body, otherwise=said.strip() or "no answer")
+    return LinkError(f"{what}: {problem['message']}", hint=problem["hint"])

@@ -35,6 +35,7 @@ from teds_provision.measure.running import trigger
 from teds_provision.measure.running.common_start import TOGETHER, CommonStart
 from teds_provision.measure.sinks import Sink
 from teds_provision.measure.verified_session import VerifiedSession
+from teds_provision.shapes.problem import failure_of
 from teds_provision.station.station import Station
 
 BEAT = 0.02  # seconds between rows of the group
@@ -400,7 +401,7 @@ def _summary(keeper: NodeSupervisor) -> dict[str, Any]:
     ]
     node: dict[str, Any] = {"uuid": keeper.uuid.hex(), "streams": streams}
     if keeper.error is not None:
-        node["error"] = {"code": keeper.error.code, "message": keeper.error.message}
+        node["error"] = failure_of(keeper.error)
     return node
 
 

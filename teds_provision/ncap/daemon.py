@@ -44,6 +44,7 @@ from teds_provision.ncap.waits import USUAL, Waits
 from teds_provision.ncap.web.tokens import Tokens
 from teds_provision.provisioning.commands import locate_here, locate_measured
 from teds_provision.provisioning.conversation import Conversation
+from teds_provision.shapes.problem import Problem, problem_of
 from teds_provision.station.station import Station
 
 _log = logging.getLogger(__name__)
@@ -133,7 +134,7 @@ class Daemon:
         self._ends: Callable[[], None] = lambda: None
         self.started = time.time()
         self._version = station.version()
-        self._vault_problem: dict[str, str] | None = None
+        self._vault_problem: Problem | None = None
         self._stop = threading.Event()
         self._guard = threading.Lock()
         source = own_source(station.id)
@@ -259,11 +260,11 @@ class Daemon:
 
     def _look_at_vault(self) -> None:
         """Report when another command locks this process out of the vault, and when it is open again."""
-        problem: dict[str, str] | None = None
+        problem: Problem | None = None
         try:
             self.station.current_vault()
         except VaultError as failure:
-            problem = {"code": failure.code, "message": failure.message, "hint": failure.hint}
+            problem = problem_of(failure)
         if (problem is None) == (self._vault_problem is None):
             return
         self._vault_problem = problem

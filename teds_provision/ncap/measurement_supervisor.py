@@ -39,12 +39,12 @@ from teds_provision.measure.verified_session import DEAD_MAN, VerifiedSession
 from teds_provision.ncap.dynamic_membership import DynamicMembership
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.directory import NodeDirectory
-from teds_provision.ncap.nodes.inspection import as_problem
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
 from teds_provision.ncap.sinks import DaemonSinks, sink_json
 from teds_provision.ncap.waits import USUAL, Waits
 from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.shapes.measurement import MeasurementSpec
+from teds_provision.shapes.problem import problem_of
 from teds_provision.station.station import Station
 from teds_provision.station.store import KeptMeasurement
 from teds_provision.teds.image import Image
@@ -800,7 +800,7 @@ class MeasurementSupervisor:
             if before.get("state") != "running":
                 facts |= {"heard": None, "looked": time.time()}  # in a session: what it sent outside one is obsolete
         elif changed and said.state in ("lost", "refused", "waiting") and said.why and self._is_of(said.uuid, running):
-            facts["problem"] = as_problem(TedsProvisionError(said.why))
+            facts["problem"] = problem_of(TedsProvisionError(said.why))
         if changed:
             self._directory.refresh([said.uuid])
         self._directory.note(said.uuid, said.state if changed else None, **facts)

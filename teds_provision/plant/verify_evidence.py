@@ -19,6 +19,7 @@ from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.document import ROSTER
 from teds_provision.protocol.plant.evidence import CheckedEvidence, Evidence, Signatures
 from teds_provision.protocol.plant.roster import Roster, open_roster
+from teds_provision.shapes.problem import failure_of
 from teds_provision.teds.codec import security
 
 if TYPE_CHECKING:
@@ -144,7 +145,7 @@ class JudgedEvidence:
                 "finished": self.evidence.finished,
             }
         if self.error is not None:
-            told["error"] = {"code": self.error.code, "message": self.error.message}
+            told["error"] = failure_of(self.error)
         return told
 
 

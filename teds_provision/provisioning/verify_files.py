@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +22,7 @@ from teds_provision.provisioning.verify import (
     snapshot_trust,
     verify_images,
 )
+from teds_provision.shapes.problem import Failure, failure_of
 from teds_provision.station.station import Station
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
@@ -44,16 +45,15 @@ class FileVerdict:
     checks: tuple[Check, ...] = ()
     warnings: tuple[str, ...] = ()
     exit_code: int = 0
-    code: str = ""
-    error: str = ""
+    error: Failure | None = None
 
     def to_json(self) -> dict[str, object]:
         """One line of the result."""
         out: dict[str, object] = {"file": str(self.path), "uuid": self.uuid, "scope": "image", "verdict": self.verdict}
         out["checks"] = [{"name": check.name, "result": check.result, "why": check.why} for check in self.checks]
         out["warnings"] = list(self.warnings)
-        if self.error:
-            out["error"] = {"code": self.code, "message": self.error}
+        if self.error is not None:
+            out["error"] = self.error
         return out
 
 
@@ -172,7 +172,7 @@ def _judged(judging: TrustSource, some: Sequence[_Read]) -> Iterator[FileVerdict
         if isinstance(image, Image):
             yield _verdict(path, image, next(checks))
         else:
-            yield FileVerdict(path, exit_code=image.exit_code, code=image.code, error=image.message)
+            yield FileVerdict(path, exit_code=image.exit_code, error=failure_of(image))
 
 
 def _verdict(path: Path, image: Image, checks: Sequence[Check]) -> FileVerdict:
@@ -197,13 +197,4 @@ def _with_warnings(result: FileVerdict, image: Image) -> FileVerdict:
 
 
 def _ended(result: FileVerdict, error: TedsProvisionError) -> FileVerdict:
-    return FileVerdict(
-        result.path,
-        result.uuid,
-        result.verdict,
-        result.checks,
-        result.warnings,
-        error.exit_code,
-        error.code,
-        error.message,
-    )
+    return replace(result, exit_code=error.exit_code, error=failure_of(error))

@@ -25,6 +25,7 @@ from teds_provision.lazy import late
 from teds_provision.links import LinkSettings
 from teds_provision.provisioning.progress import Reporter, StepResult
 from teds_provision.sanitize import sanitize
+from teds_provision.shapes.problem import problem_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -357,7 +358,7 @@ def _tell_board(app: App, board: BoardResult, *, warn: bool = True, **line: Any)
     if board.done is not None:
         failure = board.failure
         if failure is not None:  # an authentic board can fail: its type requires a calibration, a channel read nothing
-            line["failure"] = {"code": failure.code, "message": failure.message, "hint": failure.hint}
+            line["failure"] = problem_of(failure)
         seconds = round(board.seconds, 3)
         _print_result(app, board.done, warn=warn, row=board.row, time=board.time, seconds=seconds, **line)
         if board.failure is not None and not app.json:
@@ -416,8 +417,7 @@ def _tell_totals(app: App, boards: BatchRun) -> None:
     }
     result: dict[str, Any] = {"totals": told}
     if totals.error is not None:
-        error = totals.error
-        result["error"] = {"code": error.code, "message": error.message, "hint": error.hint}
+        result["error"] = problem_of(totals.error)
     share = "" if totals.first_pass is None else f", {totals.first_pass:.1%} at the first attempt"
     steps = "".join(f"\n  {name:<11} {seconds:6.2f} s" for name, seconds in totals.steps.items())
     counts = f"{totals.passed} passed, {totals.failed} failed, {totals.skipped} skipped"

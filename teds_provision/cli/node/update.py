@@ -28,6 +28,7 @@ from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import UsageError, WrongImageError
 from teds_provision.links import LinkSettings
 from teds_provision.provisioning.progress import NodeReporter, Reporter, SilentReporter
+from teds_provision.shapes.problem import problem_of
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -234,8 +235,7 @@ def _to_json(board: BoardUpdate, order: UpdateOrder) -> dict[str, Any]:
         "result": board.result,
     }
     if board.error is not None:
-        error = board.error
-        told["error"] = {"code": error.code, "message": error.message, "hint": error.hint}
+        told["error"] = problem_of(board.error)
     return told
 
 

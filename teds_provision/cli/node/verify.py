@@ -136,7 +136,7 @@ def verify_many(app: App, what: Sequence[str]) -> None:
 
 
 def _line(found: FileVerdict) -> str:
-    why = found.error or ("; ".join(found.warnings) if found.warnings else "")
+    why = found.error["message"] if found.error is not None else "; ".join(found.warnings)
     text = f"{found.verdict or 'unreadable':<13}  {found.uuid or '-':<20}  {found.path}"
     return printable(f"{text}: {why}" if why else text)
 

@@ -23,6 +23,7 @@ from teds_provision.ncap.sinks import for_readers
 from teds_provision.provisioning.inventory import with_verdicts
 from teds_provision.provisioning.readings import NodeVerdict
 from teds_provision.sanitize import by_name
+from teds_provision.shapes.problem import Problem
 from teds_provision.station.overview import Search
 from teds_provision.station.shown_units import shown_units, units_of_profile
 from teds_provision.station.station import Station
@@ -49,7 +50,7 @@ class NodePresence:
     says: str | None = None  # its state by a plain Identify: a hint, for who is not known
     heard: dict[str, Any] | None = None  # the verdict on what it last said in no session: shown beside, never instead
     looked: float = 0.0
-    problem: dict[str, str] | None = None
+    problem: Problem | None = None
     power: dict[str, Any] | None = None
     firmware: dict[str, Any] | None = None  # what it reported in no session; what is stored goes before it
     measurement: str | None = None

@@ -10,7 +10,7 @@ import time
 from dataclasses import dataclass
 from typing import Any, Final
 
-from teds_provision.errors import BadDataError, NodeRefusedError, TedsProvisionError
+from teds_provision.errors import BadDataError, NodeRefusedError
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.operation.commands import POWER, PowerReply
 from teds_provision.provisioning.agree import session_if_keyed
@@ -106,8 +106,3 @@ def power_of(node: Conversation) -> dict[str, Any] | None:
         return PowerReply.decode(node.request(POWER, "to tell its power")).as_json()
     except (NodeRefusedError, BadDataError):
         return None
-
-
-def as_problem(error: TedsProvisionError) -> dict[str, str]:
-    """Return an error as in the API."""
-    return {"code": error.code, "message": error.message, "hint": error.hint}

@@ -25,11 +25,12 @@ from teds_provision.measure.sources import sole_user
 from teds_provision.measure.standing import is_listed
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.directory import NodeDirectory
-from teds_provision.ncap.nodes.inspection import NodeInspection, as_problem, look, read_anew
+from teds_provision.ncap.nodes.inspection import NodeInspection, look, read_anew
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
 from teds_provision.ncap.waits import USUAL, Waits
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
+from teds_provision.shapes.problem import Problem, problem_of
 from teds_provision.station.station import Station
 
 # Whether a node that was seen on a bus is still there: it is asked itself, twice, before it is said to have left.
@@ -106,7 +107,7 @@ class LinkState:
 
     place: str
     state: str = "opening"
-    problem: dict[str, str] | None = None
+    problem: Problem | None = None
     waiting: str = ""
     since: float = field(default_factory=time.time)
     told: str = ""
@@ -337,7 +338,7 @@ class LinkWatch:
             self._live.event("link", place=self.place, state=notice.kind, text=notice.text)
 
     def _publish_state(self, state: str, error: TedsProvisionError | None = None) -> None:
-        problem = as_problem(error) if error is not None else None
+        problem = problem_of(error) if error is not None else None
         if (self.state.state, self.state.problem) != (state, problem):
             self.state.state, self.state.problem, self.state.since = state, problem, time.time()
             self._live.event("link", place=self.place, state=state, problem=problem)
@@ -398,15 +399,15 @@ class LinkWatch:
                 self._looked_for.add(uuid)
             return
         except NodeBusyError as error:
-            self._directory.note(uuid, problem=as_problem(error))
+            self._directory.note(uuid, problem=problem_of(error))
         except SessionLostError as lost:
-            self._directory.note(uuid, "problem", problem=as_problem(lost.cause))
+            self._directory.note(uuid, "problem", problem=problem_of(lost.cause))
         except TedsProvisionError as error:
-            self._directory.note(uuid, "problem", problem=as_problem(error))
+            self._directory.note(uuid, "problem", problem=problem_of(error))
         except Exception:  # noqa: BLE001 - a worker has no caller to raise to
             _log.exception("Looking at node %s failed.", uuid)
             self._directory.note(
-                uuid, "problem", problem=as_problem(TedsProvisionError("Unexpected failure: see the log."))
+                uuid, "problem", problem=problem_of(TedsProvisionError("Unexpected failure: see the log."))
             )
         finally:
             with self._guard:

@@ -28,7 +28,7 @@ from teds_provision.errors import (
 from teds_provision.links.ports import Notice
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.directory import NodeDirectory
-from teds_provision.ncap.nodes.inspection import STRANGERS_TEDS, as_problem
+from teds_provision.ncap.nodes.inspection import STRANGERS_TEDS
 from teds_provision.ncap.nodes.node_jobs import NodeJob, NodeJobs, as_program_error
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.protocol.messages.frames import Reason
@@ -44,6 +44,7 @@ from teds_provision.provisioning.progress import SilentReporter, StepResult
 from teds_provision.provisioning.provision import ProvisionResult, new_whitelist_entry, provision
 from teds_provision.provisioning.teds_read import list_blocks
 from teds_provision.provisioning.verify import Verification, require_authentic
+from teds_provision.shapes.problem import Problem, problem_of
 from teds_provision.station.station import Station
 from teds_provision.station.store.audit import ACTOR
 
@@ -62,7 +63,7 @@ class ProvisioningRun:
     waits_for: str | None = None
     until: float | None = None
     steps: list[dict[str, Any]] = field(default_factory=list)
-    error: dict[str, str] | None = None
+    error: Problem | None = None
     verdict: str | None = None
     job: NodeJob[Any] | None = None
 
@@ -194,16 +195,16 @@ class Provisioning:
 
         def watch() -> None:
             if not errand.done.wait(WAITING) and self._node_jobs.cancel(errand):
-                problem = {
-                    "code": "no-node",
-                    "message": f"Node {run.uuid} was not placed on a reader within {WAITING:.0f} s.",
-                    "hint": "Try again, and hold its NFC antenna flat on the reader.",
-                }
+                problem = Problem(
+                    code="no-node",
+                    message=f"Node {run.uuid} was not placed on a reader within {WAITING:.0f} s.",
+                    hint="Try again, and hold its NFC antenna flat on the reader.",
+                )
                 self._fail(run, problem)
             else:
                 errand.done.wait()
                 if errand.error is not None:
-                    self._fail(run, as_problem(errand.error))
+                    self._fail(run, problem_of(errand.error))
             clean()
 
         threading.Thread(target=watch, name=f"provision {run.uuid[:8]}", daemon=True).start()
@@ -217,17 +218,17 @@ class Provisioning:
             clean()
         except NodeRefusedError as refusal:
             if refusal.reason != Reason.NOT_PERMITTED:
-                self._fail(run, as_problem(refusal))
+                self._fail(run, problem_of(refusal))
                 clean()
                 return
             run.steps.clear()  # this node takes a key at a reader alone
             self._wait_for_a_tap(run, work, clean)
         except TedsProvisionError as error:
-            self._fail(run, as_problem(error))
+            self._fail(run, problem_of(error))
             clean()
         except Exception as error:  # noqa: BLE001 - a thread that ends without a word leaves a run that never ends
             _log.exception("Provisioning node %s failed.", run.uuid)
-            self._fail(run, as_problem(as_program_error(error)))
+            self._fail(run, problem_of(as_program_error(error)))
             clean()
 
     def _work(self, run: ProvisioningRun, node: Conversation, order: BuildOrder) -> None:
@@ -254,7 +255,7 @@ class Provisioning:
         run.state = "done"  # last: who hears it asks for the node next
         self._publish(run)
 
-    def _fail(self, run: ProvisioningRun, error: dict[str, str]) -> None:
+    def _fail(self, run: ProvisioningRun, error: Problem) -> None:
         run.state, run.error, run.waits_for, run.until = "failed", error, None, None
         self._publish(run)
 
@@ -402,7 +403,7 @@ class AutoProvisioner:
             )
         except (BadDataError, PolicyError) as error:
             self._refused[uuid] = error
-            self._live.event("node", uuid=uuid, state="not adopted", problem=as_problem(error))
+            self._live.event("node", uuid=uuid, state="not adopted", problem=problem_of(error))
             return False
         self._directory.show_sheet(uuid, None)
         self._directory.refresh([uuid])

@@ -20,6 +20,7 @@ from teds_provision.errors import BadDataError, StoreError, TedsProvisionError
 from teds_provision.files import private_folder, read_limited, write_whole
 from teds_provision.firmware_image import FirmwareImage, read_firmware_image
 from teds_provision.provisioning.update import RESULTS
+from teds_provision.shapes.problem import Problem
 
 _log = logging.getLogger(__name__)
 FOLDER: Final = "updates"
@@ -45,7 +46,7 @@ class BoardRow:
     step: str | None = None
     written: int = 0
     result: str | None = None
-    error: dict[str, str] | None = None
+    error: Problem | None = None
 
     def as_json(self, to: str) -> dict[str, Any]:
         """Return the row as the API shows it."""

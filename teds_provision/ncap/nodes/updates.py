@@ -36,7 +36,6 @@ from teds_provision.links.ports import Notice
 from teds_provision.measure.verified_session import VerifiedSession
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.directory import NodeDirectory
-from teds_provision.ncap.nodes.inspection import as_problem
 from teds_provision.ncap.nodes.node_jobs import NodeLocks, as_program_error
 from teds_provision.ncap.nodes.update_actions import (
     KEPT,
@@ -60,6 +59,7 @@ from teds_provision.provisioning.update import (
     update_at,
     version_of,
 )
+from teds_provision.shapes.problem import problem_of
 from teds_provision.station.station import Station
 from teds_provision.station.store.audit import ACTOR
 
@@ -121,7 +121,7 @@ class Updates:
             except TedsProvisionError as error:
                 for row in running[0].rows.values():
                     if row.result is None:
-                        row.state, row.result, row.error = "ended", "refused", as_problem(error)
+                        row.state, row.result, row.error = "ended", "refused", problem_of(error)
                 self._end(running[0], "stopped")
             else:
                 self._begin(running[0], image)
@@ -378,7 +378,7 @@ class Updates:
     def _put_end(row: BoardRow, done: BoardUpdate) -> None:
         row.before = done.before or row.before
         row.octets, row.seconds, row.result = done.octets, done.seconds, done.result
-        row.error = None if done.error is None else as_problem(done.error)
+        row.error = None if done.error is None else problem_of(done.error)
         row.step = None
         if row.state != "planned":
             row.state = "ended"

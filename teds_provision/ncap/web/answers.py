@@ -31,6 +31,7 @@ from teds_provision.errors import (
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.guard import CALLER, Caller, RequestRefusedError
 from teds_provision.protocol.messages.frames import Reason
+from teds_provision.shapes.problem import Error, Problem, problem_of
 
 Shape = TypeVar("Shape")
 _Words = ParamSpec("_Words")
@@ -65,7 +66,7 @@ def status_of(error: TedsProvisionError) -> int:
 def answer_error(request: Request, error: Exception) -> Response:
     """Return a TedsProvisionError as an answer, with the message of the command line."""
     assert isinstance(error, TedsProvisionError)
-    problem = {"code": error.code, "message": error.message, "hint": error.hint}
+    problem = problem_of(error)
     caller: Caller = request.scope[CALLER]
     return JSONResponse({"error": for_readers(problem) if caller.read_only else problem}, status_of(error))
 
@@ -73,14 +74,14 @@ def answer_error(request: Request, error: Exception) -> Response:
 def answer_refusal(_request: Request, refusal: Exception) -> Response:
     """Return a Refusal from within a route (a body that is too long, or does not match its schema)."""
     assert isinstance(refusal, RequestRefusedError)
-    error = {"code": refusal.code, "message": refusal.message, "hint": refusal.hint}
-    return JSONResponse({"error": error}, refusal.status)
+    return JSONResponse(Error(error=problem_of(refusal)), refusal.status)
 
 
 def answer_bug(_request: Request, error: Exception) -> Response:
     """Whatever else escapes is a bug; the client learns only its type."""
     message = f"Unexpected {type(error).__name__}."
-    return JSONResponse({"error": {"code": "bug", "message": message, "hint": "See the daemon's log."}}, 500)
+    problem = Problem(code="bug", message=message, hint="See the daemon's log.")
+    return JSONResponse(Error(error=problem), 500)
 
 
 async def body_of(request: Request, shape: type[Shape]) -> Shape:

@@ -27,6 +27,7 @@ from teds_provision.ncap.web.clause12 import Clause12
 from teds_provision.ncap.web.guard import CALLER, SAFE, Caller, RequestRefusedError
 from teds_provision.ncap.web.resources import Resources
 from teds_provision.ncap.web.tokens import Tokens
+from teds_provision.shapes.problem import Error, Problem
 
 PAGE: Final = Path(__file__).parent.parent / "page"
 MOST_LISTENERS: Final = 200
@@ -104,13 +105,13 @@ class _Page(StaticFiles):
 
 
 def _no_page(_request: Request, _error: Exception) -> Response:
-    error = {"code": "not-found", "message": "Page not found.", "hint": "See /api/v1/openapi.json."}
-    return JSONResponse({"error": error}, 404)
+    problem = Problem(code="not-found", message="Page not found.", hint="See /api/v1/openapi.json.")
+    return JSONResponse(Error(error=problem), 404)
 
 
 def _no_method(request: Request, error: Exception) -> Response:
-    told = {"code": "usage", "message": f"{request.method} is not allowed for this resource.", "hint": ""}
-    return JSONResponse({"error": told}, 405, headers=getattr(error, "headers", None))
+    problem = Problem(code="usage", message=f"{request.method} is not allowed for this resource.", hint="")
+    return JSONResponse(Error(error=problem), 405, headers=getattr(error, "headers", None))
 
 
 async def _nothing(_request: Request) -> Response:

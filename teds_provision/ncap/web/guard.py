@@ -22,6 +22,7 @@ from teds_provision.api.operations import API, LARGEST_IMAGE
 from teds_provision.errors import StoreError
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.tokens import Tokens
+from teds_provision.shapes.problem import Error, problem_of
 from teds_provision.station.store.audit import ACTOR, by_token
 
 Scope = MutableMapping[str, Any]
@@ -214,8 +215,7 @@ class Guard:
 
 def _unreadable(failure: StoreError) -> RequestRefusedError:
     """Return the refusal if the file of the tokens cannot be read; it names no folder."""
-    told = for_readers({"message": failure.message, "hint": failure.hint})
-    return RequestRefusedError(503, failure.code, told["message"], told["hint"])
+    return RequestRefusedError(503, failure.code, for_readers(failure.message), for_readers(failure.hint))
 
 
 def _headers(scope: Scope) -> dict[str, str]:
@@ -328,8 +328,8 @@ async def _refuse(scope: Scope, send: Send, refusal: RequestRefusedError, *, as_
         text += f"<p>{html.escape(refusal.message)}<p>{html.escape(refusal.hint)}"
         body, kind = text.encode(), b"text/html; charset=utf-8"
     else:
-        told = {"code": refusal.code, "message": refusal.message, "hint": refusal.hint}
-        body, kind = json.dumps({"error": told}).encode() if refusal.code else b"", b"application/json"
+        body = json.dumps(Error(error=problem_of(refusal))).encode() if refusal.code else b""
+        kind = b"application/json"
     headers = [(b"content-type", kind), (b"content-length", str(len(body)).encode()), *refusal.headers]
     if refusal.status == 413:
         headers.append((b"connection", b"close"))
