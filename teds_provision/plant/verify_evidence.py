@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +17,7 @@ from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.document import ROSTER
 from teds_provision.protocol.plant.evidence import CheckedEvidence, Evidence, Signatures
 from teds_provision.protocol.plant.roster import Roster, open_roster
+from teds_provision.provisioning.forked_workers import map_ranges
 from teds_provision.shapes.problem import failure_of
 from teds_provision.teds.codec import security
 
@@ -194,9 +193,8 @@ def verify_evidence(
         return
     yield work.judge(range(1))  # what is loaded late is there before there are more processes
     size = min(_CHUNK, max(1, (len(files) - 1) // (4 * workers)))
-    context = multiprocessing.get_context("fork")  # what is judged by is simply there
-    with context.Pool(workers, initializer=_init_worker, initargs=(work,)) as pool:
-        yield from pool.imap(_judge_chunk, (range(at, min(at + size, len(files))) for at in range(1, len(files), size)))
+    ranges = [range(at, min(at + size, len(files))) for at in range(1, len(files), size)]
+    yield from map_ranges(work.judge, ranges, workers)
 
 
 @dataclass(frozen=True)
@@ -211,21 +209,6 @@ class _Work:
             totals.add(judged)
             lines.append(self.tell(judged))
         return lines, totals
-
-
-_work: _Work | None = None
-
-
-def _init_worker(work: _Work) -> None:
-    global _work  # noqa: PLW0603 - set once, in a separate process
-    _work = work
-    gc.freeze()
-    gc.disable()  # documents are trees: their count of references alone frees them, a tenth of the time sooner
-
-
-def _judge_chunk(places: range) -> tuple[list[str], EvidenceTotals]:
-    assert _work is not None
-    return _work.judge(places)
 
 
 def judge_file(grounds: EvidenceAnchors, path: Path) -> JudgedEvidence:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +12,7 @@ from teds_provision.errors import BadDataError, PolicyError, TedsProvisionError
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
 from teds_provision.portable import cores_to_share
+from teds_provision.provisioning.forked_workers import map_ranges
 from teds_provision.provisioning.verify import (
     Check,
     TrustSource,
@@ -107,9 +106,9 @@ def verify_files(
         return
     yield work.judge(range(1))  # what is loaded late is there before there are more processes
     size = min(_CHUNK, max(1, (len(files) - 1) // (4 * workers)))
-    context = multiprocessing.get_context("fork")  # what is remembered is simply there
-    with context.Pool(workers, initializer=_init_worker, initargs=(work,)) as pool:
-        yield from pool.imap(_judge_chunk, (range(at, min(at + size, len(files))) for at in range(1, len(files), size)))
+    yield from map_ranges(
+        work.judge, [range(at, min(at + size, len(files))) for at in range(1, len(files), size)], workers
+    )
 
 
 @dataclass(frozen=True)
@@ -128,20 +127,6 @@ class _Work:
                 totals.add(found)
                 lines.append(self.tell(found))
         return lines, totals
-
-
-_work: _Work | None = None
-
-
-def _init_worker(work: _Work) -> None:
-    global _work  # noqa: PLW0603 - set once, in a separate process
-    _work = work
-    gc.freeze()  # the whole program is there before the first image: not looked through again for each few of them
-
-
-def _judge_chunk(places: range) -> tuple[list[str], VerdictTotals]:
-    assert _work is not None
-    return _work.judge(places)
 
 
 _Read = tuple[Path, Image | TedsProvisionError]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import json
+import os
+import signal
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -15,9 +17,11 @@ from in_toto_attestation.v1.statement import Statement
 from securesystemslib.dsse import Envelope
 from securesystemslib.signer import SSlibKey
 
+from teds_provision.cli.plant import line as line_command
 from teds_provision.errors import BadDataError, NodeSilentError, NotAuthenticError, TedsProvisionError
 from teds_provision.plant.evidence import sign_evidence
 from teds_provision.plant.line import _firmware_in_session
+from teds_provision.plant.verify_evidence import JudgedEvidence
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
 from teds_provision.protocol.messages.firmware import FirmwareReport
 from teds_provision.protocol.plant import evidence as codec
@@ -225,6 +229,31 @@ def test_evidence_verify_needs_nothing_but_files(tmp_path: Path, station: Statio
     done = call(none, "evidence", "verify", good.parent, "--ca", ca, passphrase=None)
     assert done.code == 4
     assert done.out.splitlines()[-1] == "3 files: 1 not authentic, 1 passed, 1 unreadable."
+
+
+def test_a_process_that_is_killed_ends_evidence_verify_with_an_error(
+    tmp_path: Path, station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    document, whole, here = evidence_of(station, board), line_command._json, os.getpid()
+    (tmp_path / "evidence").mkdir()
+    for number in range(200):
+        (tmp_path / "evidence" / f"{number:03}.json").write_bytes(document)
+    ca = tmp_path / "ca.pem"
+    ca.write_text(to_pem(station.identity.ca))
+    alone = call(tmp_path, "--json", "evidence", "verify", tmp_path / "evidence", "--ca", ca, passphrase=None)
+    assert json.loads(alone.out.splitlines()[-1]) == {"totals": {"files": 200, "passed": 200}}
+    assert [json.loads(line)["file"][-8:-5] for line in alone.out.splitlines()[:-1]] == [f"{n:03}" for n in range(200)]
+
+    def killed(judged: JudgedEvidence) -> str:
+        if judged.path.name == "100.json" and os.getpid() != here:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return whole(judged)
+
+    monkeypatch.setattr(line_command, "_json", killed)
+    done = call(tmp_path, "--json", "evidence", "verify", tmp_path / "evidence", "--ca", ca, passphrase=None)
+    error = json.loads(done.out.splitlines()[-1])["error"]
+    assert (done.code, error["code"]) == (1, "failed")
+    assert "ended by signal 9" in error["message"]
 
 
 def test_pins_say_which_board_it_must_have_been(tmp_path: Path, station: Station, board: Board) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.cli.node import verify as verify_command
+from teds_provision.cli.stdout import BROKEN_PIPE
 from teds_provision.errors import NotFoundError
 from teds_provision.files import json_files
 from teds_provision.protocol import datasheet
@@ -20,7 +24,8 @@ from teds_provision.teds.calibration import Calibration, CalibrationInput
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
-from tests.cli.shell import call, spawn
+from tests.cli.shell import PROGRAM, ROOT, call, clean_environment, spawn
+from tests.pace import PATIENCE
 
 CA, STATION = (SoftwareKey.from_secret(number.to_bytes(32, "big")) for number in (5, 6))
 PASSPHRASE = "a passphrase of the tests"
@@ -145,6 +150,44 @@ def test_the_same_verdicts_come_from_one_process_and_from_several(
     together = call(home, "--json", "verify", folder).out
     assert together == alone
     assert call(home, "--json", "verify", folder / "1.json").json["checks"] == lines(alone)[1]["checks"]
+
+
+def test_a_process_that_is_killed_ends_the_command_with_an_error(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a pool the command waited for ever for what that process had."""
+    image, whole, here = signed(1), verify_command._json, os.getpid()
+    for number in range(200):
+        write(tmp_path / "images", f"{number:03}.json", image)
+
+    def killed(found: FileVerdict) -> str:
+        if found.path.name == "100.json" and os.getpid() != here:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return whole(found)
+
+    monkeypatch.setattr(verify_command, "_json", killed)
+    done = call(home, "--json", "verify", tmp_path / "images")
+    assert done.code == 1
+    *each, last = lines(done.out)
+    assert 0 < len(each) <= 100
+    assert last["error"]["code"] == "failed"  # type: ignore[index]
+    assert "ended by signal 9" in last["error"]["message"]  # type: ignore[index]
+
+
+def test_output_that_is_closed_ends_the_command_and_every_process_of_it(home: Path, tmp_path: Path) -> None:
+    image = signed(1)
+    for number in range(200):
+        write(tmp_path / "images", f"{number:03}.json", image)
+    words = [*PROGRAM, "--home", str(home), "--json", "verify", str(tmp_path / "images")]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=clean_environment(), cwd=ROOT
+    ) as program:
+        assert program.stdout is not None
+        assert program.stderr is not None
+        assert b"authentic" in program.stdout.readline()
+        program.stdout.close()
+        assert program.stderr.read() == b""  # its end is the end of the last process
+        assert program.wait(PATIENCE) == BROKEN_PIPE
 
 
 def test_every_check_of_an_image_is_its_own_whoever_it_is_checked_with(
