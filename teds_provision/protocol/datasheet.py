@@ -97,8 +97,15 @@ def signature_good(teds: SecurityTeds, octets: bytes, uuid: bytes, check: Verify
     """Return True if 100 verifies under 103 over the octets as they are; a node passes its chip's ``check``."""
     if teds.station_key is None or teds.signature is None:
         return False
-    asked = teds.station_key, security.tbs(uuid, octets), teds.signature
-    return _signed(*asked) if check is None else check(*asked)
+    message = security.tbs(uuid, octets)
+    return signs(teds, message) if check is None else check(teds.station_key, message, teds.signature)
+
+
+def signs(teds: SecurityTeds, message: bytes) -> bool:
+    """Return True if 100 verifies under 103 over ``message``, which :func:`security.tbs` cut from the octets."""
+    if teds.station_key is None or teds.signature is None:
+        return False
+    return _signed(teds.station_key, message, teds.signature)
 
 
 @lru_cache(maxsize=16)

@@ -20,7 +20,7 @@ from teds_provision.station.store import RevocationRecord, WhitelistEntry
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.codec.security import NotCanonicalError, SecurityTeds
-from teds_provision.teds.image import SECURITY, Image
+from teds_provision.teds.image import SECURITY, BlockId, Image
 
 if TYPE_CHECKING:
     from teds_provision.protocol.plant.signer import SignerVerdict
@@ -252,8 +252,8 @@ def verify_images(station: TrustSource, images: Iterable[Image]) -> list[list[Ch
     All signatures are checked in a row. Between the other checks of its image, each one took half as long again: the
     tables of OpenSSL and the Python around them evicted each other from the processor's cache.
     """
-    proven = [(image, _proofs(image)) for image in images]
-    return [_checks(station, image, proofs, None) for image, proofs in proven]
+    files = list(images)
+    return [_checks(station, image, proofs, None) for image, proofs in zip(files, _all_proofs(files), strict=True)]
 
 
 class _SecurityFields(NamedTuple):
@@ -266,15 +266,34 @@ class _SecurityFields(NamedTuple):
 
 def _proofs(image: Image) -> _SecurityFields:
     """Read the Security TEDS of an image, and check what needs no trust: fields 102 and 100."""
+    return _all_proofs([image])[0]
+
+
+def _all_proofs(images: Sequence[Image]) -> list[_SecurityFields]:
+    """Return the same of many images: all are read, then the signatures of all nodes checked, then of all stations."""
+    read = [_shown(image) for image in images]
+    signed = [
+        security.tbs(image.uuid, image.blocks[SECURITY]) if isinstance(shown, SecurityTeds) and shown.signed else None
+        for image, shown in zip(images, read, strict=True)
+    ]
+    node_keys = [
+        isinstance(shown, SecurityTeds) and node_key_good(image.uuid, shown.node_key, shown.node_key_signature)
+        for image, shown in zip(images, read, strict=True)
+    ]
+    datasheets = [
+        message is not None and isinstance(shown, SecurityTeds) and datasheet.signs(shown, message)
+        for shown, message in zip(read, signed, strict=True)
+    ]
+    return list(map(_SecurityFields, read, node_keys, datasheets))
+
+
+def _shown(image: Image) -> _Shown:
+    """Read the Security TEDS of an image, or return why it cannot be read (None: there is none)."""
     octets = image.security
-    if octets is None:
-        return _SecurityFields(None)
     try:
-        shown = security.decode(octets)
+        return None if octets is None else security.decode(octets)
     except NotCanonicalError as error:
-        return _SecurityFields(error)
-    node_key = node_key_good(image.uuid, shown.node_key, shown.node_key_signature)
-    return _SecurityFields(shown, node_key, shown.signed and datasheet.signature_good(shown, octets, image.uuid))
+        return error
 
 
 def _checks(station: TrustSource, image: Image, proofs: _SecurityFields, known: FreshnessFloor | None) -> list[Check]:
@@ -325,7 +344,7 @@ def judge(
 
     ``security_teds``: the TEDS itself or its SHA-256, by which the plant's stations name what they signed.
     """
-    checks = {check.name: check for check in octets}
+    checks = {check[0]: check for check in octets}
     if signers.node_key is not None:
         if "node key" not in checks:
             checks["node key"] = _pinned(station, uuid, signers.node_key)
@@ -334,7 +353,7 @@ def judge(
         certifier = _certifier(station, uuid, signers)
         checks |= {check.name: check for check in _signer(station, signers, certifier, security_teds)}
         checks["station certificate"] = _certificate(station, signers, certifier)
-    return sorted(checks.values(), key=lambda check: _PLACES[check.name])
+    return [checks[name] for name in _ORDER if name in checks]
 
 
 _ORDER: Final = (
@@ -342,7 +361,6 @@ _ORDER: Final = (
     "signing station", _PAGES, "station certificate", "signature", "signed TEDS", "every TEDS is signed", "UUID",
     "possession", _SESSION,
 )  # fmt: skip
-_PLACES: Final = {name: place for place, name in enumerate(_ORDER)}
 ABOUT_THE_REST: Final = frozenset({"form", "signed TEDS", "every TEDS is signed", "UUID"})
 """Checks of other TEDS than the Security TEDS."""
 
@@ -358,20 +376,21 @@ def _not_older(shown: _Shown, known: FreshnessFloor | None) -> list[Check]:
 
 def _by_itself(image: Image, proofs: _SecurityFields) -> tuple[Check, ...]:
     """Return the checks of an image that need no other knowledge."""
-    checks, shown = [_form(image)], proofs.shown
+    shown = proofs.shown
+    checks = [_form(image, known_good=SECURITY if isinstance(shown, SecurityTeds) else None)]
     if shown is None:
         return (*checks, Check("signed", "failed", "the image has no Security TEDS"))
     if isinstance(shown, NotCanonicalError):
         ours = security.has_profile_version(image.blocks[SECURITY])
         why = shown.message if ours else "the Security TEDS does not follow this profile: shown, never trusted"
         return (*checks, Check("canonical form", "failed", why))
-    checks += [Check("canonical form", "passed"), _algorithms(shown)]
+    checks += [_CANONICAL, _algorithms(shown)]
     if not proofs.node_key:
         checks.append(Check("node key", "failed", "field 102 does not sign this key for this UUID"))
     if not shown.signed:
         return (*checks, Check("signed", "failed", "this is the initial Security TEDS, which is not signed yet"))
     checks += [
-        Check("signed", "passed"),
+        _SIGNED,
         _check("signature", proofs.datasheet, _CHANGED),
         _blocks(image, shown),
         _unlisted(image, shown),
@@ -436,18 +455,29 @@ def _check(name: str, holds: bool, why: str, good: str = "") -> Check:
     return Check(name, "passed", good) if holds else Check(name, "failed", why)
 
 
-def _form(image: Image) -> Check:
-    bad = [block for block in image if not datasheet.passes_own_check(block, image.blocks[block])]
-    why = ", ".join(f"TEDS {code} of channel {channel}" for channel, code in bad)
-    return _check("form", not bad, f"length, checksum or class is wrong: {why}", f"{len(image.blocks)} TEDS")
+_CANONICAL: Final = Check("canonical form", "passed")
+_SIGNED: Final = Check("signed", "passed")
+_OUR_ALGORITHMS: Final = Check("algorithms", "passed", "ECDSA P-256, SHA-256, AES-128")
+
+
+def _form(image: Image, known_good: BlockId | None) -> Check:
+    """Check length, checksum and class of every TEDS but ``known_good``, which was decoded."""
+    blocks = image.blocks
+    bad = [id for id in blocks if id != known_good and not datasheet.passes_own_check(id, blocks[id])]
+    if not bad:
+        return Check("form", "passed", f"{len(blocks)} TEDS")
+    why = ", ".join(f"TEDS {code} of channel {channel}" for channel, code in sorted(bad))
+    return Check("form", "failed", f"length, checksum or class is wrong: {why}")
 
 
 def _algorithms(shown: SecurityTeds) -> Check:
+    if shown.values == security.OUR_VALUES:
+        return _OUR_ALGORITHMS
     wrong = [number for number, value in security.OUR_VALUES.items() if shown.values[number] != value]
     why = "weak or unknown algorithm in field " + ", ".join(map(str, wrong))
     if other := security.other_wire(shown):
         why = f"it names {other}"
-    return _check("algorithms", not wrong, why, "ECDSA P-256, SHA-256, AES-128")
+    return Check("algorithms", "failed", why)
 
 
 def _pinned(station: TrustSource, uuid: bytes, node_key: bytes) -> Check:
@@ -462,12 +492,14 @@ def _pinned(station: TrustSource, uuid: bytes, node_key: bytes) -> Check:
 
 
 _FILE_ALONE = "a file does not show the node's current state"
+_NO_EPOCH: Final = Check("key epoch", "skipped", _FILE_ALONE)
+_NO_SEQUENCE: Final = Check("sequence", "skipped", _FILE_ALONE)
 
 
 def _epoch(shown: SecurityTeds, known: FreshnessFloor | None) -> Check:
     name = "key epoch"
     if known is None:
-        return Check(name, "skipped", _FILE_ALONE)
+        return _NO_EPOCH
     if known.identity is not None and shown.key_epoch > known.identity.epoch:
         why = f"signed for epoch {shown.key_epoch}, but the node is at {known.identity.epoch}"
         return Check(name, "failed", why)
@@ -478,7 +510,7 @@ def _epoch(shown: SecurityTeds, known: FreshnessFloor | None) -> Check:
 def _sequence(shown: SecurityTeds, known: FreshnessFloor | None) -> Check:
     name = "sequence"
     if known is None:
-        return Check(name, "skipped", _FILE_ALONE)
+        return _NO_SEQUENCE
     if known.identity is not None and shown.sequence < known.identity.sequence:
         own = known.identity.sequence
         why = f"sequence {shown.sequence} is older than the node's own {own}: an old datasheet was restored"
@@ -541,13 +573,15 @@ _CHANGED = "field 100 does not verify: the datasheet was changed or belongs to a
 
 def _blocks(image: Image, shown: SecurityTeds) -> Check:
     found = datasheet.digests(image.blocks)
+    if found == shown.signed_blocks:
+        return Check("signed TEDS", "passed", f"{len(found)} digests")
     wrong = [block for block, digest in shown.signed_blocks.items() if found.get(block) != digest]
     why = ", ".join(f"TEDS {code} of channel {channel} is missing or changed" for channel, code in wrong)
     return _check("signed TEDS", not wrong, why, f"{len(shown.signed_blocks)} digests")
 
 
 def _unlisted(image: Image, shown: SecurityTeds) -> Check:
-    extra = [block for block in image if block != SECURITY and block not in shown.signed_blocks]
+    extra = sorted(image.blocks.keys() - shown.signed_blocks.keys() - {SECURITY})
     why = ", ".join(f"TEDS {code} of channel {channel} is unsigned" for channel, code in extra)
     return _check("every TEDS is signed", not extra, why)
 

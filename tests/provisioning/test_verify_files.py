@@ -19,11 +19,13 @@ from teds_provision.files import json_files
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.keys import SoftwareKey, node_key_message, station_key_message, to_pem
 from teds_provision.provisioning import verify_files as many
+from teds_provision.provisioning.verify import snapshot_trust
 from teds_provision.provisioning.verify_files import FileVerdict, VerdictTotals
 from teds_provision.teds.calibration import Calibration, CalibrationInput
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
+from tests.bench import make_station
 from tests.cli.shell import PROGRAM, ROOT, call, clean_environment, spawn
 from tests.pace import PATIENCE
 
@@ -216,6 +218,18 @@ def test_so_many_images_are_held_at_a_time_as_there_is_room_for(
     for room, held in ((0, [1, 1, 1, 1, 1]), (2 * size, [3, 2]), (9 * size, [5])):
         monkeypatch.setattr(many, "_TOGETHER", room)
         assert [len(some) for some in many._some(paths)] == held
+
+
+def test_images_that_are_verified_together_are_decoded_once_each(tmp_path: Path) -> None:
+    images = [signed(number) for number in range(40)]
+    names = [str(write(tmp_path, f"{number}.json", image)) for number, image in enumerate(images)]
+    station = make_station(tmp_path / "home")
+    work = many._Work(snapshot_trust(station), lambda found: found.path.name, names)
+    security.decode.cache_clear()
+    told, totals = work.judge(range(40))
+    assert (len(told), totals.files) == (40, 40)
+    assert security.decode.cache_info().misses == 40
+    station.close()
 
 
 def test_images_without_a_calibration_load_no_guard(home: Path, tmp_path: Path) -> None:

@@ -134,7 +134,7 @@ def ca_hint(name: str, ca_fingerprint: str) -> str:
     return f"{cut}:{ca_fingerprint[:16]}"
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=128)  # more than the 64 files that are verified together
 def decode(teds: bytes) -> SecurityTeds:
     """Decode a framed Security TEDS in canonical form; raises NotCanonicalError with the rule that it breaks.
 
