@@ -444,7 +444,7 @@ class Client:
             try:
                 connection.request("GET", f"{API}/nodes/{uuid}/let-go?for={quote(command, safe='')}")
                 answer = connection.getresponse()
-                said = answer.readline() if answer.status == 200 else b""
+                line = answer.readline() if answer.status == 200 else b""
             except LinkError:  # no listener
                 yield False
                 return
@@ -453,13 +453,13 @@ class Client:
                     f"The base station measures, and did not release node {uuid} within {LETTING_GO:g} s.",
                     hint="See: teds-provision ncap status. Or end the measurement first.",
                 ) from error
-            if said not in (b"let go\n", b"not measured\n"):
-                why = said.decode(errors="replace").removeprefix("refused: ").strip()
+            if line not in (b"let go\n", b"not measured\n"):
+                why = line.decode(errors="replace").removeprefix("refused: ").strip()
                 raise PolicyError(
                     why or f"The base station did not release node {uuid}.",
                     hint="See: teds-provision ncap status. Or end the measurement first.",
                 )
-            yield said == b"let go\n"
+            yield line == b"let go\n"
         finally:
             connection.close()
 

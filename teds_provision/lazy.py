@@ -174,10 +174,10 @@ def _as_it_came(requirement: str) -> list[str]:
 def _uv_tool(receipt: pathlib.Path, requirements: tuple[str, ...]) -> str:
     """``uv tool install`` with what its receipt has, and these."""
     try:
-        said = tomllib.loads(receipt.read_text(encoding="utf-8"))["tool"]
-        listed = {requirement["name"]: requirement for requirement in said["requirements"]}
+        text = tomllib.loads(receipt.read_text(encoding="utf-8"))["tool"]
+        listed = {requirement["name"]: requirement for requirement in text["requirements"]}
     except (OSError, ValueError, KeyError, TypeError):
-        said, listed = {}, {}
+        text, listed = {}, {}
     ours = listed.pop(_TOOL, {})
     extras = {
         *ours.get("extras", []),
@@ -185,8 +185,8 @@ def _uv_tool(receipt: pathlib.Path, requirements: tuple[str, ...]) -> str:
     }
     named = f"{_TOOL}[{','.join(sorted(extras))}]" if extras else _TOOL
     words = ["uv", "tool", "install"]
-    if "python" in said:
-        words += ["--python", said["python"]]
+    if "python" in text:
+        words += ["--python", text["python"]]
     if "editable" in ours:
         words += ["--editable", named.replace(_TOOL, ours["editable"], 1)]
     elif "directory" in ours or "path" in ours or "url" in ours:

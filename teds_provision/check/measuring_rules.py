@@ -343,12 +343,14 @@ def _subscribed(probe: Probe, channel: int, octets: int) -> tuple[SubscribeComma
     what = describe_command(asked.command())
     holds(reply.ok, f"{what}, sealed: success is due, {describe_reply(reply)} came.")
     try:
-        said = SubscribeReply.decode(reply.payload)
+        reply_members = SubscribeReply.decode(reply.payload)
     except GarbledError as error:
         raise RuleBrokenError(f"{what}: {error.message}") from None
     due = message_length(kind, 1, octets)
-    holds(said.length == due, f"{what}: messages of {said.length} octets are announced; {due} are due.")
-    return asked, said
+    holds(
+        reply_members.length == due, f"{what}: messages of {reply_members.length} octets are announced; {due} are due."
+    )
+    return asked, reply_members
 
 
 def _messages(
@@ -389,11 +391,14 @@ def stream_messages(probe: Probe) -> str:
         session = probe.session
         assert session is not None
         for run in (1, 2):
-            asked, said = _subscribed(probe, channel, octets)
-            holds(said.run == run, f"Subscribe (128.14): run {said.run}; {run} is due, each once in a session.")
+            asked, subscribed = _subscribed(probe, channel, octets)
+            holds(
+                subscribed.run == run,
+                f"Subscribe (128.14): run {subscribed.run}; {run} is due, each once in a session.",
+            )
             seconds = 1.5 + 2 * _MESSAGES * asked.period / 1e9
             before = DatagramSealer(stream_key(session.message_key, run - 1))
-            came = _messages(probe, frames, asked, said.length, _MESSAGES, seconds, stale=before)
+            came = _messages(probe, frames, asked, subscribed.length, _MESSAGES, seconds, stale=before)
             text = (
                 f"Subscribe (128.14), run {run}: {len(came)} data messages within {seconds:g} s, {_MESSAGES} are due."
             )
@@ -408,7 +413,7 @@ def stream_messages(probe: Probe) -> str:
                 _right_message(session.message_key, run, message, asked, octets)
                 last = counter
         stopped = decode_stopped(probe.sealed_good(stop(asked.stream)))
-        rest = _messages(probe, frames, asked, said.length, _MOST_LATE, 3 * asked.period / 1e9)
+        rest = _messages(probe, frames, asked, subscribed.length, _MOST_LATE, 3 * asked.period / 1e9)
         late = [
             message for message in rest if int.from_bytes(message[:4], "big") >= stopped
         ]  # others were on their way
@@ -446,11 +451,11 @@ def drive_replay(probe: Probe) -> str:
         assert session is not None
         assert node is not None
         value = decode_data_set(probe.sealed_good(read_data_set(channel)), octets)
-        said = DriveReply.decode(probe.sealed_good(drive([channel])))
-        holds(said.run == 1, f"Drive (128.20): run {said.run}; 1 is due.")
+        reply = DriveReply.decode(probe.sealed_good(drive([channel])))
+        holds(reply.run == 1, f"Drive (128.20): run {reply.run}; 1 is due.")
         due = drive_length(octets)
-        holds(said.length == due, f"Drive (128.20): messages of {said.length} octets are announced; {due} are due.")
-        key, address = drive_key(session.message_key, said.run), DriveAddress(node, frames.own)
+        holds(reply.length == due, f"Drive (128.20): messages of {reply.length} octets are announced; {due} are due.")
+        key, address = drive_key(session.message_key, reply.run), DriveAddress(node, frames.own)
 
         def made(counter: int) -> bytes:
             until = (_clock(probe).sent // 1000 + 900 * _DEAD_MAN) % (1 << 32)

@@ -44,7 +44,7 @@ else:
     console = late("teds_provision.cli.console")  # rich
 
 _BEHIND = " [y/N]: "
-_TELLING = threading.Lock()
+_PRINTING = threading.Lock()
 SOCKET: Final = "ncap.sock"
 _SERVICE_SECONDS: Final = 5.0
 """``client.SOCKET``; that module is loaded only if the socket exists."""
@@ -107,10 +107,10 @@ class App:
             raise
         except OSError as error:  # the work is done and safe; a script that gets no answer must hear of it
             nowhere(sys.stdout)
-            told = f"Cannot write the result to stdout: {error.strerror}."
+            text = f"Cannot write the result to stdout: {error.strerror}."
             if self.json:
-                raise StoreError(told, hint="The work itself is done. Free some space before the next run.") from error
-            self.note(told)
+                raise StoreError(text, hint="The work itself is done. Free some space before the next run.") from error
+            self.note(text)
 
     def _print(self, human: Callable[[Console], None] | RenderableType) -> None:
         if isinstance(human, str) and not sys.stdout.isatty():  # nothing that rich would be loaded for
@@ -168,8 +168,8 @@ class App:
         else:
             where = ", ".join(f"row {value}" if name == "row" else str(value) for name, value in known.items())
             at = f" ({where})" if where else ""
-            told_lines = f"Error{at}: {error.message}" + (f"\n  → {error.hint}" if error.hint else "")
-            print_message(told_lines)
+            lines = f"Error{at}: {error.message}" + (f"\n  → {error.hint}" if error.hint else "")
+            print_message(lines)
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
@@ -229,11 +229,11 @@ class App:
         self.live_line()
         while True:
             asked = _as_question(f"{question} [y/N], or type the first 32 digits of its key")
-            said = click.prompt(asked, default="n", show_default=False, err=True).strip()
-            if said.lower() in ("y", "yes", "n", "no"):
-                return said.lower().startswith("y")
-            label = station_room.label.read_label(said)
-            digits = label[1] if label is not None else protocol.fingerprints.read_fingerprint(said)
+            answer = click.prompt(asked, default="n", show_default=False, err=True).strip()
+            if answer.lower() in ("y", "yes", "n", "no"):
+                return answer.lower().startswith("y")
+            label = station_room.label.read_label(answer)
+            digits = label[1] if label is not None else protocol.fingerprints.read_fingerprint(answer)
             if digits is not None and not protocol.fingerprints.same_key(digits, fingerprint):
                 print_message("These digits belong to a different key.")
                 return False
@@ -273,7 +273,7 @@ class App:
 
     def station(self) -> Station:
         """Open this base station (store now, vault when a key is first needed); NotFoundError points to init."""
-        station = station_room.station.Station.open(self.home, ask=self.ask_secret, tell=self.warn)
+        station = station_room.station.Station.open(self.home, ask=self.ask_secret, notify=self.warn)
         station.notice = self.note
         station.use_agent = not self.has_passphrase
         station.released = self._released
@@ -315,7 +315,7 @@ class App:
 
 def print_message(text: str) -> None:
     """Print on stderr; foreign text in it steers no terminal, and no word is broken at its edge."""
-    with _TELLING:  # one line at a time, whatever threads there are
+    with _PRINTING:  # one line at a time, whatever threads there are
         sys.stderr.write(f"{folded(sanitize(text), sys.stderr)}\n")
         sys.stderr.flush()
 
@@ -395,10 +395,10 @@ def _columns(stream: TextIO) -> int:
 
 def _fold(line: str, width: int) -> str:
     lead = " " * (len(line) - len(line.lstrip(" ")))
-    said = line[len(lead) :]
-    later = lead + " " * len(_HINT) if said.startswith(_HINT) else lead
-    at = said.find(_COMMAND)
-    words = said.split(" ") if at < 0 else [*said[: at + 1].split(" "), said[at + 2 :]]
+    rest = line[len(lead) :]
+    later = lead + " " * len(_HINT) if rest.startswith(_HINT) else lead
+    at = rest.find(_COMMAND)
+    words = rest.split(" ") if at < 0 else [*rest[: at + 1].split(" "), rest[at + 2 :]]
     lines, current = [], lead + words[0]
     for word in words[1:]:
         if len(current) + 1 + len(word) <= width:

@@ -61,10 +61,10 @@ def demo(app: App, *, page: bool, plant: bool, line: bool, http: str | None) -> 
 
 def _line(app: App) -> None:
     done = demo_room.line.run_line(reporter_for(app), lambda text: app.note(f"\n{text}"))
-    told = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
+    rows = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
     words = ", ".join(f"{count} {word}" for word, count in sorted(done.evidence.items()))
     app.emit(
-        {"steps": told, "passed": done.passed, "evidence": done.evidence, "refused": list(done.refused)},
+        {"steps": rows, "passed": done.passed, "evidence": done.evidence, "refused": list(done.refused)},
         f"\nDone: {done.passed} boards passed, refused: {', '.join(done.refused)}; evidence that holds: {words}.",
     )
 
@@ -72,9 +72,9 @@ def _line(app: App) -> None:
 def _plant(app: App) -> None:
     done = demo_room.plant.run_plant_demo(reporter_for(app), lambda text: app.note(f"\n{text}"))
     steps = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
-    told = {"steps": steps, "by": done.by, "before": done.before, "after": done.after, "seconds": done.seconds}
+    result = {"steps": steps, "by": done.by, "before": done.before, "after": done.after, "seconds": done.seconds}
     app.emit(
-        told,
+        result,
         f"\nDone in {done.seconds:.0f} s: the board was {done.before} at south; with what the stolen station signed, it"
         f" is {done.after}.\nYour own plant: docs/plant.md",
     )
@@ -85,11 +85,11 @@ def _page(app: App, http: str | None) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: over.request_stop())
     with demo_room.page.page_demo(app.note, http) as shown:
-        told = f"""Open {shown.url}
+        text = f"""Open {shown.url}
   (valid once, for five minutes; for another: teds-provision --home {shown.home} ncap open)
 To place another node on its reader:
   {shown.tap}
 Press Ctrl-C to stop."""
-        app.emit({"ready": True, "url": shown.url, "home": str(shown.home), "tap": shown.tap}, told)
+        app.emit({"ready": True, "url": shown.url, "home": str(shown.home), "tap": shown.tap}, text)
         sys.stdout.flush()
         over.wait()

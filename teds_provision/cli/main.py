@@ -232,7 +232,7 @@ def run(arguments: list[str]) -> int:
         hint = f"{kind} {error.hint}".rstrip() if kind and named not in error.message else error.hint
         return _fail(arguments, error.exit_code, error.code, error.message, hint)
     except OSError as error:
-        return _untold(arguments, error)
+        return _bad_file_name(arguments, error)
     except Exception as error:  # noqa: BLE001 - the last line of defence: a foreign exception is a bug of ours
         return _bug(arguments, error)
     finally:
@@ -269,7 +269,7 @@ def _misused(arguments: list[str], error: click.ClickException) -> int:
     return _fail(arguments, 2, "usage", text, hint)
 
 
-def _untold(arguments: list[str], error: OSError) -> int:
+def _bad_file_name(arguments: list[str], error: OSError) -> int:
     """Handle lost output: the reader has gone, or the disk is full; the work was done before."""
     if isinstance(error, BrokenPipeError):
         nowhere(sys.stdout)
@@ -277,15 +277,15 @@ def _untold(arguments: list[str], error: OSError) -> int:
     if error.errno in _NO_NAMES and error.filename is not None:
         name = str(error.filename)
         name = name if len(name) <= 100 else f"{name[:64]}…"
-        told = f"{name!r} is not a valid file name: {error.strerror}."
-        return _fail(arguments, NotFoundError.exit_code, NotFoundError.code, told, "")
+        text = f"{name!r} is not a valid file name: {error.strerror}."
+        return _fail(arguments, NotFoundError.exit_code, NotFoundError.code, text, "")
     if error.errno not in _FULL:
         return _bug(arguments, error)
     nowhere(sys.stdout)  # a table that was being printed; what reads a store or a file has errors of its own
-    told = f"Cannot write the result to stdout: {error.strerror}."
+    text = f"Cannot write the result to stdout: {error.strerror}."
     if _wants(arguments, "--json"):
-        return _fail(arguments, StoreError.exit_code, StoreError.code, told, "")
-    _print_message(told)
+        return _fail(arguments, StoreError.exit_code, StoreError.code, text, "")
+    _print_message(text)
     return 0
 
 
@@ -307,8 +307,8 @@ def _wants(arguments: list[str], option: str) -> bool:
     name = option.strip("-")
     if App.current is not None and getattr(App.current, name):
         return True
-    said = os.environ.get(f"{ENVIRONMENT_PREFIX}_{name.upper()}", "").lower()
-    return option in arguments or (App.current is None and said in ("1", "true", "yes", "on", "t", "y"))
+    setting = os.environ.get(f"{ENVIRONMENT_PREFIX}_{name.upper()}", "").lower()
+    return option in arguments or (App.current is None and setting in ("1", "true", "yes", "on", "t", "y"))
 
 
 def _traceback(arguments: list[str]) -> None:

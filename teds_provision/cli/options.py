@@ -204,12 +204,12 @@ def link_options(function: Function) -> Function:
     ) -> Any:
         named = can[0] if len(can) == 1 else can or None
         chosen = click.get_current_context().get_parameter_source("via") is not ParameterSource.DEFAULT
-        here = said_here("nfc", "can", "ble")
+        here = options_given("nfc", "can", "ble")
         if not chosen and (here == {"can"} or (here == {"ble"} and not nfc)):  # the one that is named is meant
             via, chosen = here.pop(), True
         with tracing(trace) as opened, readers_for(via):
             # a setting of config.toml is the wait for a tap; the option on the command line means this very search
-            listen = timeout if said_here("timeout") else LISTEN_SECONDS
+            listen = timeout if options_given("timeout") else LISTEN_SECONDS
             links = LinkSettings(via, nfc or None, named, ble, timeout, opened, listen, chosen)
             return function(*args, links=links, **rest)
 
@@ -266,7 +266,7 @@ def links_given(ctx: click.Context) -> bool:
     return any(ctx.get_parameter_source(name) != ParameterSource.DEFAULT for name in ("via", "nfc", "can", "ble"))
 
 
-def said_here(*names: str) -> set[str]:
+def options_given(*names: str) -> set[str]:
     """Return which of these options were given explicitly on the command line."""
     ctx = click.get_current_context()
     return {name for name in names if ctx.get_parameter_source(name) == ParameterSource.COMMANDLINE}

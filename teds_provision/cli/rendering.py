@@ -95,8 +95,8 @@ def print_json_list(name: str, entries: Iterable[dict[str, Any]]) -> None:
             out.write(f", {encode(entry)}" if number else encode(entry))
     except TedsProvisionError as error:
         failed = error
-    told = problem_of(failed) if failed is not None else None
-    out.write(f'], "error": {encode(told)}}}\n' if told is not None else "]}\n")
+    body = problem_of(failed) if failed is not None else None
+    out.write(f'], "error": {encode(body)}}}\n' if body is not None else "]}\n")
     out.flush()
     if failed is not None:
         raise click.exceptions.Exit(failed.exit_code)

@@ -52,8 +52,8 @@ def _named(ctx: click.Context) -> LinkSettings:
     """Return the links that config.toml or the environment names for every command."""
 
     def of(name: str) -> tuple[str, ...]:
-        said = os.environ.get(f"TEDS_PROVISION_{name.upper()}") or (ctx.default_map or {}).get(name) or ()
-        return tuple(said.split()) if isinstance(said, str) else tuple(map(str, said))
+        setting = os.environ.get(f"TEDS_PROVISION_{name.upper()}") or (ctx.default_map or {}).get(name) or ()
+        return tuple(setting.split()) if isinstance(setting, str) else tuple(map(str, setting))
 
     ble = of("ble")
     return LinkSettings(nfc=of("nfc") or None, can=of("can") or None, ble=ble[0] if ble else None)

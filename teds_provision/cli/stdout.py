@@ -15,7 +15,7 @@ from contextlib import suppress
 from typing import Any, Final
 
 BROKEN_PIPE: Final = 141
-_NOT_TOLD: Final = 7
+_NOT_PRINTED: Final = 7
 # Control characters but line breaks, tabs and ESC; zero-width and direction marks; halves of surrogate pairs.
 _STEERING: Final = (
     "[\x00-\x08\x0b\x0c\x0e-\x1a\x1c-\x1f\x7f-\x9f"
@@ -100,7 +100,7 @@ def ended(code: int, output: GuardedOutput | None, *, as_json: bool) -> int:
             file=sys.stderr,
             flush=True,
         )
-    return _NOT_TOLD if as_json and code == 0 else code
+    return _NOT_PRINTED if as_json and code == 0 else code
 
 
 def silence() -> None:

@@ -118,7 +118,7 @@ def _plant(demo: Demo) -> tuple[Station, Station]:
         roles: frozenset[Role] = frozenset({"line"})
         plant.apply_pages.put_roster(office, plant.owner.signed(office, plant.owner.add(office, request, roles)))
         roster = plant.jobs.roster_of(office)
-        plant.owner.join(bench, roster, url=None, told=[])
+        plant.owner.join(bench, roster, url=None, events=[])
         step.detail = f"roster {roster.version}: office keeper, sign; bench line"
     office.unlock()
     bench.unlock()
@@ -164,12 +164,12 @@ def _build(demo: Demo, line: LineRun, uuid: bytes) -> int:
 def _tamper(folder: Path) -> None:
     """Change a digit of a TEDS in the flash of a virtual node, bypassing its station and its key."""
     file = folder / "flash.json"
-    told = json.loads(file.read_text(encoding="utf-8"))
-    blocks = told["flash"]["blocks"]
+    document = json.loads(file.read_text(encoding="utf-8"))
+    blocks = document["flash"]["blocks"]
     place = next(at for at, (channel, code, _) in enumerate(blocks) if (channel, code) == (0, 12))
     channel, code, teds = blocks[place]
     blocks[place] = [channel, code, teds[:-6] + ("0" if teds[-6] != "0" else "1") + teds[-5:]]
-    file.write_text(json.dumps(told), encoding="utf-8")
+    file.write_text(json.dumps(document), encoding="utf-8")
 
 
 def _proof(demo: Demo, office: Station, bench: Station) -> EvidenceTotals:

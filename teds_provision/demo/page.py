@@ -134,10 +134,10 @@ def _run(*words: str) -> None:
         raise _failure(done.stdout)
 
 
-def _failure(said: bytes) -> TedsProvisionError:
+def _failure(output: bytes) -> TedsProvisionError:
     """Return the error of a child process, from its line of JSON."""
     body: object = None
     with suppress(ValueError):
-        body = json.loads(said)
+        body = json.loads(output)
     problem = problem_in(body, otherwise="The base station of the demo did not start.")
     return TedsProvisionError(problem["message"], hint=problem["hint"])

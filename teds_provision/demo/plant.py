@@ -145,12 +145,12 @@ class _Story:
             step.detail = "every key goes to south automatically"
         for name in ("north", *_ROLES):
             with demo.steps.step("registry connect") as step:
-                self._sync("north", tell=False)
+                self._sync("north", show=False)
                 station = self[name]
                 post = self._post(station)
                 found = plant.membership.found_roster(station, post, None)
                 post.close()
-                plant.owner.join(station, found, url=None, told=list(plant.backlog.backlog(station)))
+                plant.owner.join(station, found, url=None, events=list(plant.backlog.backlog(station)))
                 step.detail = f"{name}, roster {found.version}"
 
     def _stolen(self) -> None:
@@ -175,11 +175,11 @@ class _Story:
             step.detail = f"south finds it {verified.verdict}{f': {wrong}' if wrong else ''}"
         return verified.verdict
 
-    def _sync(self, *names: str, tell: bool = True) -> None:
+    def _sync(self, *names: str, show: bool = True) -> None:
         for name in names:
             post = self._post(self[name])
             try:
-                if not tell:
+                if not show:
                     plant.sync.sync(self[name], post)
                     continue
                 with self.demo.steps.step("registry sync") as step:

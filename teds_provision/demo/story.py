@@ -359,16 +359,16 @@ def _ready(process: subprocess.Popen[str]) -> bytes:
         selector.register(process.stdout, selectors.EVENT_READ)
         line = process.stdout.readline() if selector.select(_START_SECONDS) else ""
     try:
-        said = json.loads(line)
-        return bytes.fromhex(said["uuid"])
+        ready = json.loads(line)
+        return bytes.fromhex(ready["uuid"])
     except (ValueError, KeyError, TypeError):
         raise _failure("The virtual node did not start", line) from None
 
 
-def _failure(what: str, said: str) -> LinkError:
+def _failure(what: str, output: str) -> LinkError:
     """Return the error from a node process's stdout: an error as JSON, or nothing readable."""
     body: object = None
     with suppress(ValueError):
-        body = json.loads(said)
-    problem = problem_in(body, otherwise=said.strip() or "no answer")
+        body = json.loads(output)
+    problem = problem_in(body, otherwise=output.strip() or "no answer")
     return LinkError(f"{what}: {problem['message']}", hint=problem["hint"])

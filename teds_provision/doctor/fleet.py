@@ -121,7 +121,7 @@ def nodes(system: System) -> Iterator[Finding]:
     later = tuple(uuid for uuid in tally.rotations if begins.get(uuid, "") > utc_now())
     own = tuple(uuid for uuid in tally.rotations if uuid not in later)
     first = min((begins[uuid] for uuid in later), default="")
-    told = [
+    rows = [
         (tally.overdue, "with an expired calibration", "teds-provision nodes --due 0"),
         (tally.twice, "with a name that another node has", "Give them different names: build UUID --name, sign, write"),
         (tally.drafts, "with a datasheet that was built but not written", "teds-provision draft list"),
@@ -135,11 +135,11 @@ def nodes(system: System) -> Iterator[Finding]:
             f"Wait for its copy; verify UUID does it from {first} on",
         ),
     ]
-    for uuids, what, fix in told:
+    for uuids, what, fix in rows:
         if uuids:
             some = ", ".join(uuid.hex() for uuid in uuids[:_SHOWN]) + (" …" if len(uuids) > _SHOWN else "")
             yield Finding("nodes", "warning", f"{len(uuids)} {what}: {some}.", fix)
-    if not any(uuids for uuids, _, _ in told):
+    if not any(uuids for uuids, _, _ in rows):
         yield Finding("nodes", "ok", "No node needs attention.")
 
 

@@ -201,8 +201,8 @@ def can_interfaces(system: System) -> Iterator[Finding]:
         else:
             yield Finding(name, "ok", f"{interface.name} is up{at}: --can socketcan:{interface.name}.")
     if not found:
-        told = "no CAN interface" if _kernel_can() else "no CAN (modprobe can can_raw, where its modules are there)"
-        yield Finding("can interfaces", "skipped", f"The kernel has {told}; other interfaces of --can may still work.")
+        text = "no CAN interface" if _kernel_can() else "no CAN (modprobe can can_raw, where its modules are there)"
+        yield Finding("can interfaces", "skipped", f"The kernel has {text}; other interfaces of --can may still work.")
 
 
 def _kernel_can() -> bool:
@@ -232,8 +232,8 @@ def can_loopback(system: System) -> Iterator[Finding]:
     """Do frames of a simulated bus come back, without leaving this machine (hop limit 0)."""
     channel = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255 or 1}"
     arrived, why, fix = _self_test(f"udp_multicast:{channel}?hop_limit=0&port={free_port()}")
-    told = "Simulated buses (udp_multicast:) work." if arrived else why
-    yield Finding("can loopback", "ok" if arrived else "warning", told, fix)
+    text = "Simulated buses (udp_multicast:) work." if arrived else why
+    yield Finding("can loopback", "ok" if arrived else "warning", text, fix)
 
 
 def _self_test(spec: str) -> tuple[bool, str, str]:

@@ -44,9 +44,9 @@ def registry(system: System) -> Iterator[Finding]:
         for alarm in alarms:
             yield Finding("registry", "warning", f"Alarm {alarm.code}: {alarm.why}.", "teds-provision registry status")
         conflicts = len({uuid for uuid, _, _ in plant.claims.conflicts()})
-        said = f"{counted(plant.unsent(), 'event')} unsent, {counted(conflicts, 'conflict')}."
+        text = f"{counted(plant.unsent(), 'event')} unsent, {counted(conflicts, 'conflict')}."
         fix = "teds-provision registry status" if conflicts else ""
-        yield Finding("registry", "warning" if conflicts else "ok", said, fix)
+        yield Finding("registry", "warning" if conflicts else "ok", text, fix)
 
 
 def _clocks(roster: Roster, newest: Iterable[tuple[str, str]], now: datetime) -> Iterator[Finding]:

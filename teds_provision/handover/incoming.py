@@ -217,7 +217,7 @@ class NothingImportedError(PolicyError):
     def __init__(self, bundle: Bundle, nodes: tuple[PlannedNode, ...]) -> None:
         super().__init__(
             f"None of the nodes in the bundle can be imported; {nodes[0].node.uuid.hex()}: {nodes[0].why}.",
-            hint="Nothing was imported. Tell the sender.",
+            hint="Nothing was imported. Notify the sender.",
         )
         self.bundle, self.nodes = bundle, nodes
 
@@ -304,12 +304,12 @@ def import_bundle(station: Station, plan: ImportPlan, now: datetime | None = Non
         ImportedRows(station, plan.opened.bundle).take_in(plan.taken)
         station.handovers.put(row)
         for planned in plan.nodes if station.plant.joined is not None else ():
-            node, told = planned.node, {"peer": bundle.sender, "bundle": bundle.id}
+            node, facts = planned.node, {"peer": bundle.sender, "bundle": bundle.id}
             if planned.decision == "refused":
-                station.plant.record_event("refused", node.uuid, why=planned.why, **told)
+                station.plant.record_event("refused", node.uuid, why=planned.why, **facts)
             elif planned.decision != "same":
                 station.plant.record_event(
-                    "took", node.uuid, epoch=node.epoch, key_id=node.kid, mode=bundle.mode, **told
+                    "took", node.uuid, epoch=node.epoch, key_id=node.kid, mode=bundle.mode, **facts
                 )
         refused = {refused.uuid.hex() for refused in receipt.refused}
         taken = [uuid for uuid in notes.uuids if uuid not in refused]

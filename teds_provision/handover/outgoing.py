@@ -548,8 +548,8 @@ def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...]) -> Han
     if plan.earlier is None and station.plant.joined is not None:
         for node in plan.nodes:
             for peer in peers:
-                told = {"epoch": node.epoch, "key_id": node.key_id, "peer": peer, "mode": plan.mode, "bundle": plan.id}
-                station.plant.record_event("gave", node.uuid, **told)
+                facts = {"epoch": node.epoch, "key_id": node.key_id, "peer": peer, "mode": plan.mode, "bundle": plan.id}
+                station.plant.record_event("gave", node.uuid, **facts)
     if digests:
         detail = {"handover": plan.id, "mode": plan.mode, "to": list(peers), "nodes": list(uuids_hex)}
         station.audit("export", None, "again" if files else "done", file=digests[0], **detail)

@@ -300,8 +300,8 @@ class Contact:
         ``words`` may be a function, which is called only if there is a trace.
         """
         if self.trace is not None:
-            uuid, said = self.identity.uuid, words if isinstance(words, str) else words()
-            self.trace.message(self.link.via, direction, frame, said, uuid=uuid, sealed=sealed, opened=opened)
+            uuid, text = self.identity.uuid, words if isinstance(words, str) else words()
+            self.trace.message(self.link.via, direction, frame, text, uuid=uuid, sealed=sealed, opened=opened)
 
 
 class Port(Protocol):

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from teds_provision.teds.calibration.model import Calibration
 
 Kind = Literal["sensor", "event", "actuator"]
-MOST_TOLD = 3  # reasons in one line
+MOST_REASONS = 3  # reasons in one line
 State = Literal["waiting", "running", "lost", "refused", "ended"]
 
 
@@ -151,9 +151,9 @@ class InvalidValues:
 def why_invalid(found: Sequence[InvalidValues]) -> str:
     """Return ``66 of channel 1 above its high limit, 360 °``, the largest counts first; empty if all are valid."""
     most = sorted(found, key=lambda invalid: -invalid.count)
-    told = [f"{invalid.count} of channel {invalid.channel}: {invalid.why}" for invalid in most[:MOST_TOLD]]
-    more = sum(invalid.count for invalid in most[MOST_TOLD:])
-    return "; ".join([*told, *([f"{more} more"] if more else [])])
+    lines = [f"{invalid.count} of channel {invalid.channel}: {invalid.why}" for invalid in most[:MOST_REASONS]]
+    more = sum(invalid.count for invalid in most[MOST_REASONS:])
+    return "; ".join([*lines, *([f"{more} more"] if more else [])])
 
 
 @dataclass(frozen=True)

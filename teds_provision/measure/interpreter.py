@@ -98,8 +98,8 @@ class StreamInterpreter:
         raws, value, valid = self._values(octets)
         flagged = None
         if flags:
-            told = [message.valid and not message.test_pattern for message in messages]
-            flagged = ~np.repeat(told, self._n)
+            counted = [message.valid and not message.test_pattern for message in messages]
+            flagged = ~np.repeat(counted, self._n)
             valid = valid & ~flagged[:, None]
             value = np.where(valid, value, np.nan)
         if not self._test_pattern and np.count_nonzero(valid) < valid.size:

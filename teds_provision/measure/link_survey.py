@@ -43,12 +43,12 @@ def look(station: Station, places: Sequence[str]) -> Iterator[LinkSurvey]:
         if not capabilities_at(place).connectionless:
             yield LinkSurvey(place, "listed")
             continue
-        told: list[Notice] = []
+        notices: list[Notice] = []
         try:
             with beside(station, LinkSettings().at(place), "looking") as links:
                 port = open_place(links.places[0])
                 try:
-                    contacts = port.everyone(seconds=_LISTEN_SECONDS, notice=told.append)
+                    contacts = port.everyone(seconds=_LISTEN_SECONDS, notice=notices.append)
                 finally:
                     port.close()
         except NoNodeError:
@@ -57,5 +57,5 @@ def look(station: Station, places: Sequence[str]) -> Iterator[LinkSurvey]:
             yield LinkSurvey(place, "down", error.message, error.hint)
             continue
         nodes = tuple((contact.address or 0, contact.identity) for contact in contacts)
-        troubles = tuple(notice.text for notice in told if notice.kind in ("conflict", "unfinished"))
+        troubles = tuple(notice.text for notice in notices if notice.kind in ("conflict", "unfinished"))
         yield LinkSurvey(place, "up", nodes=nodes, troubles=troubles)

@@ -60,7 +60,7 @@ from teds_provision.teds.sheet import Channel
 _log = logging.getLogger(__name__)
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 LOOKING = 2.0  # seconds that a node which ran before is looked for, between its reports
-WORKED_ON, TELL, LONGEST_WORK = 0.05, 0.5, 60.0
+WORKED_ON, NOTICE_AFTER, LONGEST_WORK = 0.05, 0.5, 60.0
 """Seconds between checks whether a command works on the node, until that is reported, and until it counts as hung."""
 LOOK = 0.2  # seconds between looks at how it does
 LOOK_FOR_DATA = 0.4  # seconds after an announcement in which data shows that it was not the node's
@@ -252,11 +252,11 @@ class NodeSupervisor:
 
     def _let_others_finish(self) -> None:
         """Wait while a command of this station works on the node: a claim in the middle would spoil what it does."""
-        passed, since, told = 0.0, time.monotonic(), False
+        passed, since, reported = 0.0, time.monotonic(), False
         while passed < LONGEST_WORK and self._station.node_lock(self.uuid).is_taken and not self._stop.wait(WORKED_ON):
             passed = time.monotonic() - since
-            if passed > TELL and not told:
-                told = True
+            if passed > NOTICE_AFTER and not reported:
+                reported = True
                 self._set_state("waiting", why="a command of this station is using it")
 
     def _wait_for_vault(self) -> None:
@@ -417,7 +417,7 @@ class NodeSupervisor:
             turn=self.turn,
             mapping=self.streams.mapping,
             echo=self._events.block,
-            tell=lambda why: self._set_state(self.state, why=why),
+            notify=lambda why: self._set_state(self.state, why=why),
         )
 
     def _subscribe(
@@ -471,7 +471,7 @@ class NodeSupervisor:
     def _watch(
         self, bus: MeasuredBus, trusted: VerifiedSession, standing: NodeStanding, rest: BackgroundReread | None
     ) -> None:
-        told = time.monotonic()
+        reported_at = time.monotonic()
         lied, mark = False, ""
         while not self._stop.is_set():
             self._anew.wait(LOOK)
@@ -480,14 +480,14 @@ class NodeSupervisor:
                 mark = standing.mark
                 self._set_state("running", why=mark)
             now = time.monotonic()
-            if self._doubted(now) or now - told >= self._lease / 3:
+            if self._doubted(now) or now - reported_at >= self._lease / 3:
                 with self.turn:
                     self.streams.tell_time(trusted)
                     if self._lease_now() > self._lease:
                         self._lease = self._lease_now()
                         for number in self._claimed:
                             claim(trusted, number, lease=self._lease)
-                told = now
+                reported_at = now
             elif rest is not None:
                 with self.turn:
                     rest = rest if rest.step() else None

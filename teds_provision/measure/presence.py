@@ -82,14 +82,14 @@ class Presence:
             self.note(text)
 
     def on_announce(
-        self, sighting: Sighting, tell: Callable[[], None], moved: Callable[[], None] | None = None
+        self, sighting: Sighting, notify: Callable[[], None], moved: Callable[[], None] | None = None
     ) -> None:
-        """Call ``tell``, which returns at once, when something announces itself as this node, or from its address.
+        """Call ``notify``, which returns at once, when something announces itself as this node, or from its address.
 
-        ``moved`` (else ``tell``): when it answers at another place. Both are hints: any device can send them.
+        ``moved`` (else ``notify``): when it answers at another place. Both are hints: any device can send them.
         """
         with self._turn:
-            self._announced[sighting.uuid] = ((sighting.port.place, sighting.address), tell, moved or tell)
+            self._announced[sighting.uuid] = ((sighting.port.place, sighting.address), notify, moved or notify)
 
     def let_announce(self, uuid: bytes) -> None:
         """Stop notices about it."""
@@ -99,13 +99,13 @@ class Presence:
     def announced(self, place: str, announce: Announce) -> None:
         """Take what a look-out heard; a hint that anyone can send."""
         with self._turn:
-            told = [
-                tell
-                for uuid, (where, tell, _) in self._announced.items()
+            uuids = [
+                notify
+                for uuid, (where, notify, _) in self._announced.items()
                 if where == (place, announce.address) or (where[0] == place and uuid_crc(uuid) == announce.crc)
             ]
-        for tell in told:
-            tell()
+        for notify in uuids:
+            notify()
 
     def awaits(self, announce: Announce) -> bool:
         """Return True if a thread waits for the node that this claims to be."""

@@ -194,12 +194,12 @@ class Measurement:
         if state != "waiting":
             del self._waits[id(sink)]
         before = self._shown.get(id(sink), "running")
-        told = f"{state} {stats.detail}".strip() if recorder else state  # it may have waited and gone on between looks
-        if told == before or state not in ("failed", "running", "waiting"):
+        news = f"{state} {stats.detail}".strip() if recorder else state  # it may have waited and gone on between looks
+        if news == before or state not in ("failed", "running", "waiting"):
             return False
         if state == "waiting" and not recorder and now - since < WAITING:
             return False
-        self._shown[id(sink)] = told
+        self._shown[id(sink)] = news
         return True
 
     def _rows(self) -> None:

@@ -46,11 +46,13 @@ class Sample:
 
     def as_json(self) -> dict[str, Any]:
         """As `sample --json` has it."""
-        told = {key: getattr(self, key) for key in ("channel", "name", "value", "unit", "raw", "uncertainty", "valid")}
+        members = {
+            key: getattr(self, key) for key in ("channel", "name", "value", "unit", "raw", "uncertainty", "valid")
+        }
         if self.shown is not None:
-            told["shown"] = shown_json(self.value, self.uncertainty, self.shown)
+            members["shown"] = shown_json(self.value, self.uncertainty, self.shown)
         return {
-            **told,
+            **members,
             "time": self.time,
             **({"text": self.text} if self.text else {}),
             **({"why": self.why} if self.why else {}),

@@ -71,11 +71,11 @@ class TopicActuators:
         turn: threading.Lock,
         mapping: threading.Lock,
         echo: Callable[[Block], None],
-        tell: Callable[[str], None],
+        notify: Callable[[str], None],
     ) -> None:
         self._verified, self._send_message = trusted, send
         self._dead_man, self._clock, self._turn, self._mapping = dead_man, clock, turn, mapping
-        self._echo, self._tell = echo, tell
+        self._echo, self._notify = echo, notify
         self._actuators = {number: _Actuator(ChannelInterpreter(trusted.sheet, number)) for number in numbers}
         self._newest: dict[int, SetPointCommand] = {}
         self._news = threading.Condition()
@@ -118,7 +118,7 @@ class TopicActuators:
 
     def _refuse(self, why: str) -> None:
         self.refused += 1
-        self._tell(f"set point refused, {why.rstrip('.')}")
+        self._notify(f"set point refused, {why.rstrip('.')}")
 
     def _apply(self, command: SetPointCommand) -> None:
         actuator = self._actuators[command.channel]
@@ -145,7 +145,7 @@ class TopicActuators:
     def _send(self, command: SetPointCommand, actuator: _Actuator, octets: bytes) -> None:
         self._seconds_left(command)
         if self._unsure:
-            self._verified.node.request(CLOCK, "to tell its time", within=self._dead_man / 1000)
+            self._verified.node.request(CLOCK, "to report its time", within=self._dead_man / 1000)
             self._unsure = False
         now = time.monotonic()
         if now >= actuator.claimed_until:
@@ -197,7 +197,7 @@ class TopicActuators:
                 isinstance(error, NodeRefusedError) and error.reason == Reason.WRONG_STATE
             ):  # its claim is gone: _set
                 actuator.drivable = False
-                self._tell(f"channel {command.channel} takes no Drive messages: {error.message}")
+                self._notify(f"channel {command.channel} takes no Drive messages: {error.message}")
             return False
         return True
 

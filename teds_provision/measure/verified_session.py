@@ -204,7 +204,7 @@ def ask_clock(node: Conversation) -> tuple[ClockReply, Exchange]:
     if isinstance(link, TimestampedLink):
         link.left = link.came = 0.0
     asked = time.monotonic_ns()
-    reply = ClockReply.decode(node.request(CLOCK, "to tell its time"))
+    reply = ClockReply.decode(node.request(CLOCK, "to report its time"))
     answered = time.monotonic_ns()
     if isinstance(link, TimestampedLink) and link.left < link.came:
         asked, answered = math.floor(link.left * 1e9), math.ceil(link.came * 1e9)
@@ -218,4 +218,4 @@ def claim(trusted: VerifiedSession, channel: int, *, lease: int, dead_man: int |
 
 def operation(node: Conversation) -> OperationReply:
     """Return what the node claims and does (128.19)."""
-    return OperationReply.decode(node.request(commands.OPERATION, "to tell its mode"))
+    return OperationReply.decode(node.request(commands.OPERATION, "to report its mode"))

@@ -162,13 +162,13 @@ class _ZeroRun:
             octets = with_zero_offset(image.blocks[at], offset, datetime.now(UTC).replace(microsecond=0))
             wanted_image = Image(node.uuid, {**image.unsigned_blocks(), at: octets})
             record = not self.dry_run
-            told = guard(
+            result = guard(
                 station, wanted_image, image, self.order.accept_calibration, record=record, expected=("changed",)
             )
             changes = tuple(
                 change.text for change in diff_blocks(image.unsigned_blocks(), wanted_image.unsigned_blocks())
             )
-            found = replace(found, changes=changes, warnings=(*found.warnings, *told))
+            found = replace(found, changes=changes, warnings=(*found.warnings, *result))
             step.detail = f"zero offset {channel.show(found.offset, difference=True)}"
         if self.dry_run:
             return replace(found, steps=tuple(self.steps.done))
@@ -184,8 +184,8 @@ class _ZeroRun:
         if not channel.full_turn:
             slack = max(channel.stated_uncertainty, 0.0) if math.isfinite(channel.stated_uncertainty) else 0.0
             if si < channel.low - slack or si > channel.high + slack:
-                said = unit_for(channel, order.unit) if order.unit is not None else channel.shown
-                asked, low, high = (format_value(number, said) for number in (si, channel.low, channel.high))
+                unit = unit_for(channel, order.unit) if order.unit is not None else channel.shown
+                asked, low, high = (format_value(number, unit) for number in (si, channel.low, channel.high))
                 raise PolicyError(
                     f"{asked} exceeds the limits of channel {channel.label}, {low} to {high}.",
                     hint="Limits come from the signed datasheet and cannot be exceeded.",

@@ -344,7 +344,7 @@ class Daemon:
             "state": state.state,
             "problem": state.problem,
             "waiting": state.waiting or None,
-            "notice": state.told or None,
+            "notice": state.notice_text or None,
             "since": state.since,
             "nodes": self.directory.present(watch.place),
             "strangers": self.directory.strangers(watch.place),

@@ -122,7 +122,7 @@ class Live:
         self._loop: asyncio.AbstractEventLoop | None = None
         self.overrun = 0
         self.values = 0
-        self.told: Callable[[dict[str, Any]], None] = lambda _event: None
+        self.on_event: Callable[[dict[str, Any]], None] = lambda _event: None
         """Gets every event as well: the daemon's lines."""
 
     # -- from any thread ---------------------------------------------------------------------------------------------
@@ -151,7 +151,7 @@ class Live:
     def event(self, event: str, **facts: Any) -> None:
         """Send an event about a node, a measurement, a link or a step to every client, in order."""
         line = {"event": event, "time": time.time(), **facts}
-        self.told(line)
+        self.on_event(line)
         text = json.dumps({"type": "event", **line})
         loop = self._loop
         if loop is not None and not loop.is_closed():
@@ -181,7 +181,7 @@ class Live:
     async def run(self) -> None:
         """Give out what came, every BEAT, until cancelled."""
         self._loop = asyncio.get_running_loop()
-        told = before = time.monotonic()
+        reported_at = before = time.monotonic()
         while True:
             await asyncio.sleep(BEAT)
             now = time.monotonic()
@@ -195,8 +195,8 @@ class Live:
                 text = json.dumps({**message, "raw": raw} if raw else message)
                 for listener in self._listeners:
                     listener.values(text)
-            if now - told >= _TOLD:
-                told = now
+            if now - reported_at >= _TOLD:
+                reported_at = now
                 beat = json.dumps({"type": "beat", "time": time.time()})
                 self._broadcast(beat, beat)
 

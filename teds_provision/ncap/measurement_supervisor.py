@@ -762,16 +762,16 @@ class MeasurementSupervisor:
     # -- what it hears -----------------------------------------------------------------------------------------------
 
     def _watcher(self, running: RunningMeasurement) -> Watcher:
-        def report(said: NodeReport) -> None:
-            self._report(running, said)
+        def report(report: NodeReport) -> None:
+            self._report(running, report)
 
-        def facts(said: Sequence[ChannelFacts]) -> None:
+        def facts(facts: Sequence[ChannelFacts]) -> None:
             raw: set[tuple[str, int]] = set()
-            for uuid in {fact.uuid for fact in said}:
+            for uuid in {fact.uuid for fact in facts}:
                 self._directory.show_sheet(uuid, None)
                 self._directory.refresh([uuid])
                 raw |= {(uuid, number) for number in self._directory.raw_only(uuid)}
-            self._live.learn(said, raw)
+            self._live.learn(facts, raw)
 
         def sink(failed: Sink) -> None:
             self._live.event("sink", **sink_json(running.kept.id, failed))
@@ -793,7 +793,7 @@ class MeasurementSupervisor:
         running.reports[said.uuid] = report
         changed = (before.get("state"), before.get("why")) != (said.state, said.why)
         if changed:
-            self._tell_who_comes(running, said, before.get("state"))
+            self._report_arrival(running, said, before.get("state"))
         facts: dict[str, Any] = {"report": report}
         if said.state == "running":
             facts |= {"present": True, "seen": time.time(), "problem": None}
@@ -811,22 +811,22 @@ class MeasurementSupervisor:
         """Return True if a node is this measurement's, or free: reports from one that it has left are obsolete."""
         return self.measurement_of(uuid) in (None, running.kept.id)
 
-    def _tell_who_comes(self, running: RunningMeasurement, said: NodeReport, before: str | None) -> None:
+    def _report_arrival(self, running: RunningMeasurement, report: NodeReport, before: str | None) -> None:
         """Send an event for each node that starts or stops being measured, or waits, and why."""
-        if said.state == "running" and before != "running":
+        if report.state == "running" and before != "running":
             state = "joined"
-        elif said.state != "running" and before == "running":
+        elif report.state != "running" and before == "running":
             state = "left"
-        elif said.state in ("waiting", "refused") and said.why:
+        elif report.state in ("waiting", "refused") and report.why:
             state = "waiting"
         else:
             return
-        if state == "joined" and said.uuid not in running.logged:  # not each time that it comes back
-            running.logged.add(said.uuid)
-            self._log(running, "joined", said.uuid)
+        if state == "joined" and report.uuid not in running.logged:  # not each time that it comes back
+            running.logged.add(report.uuid)
+            self._log(running, "joined", report.uuid)
         ended = state == "left" and running.stop.is_set()
-        why = said.why or ("the measurement ended" if ended else "")
-        self._live.event("measurement", state=state, id=running.kept.id, uuid=said.uuid, why=why)
+        why = report.why or ("the measurement ended" if ended else "")
+        self._live.event("measurement", state=state, id=running.kept.id, uuid=report.uuid, why=why)
 
 
 def _state_of_open(running: RunningMeasurement, job: MeasurementJob, unknown: str) -> tuple[str, str]:

@@ -67,11 +67,11 @@ class DaemonLock:
         return listen_alone(self._home / SOCKET, 128)
 
 
-Tell = Callable[[dict[str, Any]], None]
+OnEvent = Callable[[dict[str, Any]], None]
 
 
-def run(station: Station, settings: Settings, tell: Tell, waits: Waits = USUAL) -> None:
-    """Run until SIGTERM or Ctrl-C; ``tell`` gets the ready line, then a line for each event.
+def run(station: Station, settings: Settings, on_event: OnEvent, waits: Waits = USUAL) -> None:
+    """Run until SIGTERM or Ctrl-C; ``on_event`` gets the ready line, then a line for each event.
 
     Raises StoreLockedError if this home has a daemon, LinkError if an address is taken, UsageError.
     """
@@ -86,7 +86,7 @@ def run(station: Station, settings: Settings, tell: Tell, waits: Waits = USUAL) 
                 foxglove.start(station.name)
             daemon = Daemon(station, settings, foxglove, waits)
             with MasterSocket(station.home, station.accept_masters):
-                asyncio.run(_serve(daemon, local, tcp, tell))
+                asyncio.run(_serve(daemon, local, tcp, on_event))
             if daemon.failure is not None:
                 raise daemon.failure
         finally:
@@ -97,7 +97,7 @@ def run(station: Station, settings: Settings, tell: Tell, waits: Waits = USUAL) 
                     listener.close()
 
 
-async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None, tell: Tell) -> None:
+async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None, on_event: OnEvent) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -108,7 +108,7 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
     watchdog = asyncio.create_task(_watchdog())
     app = build(daemon)
     early: list[dict[str, Any]] = []
-    daemon.live.told = early.append  # the first line reports that it is ready
+    daemon.live.on_event = early.append  # the first line reports that it is ready
 
     async def begin() -> None:
         await servers.serve(Guard(app, daemon.tokens, None), local)
@@ -121,10 +121,10 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
         socket_path = str(Path(daemon.station.home) / SOCKET)
         links = list(daemon.settings.places)
         ready = {"ready": True, "url": daemon.url, "api": f"unix:{socket_path}", "pid": os.getpid(), "links": links}
-        tell({**ready, "foxglove": daemon.foxglove.url if daemon.foxglove is not None else None})
-        daemon.live.told = tell
+        on_event({**ready, "foxglove": daemon.foxglove.url if daemon.foxglove is not None else None})
+        daemon.live.on_event = on_event
         for event in early:
-            tell(event)
+            on_event(event)
         notify("READY=1")
 
     try:

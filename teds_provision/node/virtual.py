@@ -41,7 +41,7 @@ A station drops what is older than 2 · n · period + 200 ms (operation.md, sect
 """
 _STEP: Final = 1_000_000
 """ns: the least step of samples that are caught up with."""
-_TELL_EVERY: Final = 10.0
+_NOTICE_EVERY: Final = 10.0
 """Seconds between two lines about messages that were lost here."""
 _EVENTS: Final = 0.005
 """Seconds between two looks at event sensors."""
@@ -167,7 +167,7 @@ class VirtualNode:
         self._core, self._realtime_loop = _Core(), pulse
         self._wire = threading.Lock()
         self._sampled = 0
-        self._told_missed, self._tell_at = 0, 0.0
+        self._reported_missed, self._report_at = 0, 0.0
         self._buses: dict[str, SendData] = {}
         self._press_announcers: list[Callable[[], None]] = []
         self._one_time_at = time.monotonic() + self._delays.crypto
@@ -382,7 +382,7 @@ class VirtualNode:
         if wait is None:
             return None
         frame = self._send_frames()
-        self._tell_misses(board)
+        self._report_missed(board)
         wait = max(wait, board.lag / NANOSECONDS / 2)  # what lags is sampled a few instants at a time
         wait = min(max(wait, _COARSE), _EVENTS if board.has_events else wait + _COARSE)
         return wait if frame is None else min(frame, wait)
@@ -409,17 +409,17 @@ class VirtualNode:
                 return 0.0
             at = min(real, at + max(round(wait * NANOSECONDS), _STEP))
 
-    def _tell_misses(self, board: Board) -> None:
+    def _report_missed(self, board: Board) -> None:
         """Report now and then how many messages were lost here, and the rest once no stream runs any more."""
         with self._core.interrupt():
             missed, streaming = self.tim.missed, self.tim.streaming
         now = time.monotonic()
-        if missed > self._told_missed and (now >= self._tell_at or not streaming):
-            more = missed - self._told_missed
-            board.tell(
+        if missed > self._reported_missed and (now >= self._report_at or not streaming):
+            more = missed - self._reported_missed
+            board.notify(
                 f"{more} data messages of node {self.tim.flash.uuid.hex()} could not be sent in time ({missed})."
             )
-            self._told_missed, self._tell_at = missed, now + _TELL_EVERY
+            self._reported_missed, self._report_at = missed, now + _NOTICE_EVERY
 
     def _send_frames(self) -> float | None:
         """Send what may begin now, a frame for each bus, and what follows close behind; seconds until the next one.

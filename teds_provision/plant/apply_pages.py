@@ -75,7 +75,7 @@ def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster,
     """
     joined = station.plant.joined
     registry = joined.registry if joined is not None else ""
-    told: list[tuple[Roster, Taking, str]] = []
+    results: list[tuple[Roster, Taking, str]] = []
     read: dict[str, Roster] = {}
     for octets in found:
         try:
@@ -93,7 +93,7 @@ def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster,
             how, why = "refused", "it is dated in the future: check this machine's clock"
         if how in ("same", "older") and (how == "same" or roster.hash in known):
             continue
-        told.append((roster, how, why))
+        results.append((roster, how, why))
         if how.startswith("taken"):
             put_roster(station, roster)
         elif how == "two rosters":
@@ -105,7 +105,7 @@ def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster,
         for raised in station.plant.alarms.all():
             if raised.code == "two-rosters" and raised.n < held.version and not raised.seen:
                 station.plant.alarms.end(raised)
-    return told
+    return results
 
 
 def put_roster(station: Station, roster: Roster) -> None:
@@ -232,9 +232,9 @@ def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object])
     _keep_bans(station, chain, events, counts=True)
     there = station.plant.claims.of_station(chain.chain, list(by_node))
     claims: dict[bytes, str] = {}
-    for uuid, said in by_node.items():
+    for uuid, statements in by_node.items():
         claim = Claim.from_json(there[uuid]) if uuid in there else Claim()
-        for stated in said:
+        for stated in statements:
             claim.apply_event(stated)
         claims[uuid] = claim.to_json()
     station.plant.claims.put(chain.chain, claims)
@@ -332,7 +332,7 @@ def _judged(
     judged = {}
     for uuid in uuids:
         statements = said.get(uuid, [])
-        own = here.own(station, uuid, [(statement.hash, statement.said.statement) for statement in statements])
+        own = here.own(station, uuid, [(statement.hash, statement.revocation.statement) for statement in statements])
         node = {station_id: Claim.from_json(claim) for station_id, claim in claims.get(uuid, {}).items()}
         judged[uuid] = merge_claims(roster, node, own, statements, lifted), statements
     return judged
@@ -389,7 +389,7 @@ def _ban(station: Station, uuid: bytes, seen: MergedClaims, statements: Sequence
         station.policy.forgive(uuid)
         station.audit("revoke", uuid, "lifted", by="registry", why=entry.why)
     for statement in seen.bans[:1]:
-        deny.deny(station, statement.said, key=station.pins.pinned(uuid))
+        deny.deny(station, statement.revocation, key=station.pins.pinned(uuid))
 
 
 def _is_lifted(station: Station, statement: str, hash: str) -> bool:

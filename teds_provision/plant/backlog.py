@@ -22,10 +22,10 @@ from teds_provision.station.store import KeyRecord
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import Image
 
-Told = tuple[str, bytes | None, dict[str, Any]]
+PastEvent = tuple[str, bytes | None, dict[str, Any]]
 
 
-def backlog(station: Station) -> Iterator[Told]:
+def backlog(station: Station) -> Iterator[PastEvent]:
     """Yield the events that this station would have recorded as a member: act, node, members; writes nothing."""
     for entry in station.pins.all_entries():
         if is_whole(entry.fingerprint) and entry.assurance != "registry":
@@ -48,7 +48,7 @@ def backlog(station: Station) -> Iterator[Told]:
         yield "revoked", ban.uuid, {"statement": own.statement}
 
 
-def _handed(station: Station, keys: dict[bytes, KeyRecord]) -> Iterator[Told]:
+def _handed(station: Station, keys: dict[bytes, KeyRecord]) -> Iterator[PastEvent]:
     """Keys that left and came, by the handovers that are remembered."""
     for row in station.handovers.all():
         notes = BundleNotes.from_json(row.nodes)
@@ -68,7 +68,7 @@ def _handed(station: Station, keys: dict[bytes, KeyRecord]) -> Iterator[Told]:
                 yield from (("gave", uuid, {**handed, "peer": peer}) for peer in row.peers)
 
 
-def firmware_reports(station: Station) -> Iterator[Told]:
+def firmware_reports(station: Station) -> Iterator[PastEvent]:
     """Firmware that nodes reported in a session, as it is kept here."""
     for record in station.firmware_reports.all():
         if (stated := plant_event(record)) is not None:
@@ -95,6 +95,6 @@ def signed_here(station: Station, uuid: bytes) -> Iterator[tuple[int, int, str]]
             yield shown.key_epoch, shown.sequence, digest
 
 
-def count(told: list[Told]) -> dict[str, int]:
+def count(events: list[PastEvent]) -> dict[str, int]:
     """How many events of each act."""
-    return dict(Counter(act for act, _, _ in told))
+    return dict(Counter(act for act, _, _ in events))

@@ -263,9 +263,9 @@ class LineRun:
             row = self._row(job, who.uuid)
             self.station.plant.line.put_unit(row)
             self.station.audit("unit", who.uuid, "taken", job=job.id, unit=row.unit, attempt=row.attempts)
-        told = {"job": job.id, "unit": row.unit, "of": job.total, "attempt": row.attempts}
+        facts = {"job": job.id, "unit": row.unit, "of": job.total, "attempt": row.attempts}
         with self._turn:
-            self._units_as_json[who.uuid] = told
+            self._units_as_json[who.uuid] = facts
         name = job.name_for(who.uuid, row.unit)
         named = prepared if name is None else replace(prepared, order=replace(prepared.order, name=name))
         return LineUnit(self, named, row, row.attempts, assurance, begun)
@@ -297,9 +297,9 @@ class LineRun:
             line.add_evidence(row)
             self.note(uuid, unit, passed=passed)
             self.station.audit("evidence", uuid, verdict, sha256=digest, attempt=facts.attempt)
-            told = {"sha256": digest, "job": facts.job, "unit": facts.unit}
+            members = {"sha256": digest, "job": facts.job, "unit": facts.unit}
             self.station.plant.record_event(
-                "evidence", uuid, **told, verdict=verdict if passed else f"{verdict}: {facts.failure}"
+                "evidence", uuid, **members, verdict=verdict if passed else f"{verdict}: {facts.failure}"
             )
         with self._turn:
             self._units_as_json.setdefault(uuid, {})["evidence"] = digest

@@ -102,8 +102,8 @@ def answer(station: Station, octets: bytes, jobs: Collection[str] | None = None,
         return _signed(station, request, jobs, jump=jump)
     except _RefusedError as refused:
         with station.durable("signer"):
-            told = {"by": request.signer, "job": request.job, "why": refused.why}
-            station.audit("sign-request", request.uuid, refused.word, **told)
+            facts = {"by": request.signer, "job": request.job, "why": refused.why}
+            station.audit("sign-request", request.uuid, refused.word, **facts)
         return seal_answer(Answer(request.hash, refused=refused.word, why=refused.why[:1000]), key)
 
 
@@ -128,8 +128,8 @@ def answer_all(
             request = open_request(come.document, roster_of(station).point_of)
             if roster_of(station).member(request.signer) is not None:
                 send(station, post, request.signer, sealed, name_of(hash_of(sealed)))
-            told = open_answer(sealed, lambda kid: station.point)
-            yield AnsweredRequest(request, told)
+            answered = open_answer(sealed, lambda kid: station.point)
+            yield AnsweredRequest(request, answered)
         come.drop()
 
 

@@ -15,7 +15,7 @@ from uuid import uuid4
 
 from teds_provision.errors import BadDataError, NotFoundError, PolicyError, UsageError
 from teds_provision.plant.apply_pages import now, put_roster, require_roster
-from teds_provision.plant.backlog import Told, backlog
+from teds_provision.plant.backlog import PastEvent, backlog
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
 from teds_provision.protocol.plant.document import MemberRequest, payload
@@ -66,7 +66,7 @@ def signed(station: Station, draft: Roster) -> Roster:
     return open_roster(seal_roster(draft, ca), station.ca)
 
 
-def join(station: Station, roster: Roster, *, url: str | None, told: Sequence[Told]) -> int:
+def join(station: Station, roster: Roster, *, url: str | None, events: Sequence[PastEvent]) -> int:
     """Join a registry, and record the store's existing facts as events; return how many."""
     if roster.member(station.fingerprint) is None:
         raise PolicyError(
@@ -78,16 +78,16 @@ def join(station: Station, roster: Roster, *, url: str | None, told: Sequence[To
     with station.transaction():
         station.plant.join(roster.registry, url)
         put_roster(station, roster)
-        for act, uuid, members in told:
+        for act, uuid, members in events:
             station.plant.record_event(act, uuid, **members)
-        station.audit("registry", None, "joined", registry=roster.registry, version=roster.version, events=len(told))
-    return len(told)
+        station.audit("registry", None, "joined", registry=roster.registry, version=roster.version, events=len(events))
+    return len(events)
 
 
 def create(station: Station, name: str, days: timedelta = USUAL) -> tuple[Roster, int]:
     """Make a registry with this station as its first member; returns roster 1 and how many events the past made."""
     roster = signed(station, draft_first(station, name, days))
-    return roster, join(station, roster, url=None, told=list(backlog(station)))
+    return roster, join(station, roster, url=None, events=list(backlog(station)))
 
 
 # -- the next version --------------------------------------------------------------------------------------------------
@@ -250,26 +250,28 @@ def read_draft(octets: bytes, ca: bytes) -> Roster:
 
 def changes(before: Roster | None, after: Roster) -> list[str]:
     """Return the changes of a new version, in sentences; every key with all 64 digits."""
-    said = [f"roster {after.version} of {after.name} ({after.registry}), until {after.expires:%Y-%m-%d}"]
+    lines = [f"roster {after.version} of {after.name} ({after.registry}), until {after.expires:%Y-%m-%d}"]
     there = before.by_key if before is not None else {}
     for member in after.members:
         old = there.get(member.fingerprint)
         roles = " ".join(sorted(member.roles))
         if not isinstance(old, Member):
-            said.append(f"  adds {member.name} as {roles}")
-            said.append(f"    {fingerprint(member.point)}")
+            lines.append(f"  adds {member.name} as {roles}")
+            lines.append(f"    {fingerprint(member.point)}")
         elif old.roles != member.roles:
-            said.append(f"  {member.name}: {' '.join(sorted(old.roles))} becomes {roles}")
+            lines.append(f"  {member.name}: {' '.join(sorted(old.roles))} becomes {roles}")
             if member.signed is not None:
-                said.append(f"    what it signed up to page {member.signed[0]} stays authentic")
+                lines.append(f"    what it signed up to page {member.signed[0]} stays authentic")
     for left in after.removed:
         if not isinstance(there.get(left.fingerprint), RemovedMember):
-            said.append(f"  removes {left.name} ({left.why}); its pages up to {left.last[0]} count")
-            said.append(f"    {left.fingerprint}")
+            lines.append(f"  removes {left.name} ({left.why}); its pages up to {left.last[0]} count")
+            lines.append(f"    {left.fingerprint}")
     shares = set(before.share) if before is not None else set()
-    said += [f"  shares {_share(share)} with {_names(after, share)}" for share in after.share if share not in shares]
-    said += [f"  shares {_share(share)} no more" for share in shares if share.what not in {n.what for n in after.share}]
-    return said
+    lines += [f"  shares {_share(share)} with {_names(after, share)}" for share in after.share if share not in shares]
+    lines += [
+        f"  shares {_share(share)} no more" for share in shares if share.what not in {n.what for n in after.share}
+    ]
+    return lines
 
 
 def _share(share: Share) -> str:

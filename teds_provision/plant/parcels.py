@@ -246,8 +246,8 @@ class _Reader:
         """Record on the next page that a bundle was refused whole: it is never sent again for these keys."""
         with self.station.transaction():
             for planned in error.nodes:
-                told = {"bundle": error.bundle.id, "peer": error.bundle.sender, "why": planned.why}
-                self.station.plant.record_event("refused", planned.node.uuid, **told)
+                facts = {"bundle": error.bundle.id, "peer": error.bundle.sender, "why": planned.why}
+                self.station.plant.record_event("refused", planned.node.uuid, **facts)
             self.station.audit("import", None, "refused", handover=error.bundle.id, why=error.message)
 
     def _junk(self, parcel: Parcel, error: TedsProvisionError) -> bool:
@@ -488,9 +488,9 @@ def _delete(station: Station, uuid: bytes, epoch: int) -> None:
 def silent_stations(station: Station, roster: Roster, now: datetime) -> set[str]:
     """Members, but this one, of which no page came that was made within the last seven days."""
     created = dict[str, datetime | None]()
-    for digits, said in station.plant.pages.chains().items():
+    for digits, seen in station.plant.pages.chains().items():
         if roster.member(digits) is not None and digits != station.fingerprint:
-            page = station.plant.pages.get(said.chain, *said.counted) if said.counted[0] else None
+            page = station.plant.pages.get(seen.chain, *seen.counted) if seen.counted[0] else None
             at = page.created if page is not None else ""
             created[digits] = datetime.fromisoformat(at) if at else None
     return sharing.silent(created, now)

@@ -153,17 +153,17 @@ def parameters(url: str, fingerprint: str, secret: bytes) -> dict[str, Any]:
     if parts.username is not None:
         raise UsageError("The URL of a registry must not contain a user: each station logs in as itself.")
     require_driver()
-    told: dict[str, Any]
+    parameters_given: dict[str, Any]
     try:
-        told = psycopg.conninfo.conninfo_to_dict(url)
+        parameters_given = psycopg.conninfo.conninfo_to_dict(url)
     except psycopg.ProgrammingError as error:
         raise UsageError(f"PostgreSQL's driver rejects this URL: {_words(error)}") from error
-    unknown = sorted(set(told) - _FROM_URL)
+    unknown = sorted(set(parameters_given) - _FROM_URL)
     if unknown:
         raise UsageError(f"The URL of a registry may not set {', '.join(unknown)}.", hint="Remove it.")
-    if not told.get("host") or not told.get("dbname"):
+    if not parameters_given.get("host") or not parameters_given.get("dbname"):
         raise UsageError("The URL of a registry needs a host and a database: postgresql://HOST/DATABASE")
-    return told | {
+    return parameters_given | {
         "user": schema.role_of(fingerprint),
         "password": scram.password(secret),
         "sslmode": "verify-full",
@@ -200,8 +200,8 @@ class Registry:
     PolicyError (6: full), ForkError (4), StoreError (7: schema, gap).
     """
 
-    def __init__(self, told: Mapping[str, Any], patience: float = STATEMENT + _GRACE) -> None:
-        self._told, self._patience = told, patience
+    def __init__(self, connection_parameters: Mapping[str, Any], patience: float = STATEMENT + _GRACE) -> None:
+        self._told, self._patience = connection_parameters, patience
         self._connection: psycopg.Connection[tuple[Any, ...]] | None = None
         self._turn = threading.RLock()
 
@@ -363,8 +363,8 @@ class Registry:
         until = time.monotonic() + seconds
         with self._connected(seconds) as connection:
             while (left := until - time.monotonic()) > 0:
-                for told in connection.notifies(timeout=left, stop_after=1):
-                    if not parcel_to or told.payload == f"parcel {parcel_to}":
+                for notification in connection.notifies(timeout=left, stop_after=1):
+                    if not parcel_to or notification.payload == f"parcel {parcel_to}":
                         return True
         return False
 

@@ -116,17 +116,17 @@ def _mark(
         already = station.keys.rotation_due(uuid) or "" if uuid in marked else None
         if already is not None and (already.startswith(STOLEN) or not already.startswith(REMOVED)):
             continue
-        said = {fingerprint: Claim.from_json(text) for fingerprint, text in claims.get(uuid, {}).items()}
+        claims_by = {fingerprint: Claim.from_json(text) for fingerprint, text in claims.get(uuid, {}).items()}
         had = beyond.get((uuid, key.epoch, key.key_id), set()) | {
             holder for holder in station.keys.holders_of_key(key) if roster.removed_one(holder)
         }
         known = [
             removed
             for removed in roster.removed
-            if removed.fingerprint in had or had_key(removed.fingerprint, (key.epoch, key.key_id), said)
+            if removed.fingerprint in had or had_key(removed.fingerprint, (key.epoch, key.key_id), claims_by)
         ]
         own_turn = bool(known) and _own_turn(station, roster, uuid, key)
-        why = _why_due(known, key, said, now, ours, own_turn=own_turn)
+        why = _why_due(known, key, claims_by, now, ours, own_turn=own_turn)
         if why is not None and why != already:
             wanted[uuid] = why
     if wanted:
@@ -151,7 +151,7 @@ def _own_turn(station: Station, roster: Roster, uuid: bytes, key: KeyRecord) -> 
 def _why_due(
     known: Sequence[RemovedMember],
     key: KeyRecord,
-    said: Mapping[str, Claim],
+    claims: Mapping[str, Claim],
     now: datetime,
     ours: Mapping[str, datetime],
     *,
@@ -164,7 +164,7 @@ def _why_due(
     """
     why: str | None = None
     for removed in known:
-        forgot = said[removed.fingerprint].forgot if removed.fingerprint in said else -1
+        forgot = claims[removed.fingerprint].forgot if removed.fingerprint in claims else -1
         if removed.why == "retired" and forgot >= key.epoch:
             continue
         text = f"station {removed.name} ({removed.why}) has held this key"

@@ -48,11 +48,11 @@ def _digest(station: Station, database: Returned, roster: Roster) -> str:
     if not states:
         return ""
     chains = station.plant.pages.chains()
-    told = hashlib.sha256(f"{roster.hash} {database.takes_pages}\n".encode())
+    digest = hashlib.sha256(f"{roster.hash} {database.takes_pages}\n".encode())
     for name, state in states.items():
         names = station.plant.pages.names(chains[name].chain) if name in chains else []
-        told.update(f"{state} {' '.join(hash for _, hash, _ in names)}\n".encode())
-    return told.hexdigest()
+        digest.update(f"{state} {' '.join(hash for _, hash, _ in names)}\n".encode())
+    return digest.hexdigest()
 
 
 def own(

@@ -255,10 +255,10 @@ class RemoteOffice:
     def _answered(self, document: bytes) -> tuple[str, str]:
         """Return who signed an answer, and the H of its request; "" for an unknown signer."""
         try:
-            told = jose.verify_compact(
+            payload = jose.verify_compact(
                 document.strip(), roster_of(self.station).point_of, typ=SIGNED.typ, max_octets=SIGNED.most
             )
-            return told.kid, str(load_object(told.payload, "The answer").get("of"))
+            return payload.kid, str(load_object(payload.payload, "The answer").get("of"))
         except (BadDataError, NotAuthenticError, PolicyError):
             return "", ""
 

@@ -209,7 +209,7 @@ def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator
                         roster.name_of(reported.station): _firmware_to_json(roster, reported)
                         for reported in seen.firmware
                     },
-                    "revoked": [roster.name_of(statement.said.sender) for statement in seen.bans],
+                    "revoked": [roster.name_of(statement.revocation.sender) for statement in seen.bans],
                 },
                 "conflicts": [{"name": conflict, "why": why} for conflict, why in seen.conflicts.items()],
             }

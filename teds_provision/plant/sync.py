@@ -61,7 +61,7 @@ class SyncResult:
     parcels_out: int = 0
     waiting: int = 0
     """Parcels that came and that a person has to take in (``import-keys --received``)."""
-    told: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
     rosters: list[int] = field(default_factory=list)
 
 
@@ -92,7 +92,7 @@ def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncRe
             )
         _own_head(station, post, roster, done, connected=connected)
         if again := fold_new_acts(station, roster):
-            done.told.append(f"{counted(again, 'page')} read again: this version shows more of what pages say")
+            done.remarks.append(f"{counted(again, 'page')} read again: this version shows more of what pages say")
         while close_page(station, roster) is not None:
             pass
         _push(station, post, roster, done, connected=connected)
@@ -100,7 +100,9 @@ def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncRe
         _return_pages(station, post, roster, done)
         done.judged = apply_claims(station)
         acknowledged = station.plant.pages.seen_heads()
-        done.told += [said for head, said in unseen_heads(station, roster).items() if head not in acknowledged]
+        done.remarks += [
+            head_text for head, head_text in unseen_heads(station, roster).items() if head not in acknowledged
+        ]
         _parcels(station, post, roster, done)
         with station.transaction():
             joined = station.plant.joined
@@ -117,8 +119,8 @@ def _return_pages(station: Station, post: Transport, roster: Roster, done: SyncR
     done.returned, refused = returned.hand_in(station, post.returned, roster)
     if done.returned:
         pages = "1 page" if done.returned == 1 else f"{done.returned} pages"
-        done.told.append(f"{pages} of stations that are no longer members, which the registry lacked, handed in")
-    done.told += refused
+        done.remarks.append(f"{pages} of stations that are no longer members, which the registry lacked, handed in")
+    done.remarks += refused
     if post.returned.takes_pages:
         returned.note(station, post.returned, roster)
 
@@ -131,14 +133,14 @@ def _rosters(station: Station, post: Transport, done: SyncResult) -> list[tuple[
             f"{post.where} belongs to another registry ({post.registry()}).",
             hint="Use the one that this station joined.",
         )
-    told = take_rosters(station, post.rosters())
-    for roster, how, why in told:
+    results = take_rosters(station, post.rosters())
+    for roster, how, why in results:
         if how not in ("taken", "older"):  # each member posts the newest that it knows: some are behind
-            done.told.append(f"roster {roster.version}: {how}: {why}")
+            done.remarks.append(f"roster {roster.version}: {how}: {why}")
     held = station.plant.held_roster()
     if held is not None:
         post.post_roster(held.version, held.hash, held.octets)
-    return [(told_roster, str(how), why) for told_roster, how, why in told]
+    return [(roster_read, str(how), why) for roster_read, how, why in results]
 
 
 def _parcels(station: Station, post: Transport, roster: Roster, done: SyncResult) -> None:
@@ -178,7 +180,7 @@ def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResul
         back = "1 page that this station wrote before its backup is"
         if len(new) > 1:
             back = f"{len(new)} pages that this station wrote before its backup are"
-        done.told.append(f"{back} back")
+        done.remarks.append(f"{back} back")
     elif new:
         _stop_at_fork(station, post, new)
     else:
@@ -188,7 +190,7 @@ def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResul
         if new or connected or joined.url is None:
             station.plant.end_restored()
         else:  # a stick that knows less than this home's joined state shows nothing: it would repeat a number
-            done.told.append(
+            done.remarks.append(
                 "this home was restored from a backup and publishes nothing new until it has synced with its"
                 " own registry"
             )
@@ -197,7 +199,7 @@ def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResul
         there = post.heads().get(station.fingerprint, 0)
         why = f"page {joined.acknowledged} was there, and now {there} is the last"
         alarm(station, "rolled-back", station.fingerprint, joined.acknowledged, why, again=True)
-        done.told.append(f"{post.where} was rolled back: {why}; it is being refilled")
+        done.remarks.append(f"{post.where} was rolled back: {why}; it is being refilled")
 
 
 def _own_pages(station: Station, post: Transport, roster: Roster, done: SyncResult, above: int) -> list[Page]:
@@ -219,7 +221,7 @@ def _own_pages(station: Station, post: Transport, roster: Roster, done: SyncResu
             hint=f"To delete them there: registry sql --mend {quote(roster.name_of(station.fingerprint))} {junk[0]}",
         )
     if junk:
-        done.told.append(
+        done.remarks.append(
             f"{post.where}: {counted(len(junk), 'file')} in this station's folder that it did not sign; ignored"
         )
     return found
@@ -313,7 +315,7 @@ def _know_again(station: Station, page: Page) -> None:
             station.pins.put(WhitelistEntry(uuid, pin[0], assurance=pin[1]))  # type: ignore[arg-type]
 
 
-def _know_unit(station: Station, uuid: bytes, said: event.Event, job: str, unit: int) -> None:
+def _know_unit(station: Station, uuid: bytes, stated: event.Event, job: str, unit: int) -> None:
     """Record the unit that an attempt or an office's signature was about, and one more attempt.
 
     If another board has that unit by now, this one has the next: an office counts what it gave, not its numbers.
@@ -324,11 +326,11 @@ def _know_unit(station: Station, uuid: bytes, said: event.Event, job: str, unit:
         station.notice(
             f"Unit {unit} of the job {job} was assigned twice: also to {uuid.hex()}, before this home was restored."
         )
-        if said.act == "evidence":
+        if stated.act == "evidence":
             return
         unit = line.count_units(job)[2] + 1
-    row = UnitRow(job, uuid, unit, said.at) if kept is None else replace(kept, attempts=kept.attempts + 1)
-    passed = row.attempts if said.members.get("verdict") == PASSED and not row.passed else row.passed
+    row = UnitRow(job, uuid, unit, stated.at) if kept is None else replace(kept, attempts=kept.attempts + 1)
+    passed = row.attempts if stated.members.get("verdict") == PASSED and not row.passed else row.passed
     line.put_unit(replace(row, passed=passed))
 
 
@@ -368,7 +370,7 @@ def resume(station: Station, post: Transport) -> int:
                 lost = [place for place in counted if place not in theirs and place[0] >= new[0].number]
                 station.plant.pages.put_chain(replace(chain, accepted=(newest.number, newest.hash)))
                 adopt(station, roster, new)
-                _tell_again(station, chain, lost, new)
+                _report_again(station, chain, lost, new)
             station.plant.alarms.end_about("fork", station.fingerprint)
             station.plant.end_restored()
             joined = station.plant.joined
@@ -395,7 +397,7 @@ def _strange(station: Station, found: Sequence[Page]) -> list[Page]:
     return [page for page in found if (page.number, page.hash) not in known]
 
 
-def _tell_again(station: Station, chain: Chain, lost: Sequence[tuple[int, str]], new: Sequence[Page]) -> None:
+def _report_again(station: Station, chain: Chain, lost: Sequence[tuple[int, str]], new: Sequence[Page]) -> None:
     adopted = {stated.get("id") for page in new for stated in page.events if isinstance(stated, dict)}
     for n, hash in lost:
         row = station.plant.pages.get(chain.chain, n, hash)
@@ -432,11 +434,11 @@ def close_page(station: Station, roster: Roster, *, empty: bool = False) -> Page
 
 def _fresh_heads(station: Station, own: Chain) -> dict[str, tuple[int, str]]:
     """Return what this station verified of others and did not report yet."""
-    said = {about: (n, hash) for who, about, n, hash in station.plant.pages.heads() if who == own.station}
+    known = {about: (n, hash) for who, about, n, hash in station.plant.pages.heads() if who == own.station}
     return {
         fingerprint: chain.counted
         for fingerprint, chain in station.plant.pages.chains().items()
-        if fingerprint != own.station and chain.counted[0] and said.get(fingerprint) != chain.counted
+        if fingerprint != own.station and chain.counted[0] and known.get(fingerprint) != chain.counted
     }
 
 

@@ -131,10 +131,10 @@ class JudgedEvidence:
 
     def to_json(self) -> dict[str, Any]:
         """One line of the result."""
-        told: dict[str, Any] = {"file": str(self.path), "good": self.good, "faults": list(self.faults)}
+        members: dict[str, Any] = {"file": str(self.path), "good": self.good, "faults": list(self.faults)}
         if self.evidence is not None:
             facts = self.evidence.facts
-            told |= {
+            members |= {
                 "uuid": self.evidence.uuid.hex(),
                 "verdict": self.evidence.verdict,
                 "station": facts.station,
@@ -144,8 +144,8 @@ class JudgedEvidence:
                 "finished": self.evidence.finished,
             }
         if self.error is not None:
-            told["error"] = failure_of(self.error)
-        return told
+            members["error"] = failure_of(self.error)
+        return members
 
 
 @dataclass

@@ -78,7 +78,7 @@ class StationYield:
     def to_json(self) -> dict[str, Any]:
         """One station of ``job status``."""
         steps = {name: {"median": middle, "worst": worst} for name, (middle, worst) in self.steps.items()}
-        told: dict[str, Any] = {
+        members: dict[str, Any] = {
             "station": self.station,
             "name": self.name,
             "allotment": self.allotment,
@@ -88,7 +88,7 @@ class StationYield:
             "attempts": self.attempts,
             "over": self.over,
         }
-        return {**told, "failures": dict(self.failures.most_common()), "steps": steps}
+        return {**members, "failures": dict(self.failures.most_common()), "steps": steps}
 
 
 def attempts_of(station: Station, job: str, files: Iterable[bytes] = ()) -> list[Attempt]:
@@ -127,16 +127,16 @@ def _of_pages(station: Station, job: str) -> Iterator[tuple[str, Attempt]]:
     for name, pages in station.plant.pages.chains().items():
         for page in station.plant.pages.each(pages.chain):
             for value in json.loads(page.content).get("events", []):
-                told = event.read(value)
-                if not isinstance(told, event.Event) or told.act != "evidence" or told.uuid is None:
+                stated = event.read(value)
+                if not isinstance(stated, event.Event) or stated.act != "evidence" or stated.uuid is None:
                     continue
-                if told.members["job"] != job:
+                if stated.members["job"] != job:
                     continue
-                counts[name, told.uuid] += 1
-                verdict = told.members["verdict"]
+                counts[name, stated.uuid] += 1
+                verdict = stated.members["verdict"]
                 code = None if verdict == PASSED else verdict.partition(": ")[2] or verdict
-                attempt = Attempt(name, told.uuid, told.members["unit"], counts[name, told.uuid], code, told.at)
-                yield told.members["sha256"], attempt
+                attempt = Attempt(name, stated.uuid, stated.members["unit"], counts[name, stated.uuid], code, stated.at)
+                yield stated.members["sha256"], attempt
 
 
 def yield_stats(station: Station, job: Job, attempts: Iterable[Attempt]) -> list[StationYield]:

@@ -52,7 +52,7 @@ class FactoryDatasheet:
     def findings(self) -> list[dict[str, str]]:
         """For the API and --json: ``severity``, ``message``."""
         both = (("error", self.errors), ("warning", self.warnings))
-        return [{"severity": severity, "message": text} for severity, said in both for text in said]
+        return [{"severity": severity, "message": text} for severity, texts in both for text in texts]
 
 
 class NotAdoptedError(PolicyError):
@@ -116,8 +116,8 @@ def _wrong_with(sheet: Sheet, blocks: Mapping[BlockId, bytes]) -> tuple[list[str
     warnings += [channel.value_problem for channel in sheet.channels if channel.value_problem and not channel.actuator]
     if any(code == AccessCode.CALIBRATION for _, code in blocks):
         for finding in guarding.check_calibration(blocks):
-            said = f"channel {finding.channel}: {finding.message}."
-            (errors if finding.severity == "error" else warnings).append(said)
+            text = f"channel {finding.channel}: {finding.message}."
+            (errors if finding.severity == "error" else warnings).append(text)
     return errors, warnings
 
 

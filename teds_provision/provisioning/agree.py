@@ -85,16 +85,18 @@ def _take_up(station: Station, node: Conversation, held: NodeKey) -> NodeKey:
     """
     uuid, record = node.uuid, held.record
     station.nodes.met_at(uuid, without_source(node.contact.bus))
-    told = read_identity(node) if record.state == "pending" and record.source == "import" else None
+    identity = read_identity(node) if record.state == "pending" and record.source == "import" else None
     if _is_taken_up(station, record):
         return held
     with station.durable("agree"):
-        if told is not None and told.epoch != record.epoch:
-            station.audit("key", uuid, "epoch corrected", key_id=record.key_id, said=record.epoch, epoch=told.epoch)
-            record = station.keys.correct_epoch(record, told.epoch)
+        if identity is not None and identity.epoch != record.epoch:
+            station.audit("key", uuid, "epoch corrected", key_id=record.key_id, said=record.epoch, epoch=identity.epoch)
+            record = station.keys.correct_epoch(record, identity.epoch)
         station.pins.settled(uuid)
         # what is signed without the node is for this epoch
-        station.nodes.remember(uuid, epoch=record.epoch, **({} if told is None else {"sequence": told.sequence}))
+        station.nodes.remember(
+            uuid, epoch=record.epoch, **({} if identity is None else {"sequence": identity.sequence})
+        )
         if record.state == "pending" or station.keys.outdated(record):
             _activate(station, record)
     return NodeKey(record, held.key)
@@ -166,16 +168,16 @@ def unknown_key(station: Station, node: Conversation) -> PolicyError:
     if another is not None:
         return another
     elsewhere = agreed_elsewhere(station, node)
-    said = "it answers that it knows none of the keys held here"
+    text = "it answers that it knows none of the keys held here"
     if elsewhere and _signed_for_another_ca(station, node.uuid, _shown_security(node)):
-        return PolicyError(f"No session with node {uuid}: {said}; {elsewhere}.", hint=OTHER_OWNER_REMEDY)
+        return PolicyError(f"No session with node {uuid}: {text}; {elsewhere}.", hint=OTHER_OWNER_REMEDY)
     if elsewhere:
         return PolicyError(
-            f"No session with node {uuid}: {said}; {elsewhere}.",
+            f"No session with node {uuid}: {text}; {elsewhere}.",
             hint=f"Use it at that station, or have the key handed over. To take it over, tap it: agree {uuid} --rotate",
         )
     return PolicyError(
-        f"No session with node {uuid}: {said}. That answer is unsigned and proves nothing.",
+        f"No session with node {uuid}: {text}. That answer is unsigned and proves nothing.",
         hint=f"Try it on the reader. If it was reset or its key was rotated elsewhere, tap it: agree {uuid} --rotate",
     )
 
@@ -187,11 +189,11 @@ def agreed_elsewhere(station: Station, node: Conversation) -> str:
     and the new owner may not have signed one yet.
     """
     held = max((record.epoch for record in station.keys.keys_of(node.uuid)), default=0)
-    said = node.identity.epoch
-    if said <= held:
+    offered = node.identity.epoch
+    if offered <= held:
         return ""
     how = "keyed elsewhere by tap or rotated by another holder (unverified)"  # a plain Identify cannot distinguish them
-    hint = f"it reports key epoch {said}, after {held} here: {how}"
+    hint = f"it reports key epoch {offered}, after {held} here: {how}"
     octets = _shown_security(node)
     try:
         shown = security.decode(octets)
@@ -392,8 +394,8 @@ def _enlist(station: Station, entry: WhitelistEntry) -> None:
         return
     station.pins.put(entry)
     if present is None:
-        told = {"fingerprint": entry.fingerprint, "assurance": entry.assurance}
-        station.audit("whitelist", entry.uuid, "added", **told)
+        facts = {"fingerprint": entry.fingerprint, "assurance": entry.assurance}
+        station.audit("whitelist", entry.uuid, "added", **facts)
 
 
 def _may_return(station: Station, who: IdentifiedNode) -> bool:
@@ -539,9 +541,9 @@ def reset_node(station: Station, node: Conversation, who: IdentifiedNode) -> Res
         station.keys.remove(who.uuid)
         station.nodes.remember(who.uuid, state=int(NodeState.FACTORY), retired=None)
         station.datasheets.forget_reading(who.uuid)
-        told = {"challenge": receipt.challenge.hex(), "proof": receipt.proof.hex()}
-        station.plant.record_event("reset", who.uuid, epoch=receipt.epoch, point=who.point.hex(), **told)
-        station.audit("reset", who.uuid, "done", epoch=receipt.epoch, **told)
+        facts = {"challenge": receipt.challenge.hex(), "proof": receipt.proof.hex()}
+        station.plant.record_event("reset", who.uuid, epoch=receipt.epoch, point=who.point.hex(), **facts)
+        station.audit("reset", who.uuid, "done", epoch=receipt.epoch, **facts)
     return receipt
 
 

@@ -415,12 +415,12 @@ class BatchRun:
         done: ProvisionResult | None = None
         error: TedsProvisionError | None = None
         known = self._station.nodes.get(uuid)
-        told = NodeReporter(self._reporter, known.name if known is not None and known.name else uuid.hex())
+        reporter = NodeReporter(self._reporter, known.name if known is not None and known.name else uuid.hex())
         try:
-            with Conversation(contact, notice=told.notice) as node:
+            with Conversation(contact, notice=reporter.notice) as node:
                 if self._was_finished_elsewhere(node):
                     return None
-                done = self._provision(node, operator, told)
+                done = self._provision(node, operator, reporter)
             error = self._lacks_calibration(uuid, done.image)
         except VaultLockedError:  # of the whole command, and of no board
             raise

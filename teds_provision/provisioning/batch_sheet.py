@@ -105,12 +105,12 @@ class BatchTotals:
         """What the command ends with: None if all passed, else the worst error."""
         if not self.failed and not self.skipped:
             return None
-        told = f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped."
+        text = f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped."
         if isinstance(self.worst, NoNodeError):  # told nowhere else: no board came whose error it would be
-            told = f"{told} {self.worst.message}"
+            text = f"{text} {self.worst.message}"
         kind = type(self.worst) if self.worst is not None else PolicyError
         known = kind if kind.__init__ is TedsProvisionError.__init__ else PolicyError
-        return known(told, hint="Run the same command again to continue with the rest.")
+        return known(text, hint="Run the same command again to continue with the rest.")
 
 
 def worse(one: TedsProvisionError | None, other: TedsProvisionError | None) -> TedsProvisionError | None:
@@ -294,12 +294,12 @@ class _SheetReader:
             label = read_label(values.get(name, ""))
             if label is None:
                 continue
-            said = {"uuid": label[0].hex(), "fingerprint": label[1]}
+            facts = {"uuid": label[0].hex(), "fingerprint": label[1]}
             other = "uuid" if name == "fingerprint" else "fingerprint"
             digits = re.sub(r"[\s:-]", "", values.get(other, "")).lower().removeprefix("0x")
-            if digits and read_label(values[other]) is None and not said[other].startswith(digits):
-                self.wrong(line, f"{other}: {values[other][:48]!a}, and the label in {name} says {said[other]}")
-            values.update(said)
+            if digits and read_label(values[other]) is None and not facts[other].startswith(digits):
+                self.wrong(line, f"{other}: {values[other][:48]!a}, and the label in {name} says {facts[other]}")
+            values.update(facts)
 
     def _digits(self, line: int, what: str, text: str, form: re.Pattern[str], rule: str) -> str | None:
         if not text:
@@ -390,10 +390,10 @@ class Progress:
 
     def _read_progress(self) -> dict[str, Any]:
         try:
-            told = json.loads(read_limited(self._path, _MAX_OCTETS, "progress of a sheet", follow=False))
+            document = json.loads(read_limited(self._path, _MAX_OCTETS, "progress of a sheet", follow=False))
         except (NotFoundError, ValueError):
             return {}
-        rows = told.get("rows") if isinstance(told, dict) else None
+        rows = document.get("rows") if isinstance(document, dict) else None
         return rows if isinstance(rows, dict) else {}
 
     def _matched(self, kept: dict[str, Any]) -> Iterator[tuple[SheetRow, Any]]:
@@ -482,8 +482,8 @@ class Progress:
 
     def _write(self) -> None:
         self._there = {str(number): asdict(row) for number, row in self.rows.items()}
-        told = {"sheet": str(self.sheet.path.resolve()), "rows": self._there}
-        write_whole(self._path, json.dumps(told, indent=1).encode())
+        document = {"sheet": str(self.sheet.path.resolve()), "rows": self._there}
+        write_whole(self._path, json.dumps(document, indent=1).encode())
 
     @property
     def open(self) -> list[SheetRow]:
@@ -647,25 +647,25 @@ def write_report(path: Path, progress: Progress, about: ReportHead) -> None:
 
 
 def _rows(progress: Progress) -> list[tuple[str, ...]]:
-    told = []
+    rows = []
     for row in progress.sheet.rows:
         kept, order = progress.rows[row.number], row.prepared.order
         uuid = kept.uuid or (row.uuid.hex() if row.uuid is not None else "")
         values = (row.number, uuid, order.name or "", order.profile or "", kept.result or "not reached", kept.tries)
-        told.append((*map(str, values), str(kept.first).lower(), str(kept.seconds), kept.time, kept.message))
-    return told
+        rows.append((*map(str, values), str(kept.first).lower(), str(kept.seconds), kept.time, kept.message))
+    return rows
 
 
 def _totals(totals: BatchTotals) -> list[tuple[str, str]]:
     share = "" if totals.first_pass is None else f"{totals.first_pass:.4f}"
-    told = [
+    rows = [
         ("passed", str(totals.passed)),
         ("failed", str(totals.failed)),
         ("skipped", str(totals.skipped)),
         ("seconds", f"{totals.seconds:.3f}"),
         ("first_pass", share),
     ]
-    return told + [(f"seconds of {name}", f"{seconds:.4f}") for name, seconds in totals.steps.items()]
+    return rows + [(f"seconds of {name}", f"{seconds:.4f}") for name, seconds in totals.steps.items()]
 
 
 def _csv(rows: Sequence[Sequence[str]], totals: BatchTotals) -> str:
@@ -708,9 +708,9 @@ def _html(name: str, rows: Sequence[Sequence[str]], totals: BatchTotals, about: 
 def _sums(totals: BatchTotals) -> list[tuple[str, str]]:
     share = "none was tried" if totals.first_pass is None else f"{totals.first_pass:.1%}"
     counts = [("passed", totals.passed), ("failed", totals.failed), ("skipped or not reached", totals.skipped)]
-    told = [(what, str(count)) for what, count in counts]
-    told += [("first-pass yield", share), ("seconds in all", f"{totals.seconds:.1f}")]
-    return told + [(f"seconds of {name}, mean", f"{seconds:.2f}") for name, seconds in totals.steps.items()]
+    rows = [(what, str(count)) for what, count in counts]
+    rows += [("first-pass yield", share), ("seconds in all", f"{totals.seconds:.1f}")]
+    return rows + [(f"seconds of {name}, mean", f"{seconds:.2f}") for name, seconds in totals.steps.items()]
 
 
 def _for_people(row: Sequence[str]) -> list[str]:

@@ -128,9 +128,9 @@ def misfit(image: Image, profile: Profile) -> str:
     wanted = {channel.number: channel for channel in profile.channels}
     if own.keys() != wanted.keys() or not own:
         return f"Its channels are {_listed(own)}, not {_listed(wanted)}."
-    told = differences(image.blocks, profile)
-    if told:
-        return told[0]
+    changes = differences(image.blocks, profile)
+    if changes:
+        return changes[0]
     for number, channel in sorted(own.items()):
         mine, meant = replace(channel.units, extension=0), replace(wanted[number].units, extension=0)
         if not channel.units_stated or mine != meant:
@@ -259,11 +259,13 @@ def operate(node: Conversation, channel: int, digest: bytes, *, lease: int, dead
             f"to measure with {named}" if channel else "to measure",
         )
     except NodeRefusedError as refusal:
-        said = next((said for reason, said in _OF_OPERATE.items() if reason == refusal.reason), None)
-        if said is None:
+        reason_text = next(
+            (reason_text for reason, reason_text in _OF_OPERATE.items() if reason == refusal.reason), None
+        )
+        if reason_text is None:
             raise
-        words = f"{said[0].format(named)} (reason {refusal.reason})."
-        raise NodeRefusedError(words, reason=refusal.reason, hint=said[1]) from None
+        words = f"{reason_text[0].format(named)} (reason {refusal.reason})."
+        raise NodeRefusedError(words, reason=refusal.reason, hint=reason_text[1]) from None
 
 
 _OF_OPERATE: Final = {
@@ -353,8 +355,8 @@ def _bears(node: Conversation, channel: Channel, digest: bytes) -> bool | None:
 
 
 def _read(node: Conversation, sheet: Sheet, sensors: list[Channel], digest: bytes) -> Iterator[dict[str, Any]]:
-    told = OperationReply.decode(node.request(OPERATION, "to tell its mode")).channels
-    taken = {number for number, (state, _) in told.items() if state & ChannelState.CLAIMED_BY_OTHER}
+    channels = OperationReply.decode(node.request(OPERATION, "to report its mode")).channels
+    taken = {number for number, (state, _) in channels.items() if state & ChannelState.CLAIMED_BY_OTHER}
     free = [number for number in sensors if number.number not in taken]
     readers = {channel.number: ChannelInterpreter(sheet, channel.number) for channel in free}
     try:
@@ -386,8 +388,8 @@ def require_working_hardware(node: Conversation, image: Image) -> None:
     served = [channel for channel in sheet.channels if _bears(node, channel, digest)]
     if not served:
         return
-    told = OperationReply.decode(node.request(OPERATION, "to tell its mode")).channels
-    taken = {number for number, (state, _) in told.items() if state & ChannelState.CLAIMED_BY_OTHER}
+    channels = OperationReply.decode(node.request(OPERATION, "to report its mode")).channels
+    taken = {number for number, (state, _) in channels.items() if state & ChannelState.CLAIMED_BY_OTHER}
     free = [channel for channel in served if not channel.actuator and channel.number not in taken]
     if free and not any(_gives_value(node, channel, digest) for channel in free[:_TRIED]):
         raise BadDataError("No sensor of the board gives a valid value.")

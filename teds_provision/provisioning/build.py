@@ -277,8 +277,8 @@ def compose(
     changed = order.profile is None and before is not None and before != digest
     if changed:
         warnings += (f"Profile {wanted} has changed since this node's datasheet was built.",)
-    told = merged((*passed, *warnings, *made.warnings))
-    return ComposedTeds(profile, wanted, kept, calibrations, made.blocks, told, digest, changed)
+    warned = merged((*passed, *warnings, *made.warnings))
+    return ComposedTeds(profile, wanted, kept, calibrations, made.blocks, warned, digest, changed)
 
 
 def digest_of(profile: Profile) -> str:
@@ -325,9 +325,9 @@ def content_digests(prepared: PreparedOrder) -> tuple[str, str]:
 
 def _digest(profile: Profile) -> bytes:
     blocks = _built_of(profile, _NOBODY, {}, None, 2007).blocks
-    said = [[*block, octets.hex()] for block, octets in sorted(blocks.items())]
+    entries = [[*block, octets.hex()] for block, octets in sorted(blocks.items())]
     demands = [repr(channel.calibration) for channel in profile.channels]
-    return hashlib.sha256(json.dumps([said, demands]).encode()).digest()
+    return hashlib.sha256(json.dumps([entries, demands]).encode()).digest()
 
 
 def _absolute_profile(profile: str | None) -> str | None:
@@ -510,9 +510,9 @@ def build(
     prepared = named_for(station, uuid, prepare(station, order, uuid))
     has = has or known_image(station, uuid)
     if has is not None and prepared.profile is not None and not order.retype:
-        told = differences(has.blocks, prepared.profile, prepared.calibrations or ())
-        if told and not is_remembered(station, uuid, order.profile, factory=False):
-            (retype or require_board_type)(uuid, told)
+        changes = differences(has.blocks, prepared.profile, prepared.calibrations or ())
+        if changes and not is_remembered(station, uuid, order.profile, factory=False):
+            (retype or require_board_type)(uuid, changes)
     pending, draft = pending_image(station, uuid, has), station.datasheets.draft(uuid)
     name = own_name(station, pending, draft.profile) if pending is not None and draft is not None else None
     plan = compose(station, uuid, prepared, pending or has, name=name, edition=edition)

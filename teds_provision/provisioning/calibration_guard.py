@@ -92,10 +92,10 @@ def _joined(head: str, numbers: list[int], rest: str) -> str:
     if len(numbers) == 1:
         return f"{head} {numbers[0]}{rest}"
     whole = numbers == list(range(numbers[0], numbers[-1] + 1))
-    told = f"{numbers[0]} to {numbers[-1]}" if whole else ", ".join(map(str, numbers))
+    text = f"{numbers[0]} to {numbers[-1]}" if whole else ", ".join(map(str, numbers))
     if rest.startswith(" has "):
         rest = f" have {rest.removeprefix(' has ')}"
-    return f"{head}s {told}{rest}"
+    return f"{head}s {text}{rest}"
 
 
 def _finding_text(finding: GuardFinding) -> str:

@@ -561,11 +561,11 @@ def write_at(
         visit.session()
         if not retyped:
             channels = {channel for channel, _ in wanted}
-            told = differences(shown_by(visit.node, channels), wanted)
+            changes = differences(shown_by(visit.node, channels), wanted)
             profile = facts.get("profile")
             known = isinstance(profile, str) and is_remembered(station, uuid, profile, factory=False)
-            if told and not known:
-                operator.retype(uuid, told)
+            if changes and not known:
+                operator.retype(uuid, changes)
         written = write(
             station,
             visit.node,
@@ -653,9 +653,9 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
     keys = known_node_keys(station, uuid, has or image)
     guard(station, image, has, order.accept_calibration, record=not order.dry_run)
     changes = diff_blocks(has.unsigned_blocks() if has else {}, image.unsigned_blocks())
-    told = tuple(change.text for change in changes)
+    changed = tuple(change.text for change in changes)
     if order.dry_run:
-        return SignReport(SignResult(image, present.sequence, reused=False), told)
+        return SignReport(SignResult(image, present.sequence, reused=False), changed)
     signed = sign(
         station,
         keys,
@@ -666,7 +666,7 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
         earlier=_signed_before(image, draft),
     )
     _keep(station, order, signed, draft)
-    return SignReport(signed, told)
+    return SignReport(signed, changed)
 
 
 @dataclass(frozen=True)

@@ -87,9 +87,9 @@ def plan_sheet(
         )
     keep = {block: present.image.blocks[block] for block in present.read_only}
     image = without_stale_certificates(present.image, Image(node.uuid, {**keep, **under(blocks, node.uuid)}))
-    told = () if retype else differences(present.image.blocks, image)
-    if told:
-        require_board_type(node.uuid, told)
+    differing = () if retype else differences(present.image.blocks, image)
+    if differing:
+        require_board_type(node.uuid, differing)
     same = {
         number: calibration
         for number, calibration in teds_calibrations(present.image).items()

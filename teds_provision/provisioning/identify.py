@@ -78,8 +78,8 @@ def identify(
         if pinned is not None:
             who = replace(who, whitelisted=pinned)
             station.pins.put(pinned)
-            told = {"fingerprint": pinned.fingerprint, "assurance": pinned.assurance}
-            station.audit("whitelist", node.uuid, "pinned", **told)
+            members = {"fingerprint": pinned.fingerprint, "assurance": pinned.assurance}
+            station.audit("whitelist", node.uuid, "pinned", **members)
         if known_key(station, node.uuid) != who.point:
             keep_shown(station, node.uuid, who.security_teds, by="identify")
     return who

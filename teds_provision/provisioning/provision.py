@@ -96,9 +96,9 @@ def verify_only(station: Station, node: Conversation, line: ProductionLine, repo
                 with steps.step("verify") as step:
                     looked = verify_at_node(station, node, who)
                     step.take_verdict(looked.verified.verdict)
-                    told = differences(looked.image.blocks, prepared.profile) if prepared.profile is not None else ()
-                    if told:
-                        require_board_type(who.uuid, told)
+                    changes = differences(looked.image.blocks, prepared.profile) if prepared.profile is not None else ()
+                    if changes:
+                        require_board_type(who.uuid, changes)
                 with steps.step("check") as step:
                     firmware = read_firmware(node)
                     passed = looked.verified.verdict == "authentic" and node.sealed
@@ -275,8 +275,8 @@ class _Run:
         # before it becomes ours, or costs a unit
         if prepared.profile is not None and (who.state == NodeState.FACTORY or self.line is not None):
             shown = shown_by(self.node, {channel.number for channel in prepared.profile.channels})
-            told = differences(shown, prepared.profile, prepared.calibrations or ())
-            self._require_its_board(who, prepared, told)
+            changes = differences(shown, prepared.profile, prepared.calibrations or ())
+            self._require_its_board(who, prepared, changes)
         demand = self._firmware_demand(who, prepared)
         if demand is not None:  # a hint outside a session: it may refuse, never permit
             require_firmware(who.uuid, demand, read_firmware(self.node))
@@ -308,14 +308,14 @@ class _Run:
         known = self.station.nodes.get(who.uuid)
         return FirmwareDemands(self.station.home).of(known.profile if known is not None else None)
 
-    def _require_its_board(self, who: IdentifiedNode, prepared: PreparedOrder, told: tuple[str, ...]) -> None:
+    def _require_its_board(self, who: IdentifiedNode, prepared: PreparedOrder, changes: tuple[str, ...]) -> None:
         """Ask, or refuse, if the board claims another type; only the first of the two checks asks."""
         wanted = prepared.order.profile
-        if not told or prepared.order.retype or self._retyped:
+        if not changes or prepared.order.retype or self._retyped:
             return
         if is_remembered(self.station, who.uuid, wanted, factory=who.state == NodeState.FACTORY):
             return
-        self.operator.retype(who.uuid, told)
+        self.operator.retype(who.uuid, changes)
         self._retyped = True
 
     def _identify(self) -> IdentifiedNode:
@@ -373,8 +373,8 @@ class _Run:
     def _build(self, who: IdentifiedNode, prepared: PreparedOrder, present: NodeSnapshot) -> Proposal:
         with self.steps.step("build") as step:
             if prepared.profile is not None:  # before a calibration is held against a channel that it is not of
-                told = differences(present.image.blocks, prepared.profile, prepared.calibrations or ())
-                self._require_its_board(who, prepared, told)
+                changes = differences(present.image.blocks, prepared.profile, prepared.calibrations or ())
+                self._require_its_board(who, prepared, changes)
             brings = prepared.order.adopt and present.identity.state != NodeState.PROVISIONED
             proposal = self._adopted(prepared, present) if brings else propose(self.station, prepared, present)
             self._require_its_board(who, prepared, differences(present.image.blocks, proposal.image))

@@ -105,8 +105,8 @@ def judge_reading(
     more: Sequence[Check] = (),
 ) -> tuple[NodeReading, NodeVerdict]:
     """Return the row of a reading and the verdict on it; nothing is kept yet. See :func:`keep_read`."""
-    said, signers = static_checks(image, known)
-    octets = [*said, *more]
+    checks, signers = static_checks(image, known)
+    octets = [*checks, *more]
     row = NodeReading(image.uuid, utc_now(), by, c, True, _packed(image), *signers, _written(octets))
     return row, _judged(station, row, keyed=is_keyed(station, image.uuid))
 
@@ -151,8 +151,8 @@ def cached_image_if_current(
         return None
     if image.security != security_teds or _packed(image) != row.digests or row.failed - MERELY_UNSIGNED:
         return None
-    said, _ = static_checks(image, known)
-    if {check.name for check in said if check.result == "failed"} - MERELY_UNSIGNED:
+    checks, _ = static_checks(image, known)
+    if {check.name for check in checks if check.result == "failed"} - MERELY_UNSIGNED:
         return None
     if not row.is_of_this_start(node.open_counter):
         station.datasheets.started_anew(node.uuid, node.open_counter)

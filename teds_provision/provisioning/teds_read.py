@@ -74,11 +74,11 @@ def _read_once(node: Conversation, block: BlockId, until: float | None) -> bytes
         if not segment or len(octets) >= total:
             return bytes(octets)
         if total > largest:
-            said = f"TEDS {block[1]} of channel {block[0]} claims {total} octets; at most {largest} are read."
+            text = f"TEDS {block[1]} of channel {block[0]} claims {total} octets; at most {largest} are read."
             raise (
-                BadDataError(said)
+                BadDataError(text)
                 if node.sealed
-                else GarbledError(f"{said} That is unverified: it was received outside a session.")
+                else GarbledError(f"{text} That is unverified: it was received outside a session.")
             )
 
 

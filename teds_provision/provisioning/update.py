@@ -239,11 +239,11 @@ def version_of(report: FirmwareReport) -> str:
 def require_free_actuators(node: Conversation) -> None:
     """Raise PolicyError if an actuator of the board is claimed, in this session or another one: a restart ends that."""
     try:
-        told = OperationReply.decode(node.request_idempotent(OPERATION, "to report its mode")).channels
+        channels = OperationReply.decode(node.request_idempotent(OPERATION, "to report its mode")).channels
     except NodeRefusedError:
         return  # it does not measure
     claims = ChannelState.CLAIMED_HERE | ChannelState.CLAIMED_BY_OTHER
-    claimed = [number for number, (state, _) in told.items() if state & ChannelState.ACTUATOR and state & claims]
+    claimed = [number for number, (state, _) in channels.items() if state & ChannelState.ACTUATOR and state & claims]
     if claimed:
         raise PolicyError(
             f"Actuator {claimed[0]} of the board is in use; the restart would end that.",

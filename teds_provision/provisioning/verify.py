@@ -324,17 +324,17 @@ def static_checks(image: Image, known: FreshnessFloor | None) -> tuple[list[Chec
 
     The image's own checks are cached for a moment: both the record of a write and the verdict need them.
     """
-    said = next((said for asked, said in tuple(_SAID) if asked is image), None)
-    if said is None:
+    cached = next((cached for asked, cached in tuple(_CHECKED) if asked is image), None)
+    if cached is None:
         proofs = _proofs(image)
-        said = proofs.shown, _by_itself(image, proofs)
-        _SAID.append((image, said))
-    shown, checks = said
+        cached = proofs.shown, _by_itself(image, proofs)
+        _CHECKED.append((image, cached))
+    shown, checks = cached
     return [*checks, *_not_older(shown, known)], Signers.from_security_teds(shown)
 
 
 _Shown = SecurityTeds | NotCanonicalError | None
-_SAID: Final[deque[tuple[Image, tuple[_Shown, tuple[Check, ...]]]]] = deque(maxlen=4)
+_CHECKED: Final[deque[tuple[Image, tuple[_Shown, tuple[Check, ...]]]]] = deque(maxlen=4)
 
 
 def judge(
@@ -447,8 +447,8 @@ def require_authentic(verified: Verification) -> None:
         )
     if verified.verdict == "unproven":
         raise unproven(verified.uuid, failed[_SESSION].why)
-    told = next((failed[name] for name in _FRESHNESS if name in failed), next(iter(reversed(failed.values()))))
-    raise BadDatasheetError(f"The datasheet is {verified.verdict}: {told.why or told.name}.")
+    reason = next((failed[name] for name in _FRESHNESS if name in failed), next(iter(reversed(failed.values()))))
+    raise BadDatasheetError(f"The datasheet is {verified.verdict}: {reason.why or reason.name}.")
 
 
 def _check(name: str, holds: bool, why: str, good: str = "") -> Check:
@@ -549,14 +549,14 @@ def _signer(
     """Check that the station that signed counts; in a plant by its roster and pages, which may not be here yet."""
     octets, key = security_teds or b"", signers.station_key or b""
     digest = octets if len(octets) == _DIGEST_OCTETS else hashlib.sha256(octets).digest()
-    said = station.policy.signing(certifier, key, digest)
-    if said is None:
+    signer = station.policy.signing(certifier, key, digest)
+    if signer is None:
         return (_station(station, signers, certifier),)
     name, digits = "signing station", fingerprint(key)[:16]
-    if said.result == "unproven":
-        return (Check(name, "skipped", digits), Check(_PAGES, "failed", said.why))
-    why = f"{digits}, {said.why}" if said.why and said.result == "passed" else said.why or digits
-    return (Check(name, said.result, why),)
+    if signer.result == "unproven":
+        return (Check(name, "skipped", digits), Check(_PAGES, "failed", signer.why))
+    why = f"{digits}, {signer.why}" if signer.why and signer.result == "passed" else signer.why or digits
+    return (Check(name, signer.result, why),)
 
 
 def _certificate(station: TrustSource, signers: Signers, certifier: bytes | None) -> Check:

@@ -118,7 +118,7 @@ def write(
     return WriteResult(octets, time.monotonic() - started, back)
 
 
-def _tell_written(station: Station, image: Image, known: NodeRecord, sequence: int) -> None:
+def _report_written(station: Station, image: Image, known: NodeRecord, sequence: int) -> None:
     """Report to the plant which datasheet the node has now, and its origin."""
     octets = image.security
     if station.plant.joined is not None and octets is not None:
@@ -163,7 +163,7 @@ def _conclude(
             else:
                 known = station.nodes.remember(image.uuid, **facts)
                 keep_firmware(station, image.uuid, firmware, signed=True)
-                _tell_written(station, image, known, sequence)
+                _report_written(station, image, known, sequence)
                 # A draft that is on the node now is none any more; a newer trial stays
                 draft = station.datasheets.draft(image.uuid)
                 if draft is not None and draft.image.unsigned_blocks() == image.unsigned_blocks():
@@ -195,7 +195,7 @@ def _percent(node: Conversation) -> int | None:
     if node.tapped or node.wired or not node.sealed:
         return None
     try:
-        power = PowerReply.decode(node.request_idempotent(POWER, "to tell its charge"))
+        power = PowerReply.decode(node.request_idempotent(POWER, "to report its charge"))
     except (NodeRefusedError, BadDataError):
         return None  # it has no battery, or does not measure
     return power.level if power.flags & PowerFlag.BATTERY else None

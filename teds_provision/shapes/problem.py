@@ -57,6 +57,6 @@ def failure_of(error: Explained) -> Failure:
 def problem_in(body: object, *, otherwise: str) -> Problem:
     """Return the error of a line or answer that was parsed; what it lacks has code ``failed`` and that message."""
     found = body.get("error") if isinstance(body, dict) else None
-    told = found if isinstance(found, dict) else {}
-    message = str(told.get("message") or otherwise)
-    return Problem(code=str(told.get("code", "failed")), message=message, hint=str(told.get("hint", "")))
+    members = found if isinstance(found, dict) else {}
+    message = str(members.get("message") or otherwise)
+    return Problem(code=str(members.get("code", "failed")), message=message, hint=str(members.get("hint", "")))

@@ -39,13 +39,13 @@ def datasheet_row(image: Image, profile: str | None, seen: str) -> tuple[Any, ..
     signed: str | None = None
     if image.security is not None:
         try:
-            said = security.decode(image.security)
+            document = security.decode(image.security)
         except BadDataError:
             pass
         else:
-            sequence, epoch = said.sequence, said.key_epoch
-            if said.signed:
-                signed = iso(datetime.fromtimestamp(int.from_bytes(said.last_modified[:4], "big"), UTC))
+            sequence, epoch = document.sequence, document.key_epoch
+            if document.signed:
+                signed = iso(datetime.fromtimestamp(int.from_bytes(document.last_modified[:4], "big"), UTC))
     return image.uuid, sequence, epoch, signed, profile, seen, bytes.fromhex(image.digest()), packed(image)
 
 

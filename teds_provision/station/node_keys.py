@@ -263,10 +263,10 @@ class NodeKeys:
     def remove(self, uuid: bytes) -> int:
         """Delete every key of a node; returns how many there were."""
         with self._store.together():
-            self._tell_forgotten(uuid, self.keys_of(uuid))
+            self._report_forgotten(uuid, self.keys_of(uuid))
             return self._store.change("DELETE FROM keys WHERE uuid = ?", (uuid,))
 
-    def _tell_forgotten(self, uuid: bytes, gone: Sequence[KeyRecord]) -> None:
+    def _report_forgotten(self, uuid: bytes, gone: Sequence[KeyRecord]) -> None:
         """Report to the plant that no key up to these epochs is left here."""
         if gone and self._plant.joined is not None:
             self._plant.record_event("forgot", uuid, epoch=max(record.epoch for record in gone))
@@ -299,7 +299,7 @@ class NodeKeys:
             before = self.keys_of(uuid)
             removed = self._delete(uuid, key_id)
             if removed and len(before) == 1:
-                self._tell_forgotten(uuid, before)
+                self._report_forgotten(uuid, before)
             return removed
 
     def _delete(self, uuid: bytes, key_id: str) -> bool:

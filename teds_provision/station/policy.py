@@ -55,7 +55,7 @@ class Policy:
         handovers: Handovers,
         row_macs: RowMacs,
         plant: Plant,
-        tell: Callable[[str], object],
+        notify: Callable[[str], object],
     ) -> None:
         self._store = store
         self._identity = identity
@@ -64,7 +64,7 @@ class Policy:
         self._handovers = handovers
         self._row_macs = row_macs
         self._plant = plant
-        self._tell = tell
+        self._notify = notify
         self._broken_trust: tuple[str, ...] = ()
 
     # -- trust -----------------------------------------------------------------------------------------------------
@@ -346,12 +346,12 @@ class Policy:
         )
         if self._broken_trust:
             names = ", ".join(self._broken_trust[:_SHOWN])
-            self._tell(f"Trust in {names} was changed by another program and does not count.")
+            self._notify(f"Trust in {names} was changed by another program and does not count.")
         strange = [
             name for name, mac, kind, values in self.decision_rows() if not self._row_macs.holds(mac, kind, values)
         ]
         if strange:
-            self._tell(f"Another program added {', '.join(strange[:_SHOWN])}, which does not count.")
+            self._notify(f"Another program added {', '.join(strange[:_SHOWN])}, which does not count.")
 
     def mac_rows(self, _sample: RowSample | None = None) -> Iterator[MacRow]:
         """Yield every trusted key, for a check of its MAC."""

@@ -83,7 +83,7 @@ class _DurableRun:
 class Station:
     """A base station (NCAP) on this machine."""
 
-    def __init__(self, store: Store, ask: Ask, tell: Callable[[str], object] = lambda text: None) -> None:
+    def __init__(self, store: Store, ask: Ask, notify: Callable[[str], object] = lambda text: None) -> None:
         self._store = store
         self._ask = ask
         self._vault: Vault | None = None
@@ -113,7 +113,7 @@ class Station:
         self.pins = Pins(store, self.nodes, self.datasheets, self.keys, self.row_macs, self.plant)
         self.handovers = Handovers(store)
         self.policy = Policy(
-            store, self.identity, self.keys, self.pins, self.handovers, self.row_macs, self.plant, tell
+            store, self.identity, self.keys, self.pins, self.handovers, self.row_macs, self.plant, notify
         )
         self.groups = Groups(store, store.home, self.plant)
         self.measurements = Measurements(store, self.groups, store.home)
@@ -131,14 +131,14 @@ class Station:
         )
 
     @classmethod
-    def open(cls, home: Path, *, ask: Ask, tell: Callable[[str], object] = lambda text: None) -> Station:
+    def open(cls, home: Path, *, ask: Ask, notify: Callable[[str], object] = lambda text: None) -> Station:
         """Open the station of ``home``; raises NotFoundError if init was never finished.
 
-        ``ask`` gives a passphrase when the vault opens, ``tell`` gets messages for the user.
+        ``ask`` gives a passphrase when the vault opens, ``notify`` gets messages for the user.
         """
         if not has_store(home):
             raise not_initialised(home)
-        station = cls(Store.open(home), ask, tell)
+        station = cls(Store.open(home), ask, notify)
         if not station.identity.is_complete():
             asked = station.identity.requested is not None
             station.close()
@@ -449,7 +449,7 @@ def initialise(
     keystore: str | None,
     ask: Ask,
     costs: object | None = None,
-    tell: Callable[[str], object] = lambda text: None,
+    notify: Callable[[str], object] = lambda text: None,
 ) -> tuple[Station, str]:
     """Make the station key and the CA key, or open what an earlier run made; returns it and why this keystore.
 
@@ -458,12 +458,12 @@ def initialise(
     station = Station.make(home, ask=ask)
     if station.identity.is_complete():
         return station, station.identity.keystore_why
-    told: set[str] = set()
+    reported: set[str] = set()
 
-    def tell_once(text: str) -> None:
-        if text not in told:
-            told.add(text)
-            tell(text)
+    def notify_once(text: str) -> None:
+        if text not in reported:
+            reported.add(text)
+            notify(text)
 
     def make(known: Ask) -> str:
         with StoreLock(home, command="init"):
@@ -472,7 +472,7 @@ def initialise(
             if station.identity.requested is not None:
                 raise not_certified()
             more: dict[str, Any] = {} if costs is None else {"costs": costs}
-            vault, why = vaults.create_vault(home, station.id, keystore, known, tell=tell_once, **more)
+            vault, why = vaults.create_vault(home, station.id, keystore, known, notify=notify_once, **more)
             key, ca = vault.identity(), vault.ca()
             if ca is None:
                 raise NotFoundError(

@@ -336,14 +336,14 @@ def _beyond_raw_range(calibration: Calibration, had: Channel, now: Channel, raw:
     if raw is None or before is None:
         return "" if raw == before else "it was made for another range of raw values"
     step = 4 * FLOAT32_STEP * max(map(abs, raw)) + (1.0 if now.sample is not None and now.sample.integer else 0.0)
-    told = f"raw {before[0]:.8g} to {before[1]:.8g}", f"raw {raw[0]:.8g} to {raw[1]:.8g}"
+    spans = f"raw {before[0]:.8g} to {before[1]:.8g}", f"raw {raw[0]:.8g} to {raw[1]:.8g}"
     if raw[0] < before[0] - step or raw[1] > before[1] + step:
-        return f"it was made for {told[0]}, and this channel gives {told[1]}"
+        return f"it was made for {spans[0]}, and this channel gives {spans[1]}"
     if now.actuator or max(abs(raw[0] - before[0]), abs(raw[1] - before[1])) <= step:
         return ""  # points beyond the range were taken when it was made for this very one
     part = next((given for given in calibration.inputs if given.channel == now.number), calibration.inputs[0])
     if part.boundaries[0] < raw[0] - step or part.boundaries[-1] > raw[1] + step:
-        return f"it covers raw {part.boundaries[0]:.8g} to {part.boundaries[-1]:.8g}, and this channel gives {told[1]}"
+        return f"it covers raw {part.boundaries[0]:.8g} to {part.boundaries[-1]:.8g}, and this channel gives {spans[1]}"
     return ""
 
 

@@ -176,8 +176,10 @@ def _nfc(moment: float, data: bytes) -> Record:
 
 
 def _message(moment: float, direction: Direction, data: bytes, comments: list[str]) -> Record:
-    said = {key: text[len(key) :] for text in comments for key in (_OPENED, _UUID, _LINK) if text.startswith(key)}
-    link, _, layer = said.get(_LINK, "").partition(" ")
+    comments_by_key = {
+        key: text[len(key) :] for text in comments for key in (_OPENED, _UUID, _LINK) if text.startswith(key)
+    }
+    link, _, layer = comments_by_key.get(_LINK, "").partition(" ")
     words = next((text for text in comments if not text.startswith((_OPENED, _UUID, _LINK))), "")
     return Record(
         moment,
@@ -186,7 +188,7 @@ def _message(moment: float, direction: Direction, data: bytes, comments: list[st
         "frame" if layer == "frame" else "message",
         data,
         words,
-        opened=bytes.fromhex(said[_OPENED]) if _OPENED in said else None,
-        sealed=_OPENED in said or words.endswith("not opened"),
-        uuid=said.get(_UUID, ""),
+        opened=bytes.fromhex(comments_by_key[_OPENED]) if _OPENED in comments_by_key else None,
+        sealed=_OPENED in comments_by_key or words.endswith("not opened"),
+        uuid=comments_by_key.get(_UUID, ""),
     )

@@ -39,7 +39,7 @@ class Record:
 
     def as_json(self) -> dict[str, Any]:
         """Return the record as in a file of lines and in ``trace show --json``, without members that do not apply."""
-        told: dict[str, Any] = {
+        members: dict[str, Any] = {
             "time": datetime.fromtimestamp(self.time, UTC).isoformat(timespec="microseconds").replace("+00:00", "Z"),
             "direction": self.direction,
             "link": self.link,
@@ -49,12 +49,12 @@ class Record:
             "octets": self.octets.hex(),
         }
         if self.opened is not None:
-            told["opened"] = self.opened.hex()
+            members["opened"] = self.opened.hex()
         if self.identifier is not None:
-            told |= {"identifier": f"{self.identifier:08x}", "fd": self.fd}
+            members |= {"identifier": f"{self.identifier:08x}", "fd": self.fd}
         if self.uuid:
-            told["uuid"] = self.uuid
-        return told
+            members["uuid"] = self.uuid
+        return members
 
 
 # A trace as lines: one JSON object each, the first says what the file is. Whoever is killed leaves whole lines.

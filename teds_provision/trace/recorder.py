@@ -22,8 +22,8 @@ from teds_provision.trace.record import Record, is_lines, read_lines
 PCAPNG = ".pcapng"
 
 
-def open_trace(path: Path, tell: Callable[[str], None]) -> Recorder:
-    """Make the file of a trace, mode 0600, never over another one; ``tell`` receives the notice about a full disk.
+def open_trace(path: Path, notify: Callable[[str], None]) -> Recorder:
+    """Make the file of a trace, mode 0600, never over another one; ``notify`` receives the notice about a full disk.
 
     Raises UsageError if ``path`` exists, NotFoundError if its folder is missing, else StoreError.
     """
@@ -36,7 +36,7 @@ def open_trace(path: Path, tell: Callable[[str], None]) -> Recorder:
         raise StoreError(
             f"The trace {path} cannot be written: {error.strerror}.", hint="Choose another file for --trace."
         ) from error
-    return Recorder(path, descriptor, tell)
+    return Recorder(path, descriptor, notify)
 
 
 class Recorder:
@@ -45,9 +45,9 @@ class Recorder:
     ``failure`` is why it is incomplete, "" if it is complete.
     """
 
-    def __init__(self, path: Path, descriptor: int, tell: Callable[[str], None]) -> None:
+    def __init__(self, path: Path, descriptor: int, notify: Callable[[str], None]) -> None:
         self.path, self.failure = path, ""
-        self._descriptor, self._tell = descriptor, tell
+        self._descriptor, self._notify = descriptor, notify
         self._lock = threading.Lock()
         form = pcapng if path.suffix == PCAPNG else line_form
         self._encode = pcapng.block if form is pcapng else line_form.line
@@ -86,9 +86,9 @@ class Recorder:
         opened: bytes | None = None,
     ) -> None:
         """Record a whole command or reply with its description, and its plain form if it was sealed."""
-        told = f"{words}, not opened" if sealed and opened is None else words
+        text = f"{words}, not opened" if sealed and opened is None else words
         self._put(
-            Record(time.time(), direction, link, "message", octets, told, opened=opened, sealed=sealed, uuid=uuid.hex())
+            Record(time.time(), direction, link, "message", octets, text, opened=opened, sealed=sealed, uuid=uuid.hex())
         )
 
     def close(self, *, keep_empty: bool = True) -> None:
@@ -118,7 +118,7 @@ class Recorder:
                 return
             except OSError as error:
                 self.failure = error.strerror or "it failed"
-        self._tell(f"The trace {self.path} ends here: {self.failure}. The command goes on.")
+        self._notify(f"The trace {self.path} ends here: {self.failure}. The command goes on.")
 
 
 # Reading a trace, in either form; a capture of CAN frames by another program is read as well.

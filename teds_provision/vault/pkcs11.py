@@ -434,8 +434,8 @@ def _folder() -> Path:
         parent.mkdir(parents=True, exist_ok=True)
         return private_folder(parent / f"teds-provision-{user}")
     except (OSError, RuntimeError) as error:
-        said = error.strerror if isinstance(error, OSError) else error
+        reason = error.strerror if isinstance(error, OSError) else error
         raise VaultError(
-            f"The folder {parent / f'teds-provision-{user}'} cannot be used: {said}.",
+            f"The folder {parent / f'teds-provision-{user}'} cannot be used: {reason}.",
             hint="Remove it and run the command again.",
         ) from error

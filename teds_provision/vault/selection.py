@@ -61,11 +61,11 @@ def create_vault(
     costs: Costs = PRODUCT,
     restored: str | None = None,
     with_ca: bool = True,
-    tell: Callable[[str], object] = lambda text: None,
+    notify: Callable[[str], object] = lambda text: None,
 ) -> tuple[Vault, str]:
     """Make the vault of a station, or open the one that an earlier run made; return it and the reason for the choice.
 
-    ``tell`` receives the reason, the place and the duration before a new passphrase is asked for. The caller holds the
+    ``notify`` gets reason, place and duration before a new passphrase is asked for. The caller holds the
     store, and does not wait for typing meanwhile (:func:`asked_first`).
 
     ``keystore`` is ``keyring``, ``file``, ``pkcs11:…`` (RFC 7512) or None: then the keyring if one works (proven by a
@@ -76,7 +76,7 @@ def create_vault(
 
     def asked(prompt: str, confirm: bool) -> str:
         if confirm:
-            tell(
+            notify(
                 f"{'' if keystore else 'No OS keyring was found. '}The station's keys will be stored in"
                 f" {home / 'vault.json'}, encrypted with a passphrase. Commands that use a key ask for it; after"
                 " teds-provision unlock they don't for a while. If you lose it, you can only restore from a backup."

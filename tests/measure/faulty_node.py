@@ -271,7 +271,7 @@ FAULTS: dict[str, Callable[..., None]] = {item.__name__: item for item in (*BEND
 
 def main() -> None:
     can, *given = sys.argv[1:]
-    pulse, server = RealtimeLoop(), CanServer(can, tell=lambda text: print(text, file=sys.stderr, flush=True))
+    pulse, server = RealtimeLoop(), CanServer(can, notify=lambda text: print(text, file=sys.stderr, flush=True))
     boards = []
     for word in given:
         fault, _, folder = word.partition("=")

@@ -48,7 +48,7 @@ class Scene:
         self.actuators = TopicActuators(
             VerifiedSession(node, SHEET, "00" * 32, "g"), self.messages.append, (1,), dead_man=dead_man,
             clock=clock(10**9),
-            turn=self.turn, mapping=threading.Lock(), echo=self.applied.append, tell=self.told.append,
+            turn=self.turn, mapping=threading.Lock(), echo=self.applied.append, notify=self.told.append,
         )  # fmt: skip
 
     def give(self, count: int) -> None:

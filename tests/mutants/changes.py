@@ -21,7 +21,7 @@ _COMPARISONS: dict[type[ast.cmpop], str] = {
     ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==", ast.Is: "is not",
     ast.IsNot: "is", ast.In: "not in", ast.NotIn: "in",
 }  # fmt: skip
-_SAID_ONLY = ("notice", "debug", "info", "warning", "warn", "note", "tell", "say", "_say", "_tell", "emit")
+_SAID_ONLY = ("notice", "debug", "info", "warning", "warn", "note", "tell", "say", "_say", "notify", "_notify", "emit")
 _DOERS = (ast.Call, ast.Await)
 _NAME = re.compile(r"[A-Za-z_]+")
 _JOINED = re.compile(r"[A-Z]?[a-z]+|[A-Z]+")

@@ -298,7 +298,7 @@ PATTERNS = (
     Pattern(
         "what a link repeats is published once",
         "LinkWatch._publish_notice",
-        "notice.text != self.state.told",
+        "notice.text != self.state.notice_text",
         "True",
         "tests/ncap/test_watching.py",
     ),

@@ -253,7 +253,7 @@ def test_stays_with_an_actuator_claimed(station: Stranger, hub: Hub, node: EchoN
 
 def test_an_equal_crc_is_told_to_a_person(hub: Hub, node: EchoNode) -> None:
     told: list[str] = []
-    server = CanServer(hub.spec, node, tell=told.append)
+    server = CanServer(hub.spec, node, notify=told.append)
     server.start()
     stranger = Stranger(hub.spec)
     try:

@@ -34,14 +34,14 @@ def test_the_plant_is_shown_with_conflicts_alarms_and_what_is_to_rotate(browser:
         south = certified(fresh.folder / "south", "south", north)
         signed = plant.owner.signed(north, plant.owner.add(north, request_of(south), frozenset({"keeper", "base"})))
         plant.apply_pages.put_roster(north, signed)
-        plant.owner.join(south, signed, url=None, told=[])
+        plant.owner.join(south, signed, url=None, events=[])
         south.pins.put(WhitelistEntry(NODE, "cd" * 32, assurance="tap"))
         north.pins.put(WhitelistEntry(NODE, "ab" * 32, assurance="tap"))
         with north.transaction():
             north.plant.record_event("agreed", NODE, fingerprint="ab" * 32, epoch=2, key_id="0123456789abcdef")
         for station in (south, north):
             plant.sync.sync(station, FolderTransport(stick))
-        plant.owner.join(north, signed, url=f"{plant.membership.FILES}{stick}", told=[])
+        plant.owner.join(north, signed, url=f"{plant.membership.FILES}{stick}", events=[])
         north.keys.demand_rotation(bytes(10), f"{REMOVED}station west (lost) has held this key")
         north.plant.alarms.put(Alarm("rolled-back", south.fingerprint, 3, "page 3 was there, and now 1 is the last"))
         south.close()

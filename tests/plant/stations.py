@@ -54,7 +54,7 @@ class Plant:
         station = certified(self.folder / name, name, self.north)
         self.change(plant.owner.add(self.north, request_of(station), frozenset(roles)))
         assert self.north.plant.roster is not None
-        plant.owner.join(station, self.north.plant.roster, url=None, told=list(plant.backlog.backlog(station)))
+        plant.owner.join(station, self.north.plant.roster, url=None, events=list(plant.backlog.backlog(station)))
         self.stations.append(station)
         return station
 

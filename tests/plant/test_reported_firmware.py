@@ -286,12 +286,12 @@ def test_a_station_of_an_earlier_version_goes_on_and_sees_all_after_its_upgrade(
         assert not [alarm.code for alarm in south.plant.alarms.all()]
         assert version(south, board) is None
     done = plants.sync(south)
-    assert any("read again" in line for line in done.told)
+    assert any("read again" in line for line in done.remarks)
     assert version(south, board) == ("1.2.0", "north")
     assert version(south, own) == ("1.2.0", "south")
     plants.sync(plants.north)
     assert version(plants.north, own) == ("1.2.0", "south")
-    assert not any("read again" in line for line in plants.sync(south).told)
+    assert not any("read again" in line for line in plants.sync(south).remarks)
     assert waiting(south) == []
 
 

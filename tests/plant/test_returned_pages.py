@@ -132,7 +132,7 @@ def test_a_row_that_was_lost_is_filled_until_its_station_is_added_again(loss: Lo
     loss.sync(loss.north, later)
     assert loss.pages_here(later, west) == loss.pages_here(west, west)
     loss.known(west)
-    assert any("rolled back" in line for line in loss.sync(west).told)
+    assert any("rolled back" in line for line in loss.sync(west).remarks)
     loss.write(west)
     loss.sync(west, later)
     assert loss.pages_here(later, west) == loss.pages_here(west, west)
@@ -160,7 +160,7 @@ def test_nothing_new_is_one_round_trip_when_pages_were_handed_in(loss: Loss) -> 
         post.registry()
         before = way.sent
         done = plant_room.sync.sync(loss.south, post)
-        assert (done.returned, done.fetched, done.told) == (0, 0, [])
+        assert (done.returned, done.fetched, done.remarks) == (0, 0, [])
         assert way.sent - before == 1
         post.close()
 
@@ -265,9 +265,9 @@ def test_the_limit_of_a_member_is_shown_and_others_carry_on(loss: Loss) -> None:
     )
     done = loss.sync(loss.south)
     assert done.returned == 0
-    assert any("64 MiB" in line for line in done.told)
+    assert any("64 MiB" in line for line in done.remarks)
     assert loss.sync(loss.north).returned == len(loss.pages_here(loss.north, west))
-    assert loss.sync(loss.south, loss.south).told == []
+    assert loss.sync(loss.south, loss.south).remarks == []
 
 
 def test_a_database_of_schema_1_is_used_as_before_and_the_cure_is_named(loss: Loss) -> None:
@@ -276,11 +276,11 @@ def test_a_database_of_schema_1_is_used_as_before_and_the_cure_is_named(loss: Lo
     as_schema_1(loss.database)
     loss.write(loss.south)
     done = loss.sync(loss.south)
-    assert (done.pushed, done.returned, done.told) == (1, 0, [])
+    assert (done.pushed, done.returned, done.remarks) == (1, 0, [])
     loss.lose(loss.north, loss.south)
     as_schema_1(loss.database)
     for _ in range(2):
-        assert any("registry sql | psql" in line for line in loss.sync(loss.south).told)
+        assert any("registry sql | psql" in line for line in loss.sync(loss.south).remarks)
     loss.database.sql(registry_sql(loss.database.registry))
     assert loss.sync(loss.south).returned == len(loss.pages_here(loss.south, west))
 
@@ -308,6 +308,6 @@ def test_a_home_from_a_backup_finds_its_own_pages_among_those_handed_in(loss: Lo
         west.unlock()
         west.plant.begin_restored()
     loss.known(west)
-    assert "1 page that this station wrote before its backup is back" in loss.sync(west).told
+    assert "1 page that this station wrote before its backup is back" in loss.sync(west).remarks
     assert loss.pages_here(west, west)[newest - 1] == hash
     assert not west.plant.restored

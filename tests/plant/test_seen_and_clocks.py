@@ -29,13 +29,13 @@ def test_a_report_of_pages_that_are_missing_is_shown_until_a_person_has_seen_it(
 
     report(10_000)
     said = "witness saw page 10000 of north; the last one here is 0"
-    assert said in made.sync(south).told
-    assert said in made.sync(south).told
+    assert said in made.sync(south).remarks
+    assert said in made.sync(south).remarks
     assert acknowledge(south) == (0, 1)
-    assert made.sync(south).told == []
+    assert made.sync(south).remarks == []
     assert acknowledge(south) == (0, 0)
     report(10_001)
-    assert made.sync(south).told == ["witness saw page 10001 of north; the last one here is 0"], "one that is new"
+    assert made.sync(south).remarks == ["witness saw page 10001 of north; the last one here is 0"], "one that is new"
     made.close()
 
 
@@ -61,7 +61,7 @@ def test_the_own_roster_is_never_refused_for_a_clock_that_was_put_back(
     made.round()
     past = datetime.now(UTC) - timedelta(days=days)
     monkeypatch.setattr("teds_provision.plant.apply_pages.now", lambda: past)
-    assert made.sync(made.north).told == []
+    assert made.sync(made.north).remarks == []
     made.close()
 
 

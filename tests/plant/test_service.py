@@ -55,7 +55,7 @@ def synced(station: Station) -> None:
 
 def watching(station: Station) -> tuple[PlantWatch, list[dict[str, Any]], list[float]]:
     live, told, changed = Live(), list[dict[str, Any]](), list[float]()
-    live.told = told.append
+    live.on_event = told.append
     return PlantWatch(station, live, lambda: changed.append(time.monotonic())), told, changed
 
 

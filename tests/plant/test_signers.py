@@ -137,7 +137,7 @@ def test_a_store_of_today_joins_its_owner_retires_it_and_its_datasheets_stay(pla
     assert plants.north.plant.roster is not None
     told = list(plant.backlog.backlog(west))
     assert {"pinned", "agreed", "signed"} <= {act for act, _, _ in told}
-    plant.owner.join(west, plants.north.plant.roster, url=None, told=told)
+    plant.owner.join(west, plants.north.plant.roster, url=None, events=told)
     plants.stations.append(west)
     plants.round()
     plants.change(plant.owner.draft_removal(plants.north, "west", "retired", None))

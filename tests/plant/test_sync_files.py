@@ -242,7 +242,7 @@ def test_a_roster_that_lies_behind_is_no_news(plants: Plant) -> None:
     west = plants.member("west", "line")  # it never saw the first ones
     done = plants.sync(west)
     assert (plants.stick / "roster" / f"{first}.jws").exists()
-    assert done.told == []
+    assert done.remarks == []
 
 
 def test_a_clock_a_year_ahead_makes_no_roster_that_counts(plants: Plant) -> None:
@@ -254,7 +254,7 @@ def test_a_clock_a_year_ahead_makes_no_roster_that_counts(plants: Plant) -> None
     signed = plant.owner.signed(plants.north, ahead)
     FolderTransport(plants.stick).post_roster(signed.version, signed.hash, signed.octets)
     done = plants.sync(south)
-    assert any("check this machine's clock" in line for line in done.told)
+    assert any("check this machine's clock" in line for line in done.remarks)
     assert south.plant.roster is not None
     assert south.plant.roster.version == version
 

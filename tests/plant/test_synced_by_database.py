@@ -108,7 +108,7 @@ def test_nothing_new_is_one_round_trip(office: Office) -> None:
         post.registry()
         before = way.sent
         done = sync(south, post)
-        assert (done.pushed, done.fetched, done.told) == (0, 0, [])
+        assert (done.pushed, done.fetched, done.remarks) == (0, 0, [])
         assert way.sent - before == 1
         post.close()
 
@@ -136,7 +136,7 @@ def test_a_database_that_was_lost_is_filled_by_its_members(office: Office, clust
     office.database.sql(registry_sql(office.database.registry))
     for station in (office.north, south):
         office.known(station)
-    told = office.sync(office.north).told + office.sync(south).told
+    told = office.sync(office.north).remarks + office.sync(south).remarks
     assert any("rolled back" in line for line in told)
     assert office.database.sql("select n, jws from registry.page order by n, jws")[: len(before)] == before
     assert office.database.sql("select count(distinct jws) from registry.roster") == [["1"]]
@@ -149,7 +149,7 @@ def test_a_database_of_yesterday_is_brought_up_to_today(office: Office) -> None:
     office.sync(office.north)
     newest = office.north.plant.pages.chains()[office.north.fingerprint].counted[0]
     office.database.sql(mend_sql(office.north.fingerprint, newest))  # as if it had not come yet
-    told = office.sync(office.north).told
+    told = office.sync(office.north).remarks
     assert any(f"page {newest} was there, and now {newest - 1} is the last" in line for line in told), told
     assert [alarm.code for alarm in office.north.plant.alarms.all()] == ["rolled-back"]
     office.sync(south)

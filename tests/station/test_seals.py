@@ -59,7 +59,7 @@ def opened(home: Path) -> Iterator[Open]:
     def open_one(said: list[str] | None = None, ask: Callable[[str, bool], str] = ask) -> Station:
         forget_vaults()
         told: list[str] = [] if said is None else said
-        stations.append(Station.open(home, ask=ask, tell=told.append))
+        stations.append(Station.open(home, ask=ask, notify=told.append))
         return stations[-1]
 
     yield open_one

@@ -138,8 +138,8 @@ def _zero_lines(done: ZeroResult, *, dry_run: bool) -> str:
     changes = "".join(f"\n  {text}" for text in done.changes)
     if dry_run:
         return f"Plan: {read} ({seen}); it would read {channel.show_reading(done.after)}, {offset}.{changes}"
-    said = f"{read} ({seen}) and now reads {channel.show_reading(done.after)}: {offset}."
-    return f"{said}{changes}\nWritten and verified, sequence {done.sequence}."
+    sentence = f"{read} ({seen}) and now reads {channel.show_reading(done.after)}: {offset}."
+    return f"{sentence}{changes}\nWritten and verified, sequence {done.sequence}."
 
 
 @command(
@@ -256,13 +256,13 @@ def fit(
         fitted, warnings = dict(prepared.calibrations or {}), prepared.warnings
     else:
         fitted = teds.calibration.fit_points(text, str(file), method=method, degree=degree)
-    told = [_fit_json(calibration) for _, calibration in sorted(fitted.items())]
+    fits = [_fit_json(calibration) for _, calibration in sorted(fitted.items())]
     for warning in warnings:
         app.warn(warning)
-    result = {"file": str(file), **told[0], "channels": told, "warnings": list(warnings)}
+    result = {"file": str(file), **fits[0], "channels": fits, "warnings": list(warnings)}
     if dcc is not None:
         result["dcc"] = _write_dcc(app, dcc, laboratory, fitted, file, text)
-    app.emit(result, lambda console: _fits(console, [calibration for _, calibration in sorted(fitted.items())], told))
+    app.emit(result, lambda console: _fits(console, [calibration for _, calibration in sorted(fitted.items())], fits))
 
 
 def _write_dcc(
@@ -307,18 +307,18 @@ def _rms(values: Sequence[float]) -> float:
     return math.sqrt(sum(value * value for value in values) / len(values))
 
 
-def _fits(console: Console, fitted: Sequence[Calibration], told: Sequence[dict[str, Any]]) -> None:
+def _fits(console: Console, fitted: Sequence[Calibration], fits: Sequence[dict[str, Any]]) -> None:
     from rich.table import Table
 
-    for calibration, said in zip(fitted, told, strict=True):
+    for calibration, fit_json in zip(fitted, fits, strict=True):
         unit = calibration.unit.text
         table = Table("raw", f"value [{unit}]", "fit", "residual", box=None, pad_edge=False)
-        for row in said["residuals"]:
+        for row in fit_json["residuals"]:
             table.add_row(*(f"{row[name]:.6g}" for name in ("raw", "value", "fit")), f"{row['residual']:+.3g}")
         print_table(console, table)
         console.print(teds.calibration.sentence(calibration), markup=False)
-        if said["left_out"] is not None:
-            worst, rms = said["left_out"]["maximum"], said["left_out"]["rms"]
+        if fit_json["left_out"] is not None:
+            worst, rms = fit_json["left_out"]["maximum"], fit_json["left_out"]["rms"]
             console.print(
                 f"Leave-one-out error of the inner points: up to {worst:.3g} {unit}, rms {rms:.3g} {unit}.",
                 markup=False,

@@ -151,7 +151,7 @@ def measure(
     _propose_rate(app, job, uuids)
     ended = _run(app, job, links, uuids, duration)
     again = "" if ended.lower_rate is None else _at_rate(job, uuids, ended.lower_rate)
-    _tell_end(app, ended, job.request.requirements, file_units, again)
+    _print_end(app, ended, job.request.requirements, file_units, again)
 
 
 def _numbers(station: Station, uuids: Sequence[bytes], channels: Sequence[int | str]) -> list[int]:
@@ -312,7 +312,9 @@ def _at_rate(job: MeasurementJob, uuids: Sequence[bytes], rate: float) -> str:
     return shlex.join(["teds-provision", *kept, "--rate", f"{rate:g}"])
 
 
-def _tell_end(app: App, ended: MeasurementEnd, require: Requirements | None, file_units: FileUnits, again: str) -> None:
+def _print_end(
+    app: App, ended: MeasurementEnd, require: Requirements | None, file_units: FileUnits, again: str
+) -> None:
     """Print how it ended; ``again`` is the same command at a rate at which less would be lost, "" if nothing was."""
     result: dict[str, Any] = {"event": "end", "nodes": ended.nodes, "files": ended.files, "sinks": ended.sinks}
     if again:
@@ -357,12 +359,12 @@ def _recover(app: App, files: Sequence[str], output: Path | None) -> None:
         "cut": done.cut,
         "damaged": [asdict(damage) for damage in done.damaged],
     }
-    told = "is intact" if done.was_whole else f"repaired ({done.cut} octets of a torn end cut off)"
+    sentence = "is intact" if done.was_whole else f"repaired ({done.cut} octets of a torn end cut off)"
     if done.output is not None:
         result["output"] = str(done.output)
-        told = f"is unchanged; its intact part is in {done.output}"
+        sentence = f"is unchanged; its intact part is in {done.output}"
     error = _damage(files[0], done) if done.damaged else None
-    text = f"{files[0]} {told}: {counted(done.messages, 'message')}" + (f" until {until}" if until else "")
+    text = f"{files[0]} {sentence}: {counted(done.messages, 'message')}" + (f" until {until}" if until else "")
     app.conclude(result, text, error)
 
 

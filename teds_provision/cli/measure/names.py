@@ -168,7 +168,7 @@ def _print_names(app: App, station: Station) -> None:
     channels = _channels(station)
     topics.learn(facts for _, _, facts in channels)
     frames = station.measurements.frames
-    told: list[dict[str, Any]] = [
+    rows: list[dict[str, Any]] = [
         {
             "uuid": uuid.hex(),
             "channel": number,
@@ -181,9 +181,9 @@ def _print_names(app: App, station: Station) -> None:
     lines = [
         f"{row['uuid']} {row['channel']}: {row['topic']}{' (chosen)' if row['chosen'] else ''}"
         + (f", frame {row['frame']}" if row["frame"] else "")
-        for row in told
+        for row in rows
     ]
-    app.emit({"station": topics.station, "names": told}, "\n".join(lines) or "No datasheets are known yet.")
+    app.emit({"station": topics.station, "names": rows}, "\n".join(lines) or "No datasheets are known yet.")
 
 
 def _frame(station: Station, chosen: Mapping[tuple[bytes, int], str], topics: Topics, uuid: bytes, number: int) -> str:

@@ -15,7 +15,7 @@ import click
 
 from teds_provision import measure, provisioning
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import ChannelName, Number, WholeNumber, command, link_options, said_here
+from teds_provision.cli.options import ChannelName, Number, WholeNumber, command, link_options, options_given
 from teds_provision.cli.rendering import print_table, reporter_for, shown, tidy
 from teds_provision.errors import NodeRefusedError, UsageError
 from teds_provision.links import LinkSettings
@@ -41,18 +41,18 @@ def over_the_bus(links: LinkSettings, *, streams: bool = False) -> LinkSettings:
     A bus on this command line takes precedence over a reader in config.toml or a variable. ``streams``: so does every
     named bus, as a reader carries none.
     """
-    said = said_here("via", "nfc", "can", "ble")
-    bus = _bus_meant(links, said)
-    reader_is_meant = said & {"via", "nfc"} or (links.nfc and not streams and bus not in said)
+    named_options = options_given("via", "nfc", "can", "ble")
+    bus = _bus_meant(links, named_options)
+    reader_is_meant = named_options & {"via", "nfc"} or (links.nfc and not streams and bus not in named_options)
     if bus is not None and links.via == "nfc" and not reader_is_meant:
         return replace(links, via=bus)
     return links.after_agreeing()
 
 
-def _bus_meant(links: LinkSettings, said: set[str]) -> str | None:
+def _bus_meant(links: LinkSettings, named_options: set[str]) -> str | None:
     """Return the bus, or the air, that is named; of both the one on the command line, else the bus."""
     named = [name for name, given in (("can", links.can), ("ble", links.ble)) if given]
-    here = [name for name in named if name in said]
+    here = [name for name in named if name in named_options]
     return next(iter(here or named), None)
 
 
@@ -116,17 +116,23 @@ def _samples(console: Console, samples: Sequence[Sample]) -> None:
 
     table = Table("channel", "name", "value", "±", "unit", "raw", box=None, pad_edge=False)
     for sample in samples:
-        told = sample.as_json().get("shown") or {
+        shown_value = sample.as_json().get("shown") or {
             "value": sample.value,
             "uncertainty": sample.uncertainty,
             "unit": sample.unit,
         }
-        sure = told["uncertainty"]
-        value = _text(sample, tidy(told["value"], sure)) if told["value"] is not None else f"not valid: {sample.why}"
+        sure = shown_value["uncertainty"]
+        value = (
+            _text(sample, tidy(shown_value["value"], sure))
+            if shown_value["value"] is not None
+            else f"not valid: {sample.why}"
+        )
         value = f"{value} ({shown(sample.text)})" if sample.text else value
         uncertainty = f"{sure:.3g}" if sure is not None else ""
         name = escape(shown(sample.name))
-        table.add_row(str(sample.channel), name, escape(value), uncertainty, escape(told["unit"]), str(sample.raw))
+        table.add_row(
+            str(sample.channel), name, escape(value), uncertainty, escape(shown_value["unit"]), str(sample.raw)
+        )
     print_table(console, table)
 
 
@@ -143,7 +149,7 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
         found = measure.verified_session.operation(trusted.node)
         try:
             power = operation.commands.PowerReply.decode(
-                trusted.node.request(operation.commands.POWER, "to tell its power")
+                trusted.node.request(operation.commands.POWER, "to report its power")
             )
         except NodeRefusedError:
             power = None
@@ -249,12 +255,12 @@ def set_value(
         station.audit("set", uuid, "begun", channel=driven.number, value=value, unit=actuator.unit.text)
         with actuator:
             until = None if hold is None else time.monotonic() + hold
-            told = False
+            reported = False
             while True:
                 standing.require()
                 applied = actuator.apply(value)
-                if not told:
-                    told = True
+                if not reported:
+                    reported = True
                     app.emit({"applied": applied.as_json()}, f"Channel {driven.label}: {_near(driven, applied)}")
                 left = actuator.pause if until is None else min(actuator.pause, until - time.monotonic())
                 if left <= 0 or stop.wait(left):

@@ -123,8 +123,8 @@ def _line(found: dict[str, Any]) -> str:
     charge = f"  {found['charging']['text']}" if found["charging"] else ""
     runs = firmware_words(found["firmware"])
     pressed = "  says it was pressed" if found["pressed"] else ""
-    told = f"{name}{tag}{charge}{runs and f'  {runs}'}{pressed}"
-    return f"{found['uuid']}  key {found['fingerprint'][:16]}  {found['state']}  {listed}{told}"
+    text = f"{name}{tag}{charge}{runs and f'  {runs}'}{pressed}"
+    return f"{found['uuid']}  key {found['fingerprint'][:16]}  {found['state']}  {listed}{text}"
 
 
 # -- locate ------------------------------------------------------------------------------------------------------------
@@ -218,8 +218,8 @@ def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry
     )
     node, agreed = done.uuid.hex(), done.agreed
     if agreed is None:
-        told = f"Plan: {done.plan} ({', '.join(done.held) or 'no key yet'})."
-        app.emit({"uuid": node, "plan": done.plan, "held": list(done.held)}, told)
+        text = f"Plan: {done.plan} ({', '.join(done.held) or 'no key yet'})."
+        app.emit({"uuid": node, "plan": done.plan, "held": list(done.held)}, text)
         return
     again = "." if agreed.fresh else " (nothing to do)."
     app.emit(
@@ -285,8 +285,8 @@ def address(app: App, uuid: str, address: int, yes: bool, dry_run: bool, links: 
         plan = f"Plan: change the CAN address of node {node} to 0x{address:02x}."
         app.emit({"uuid": node, "plan": "address", "can_address": address}, plan)
         return
-    told = "now has" if done.changed else "already has"
+    state = "now has" if done.changed else "already has"
     app.emit(
         {"uuid": node, "can_address": address, "changed": done.changed},
-        f"Node {node} {told} CAN address 0x{address:02x}.",
+        f"Node {node} {state} CAN address 0x{address:02x}.",
     )

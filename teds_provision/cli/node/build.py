@@ -359,8 +359,8 @@ def _bring_back(app: App, uuid: str, sequence: int, links: LinkSettings, *, dry_
         app.emit(plan, f"Plan: restore the datasheet of sequence {sequence} on {node}.{lines}")
         return
     result = _to_json(node, done.written) | {"from": sequence, "sequence": done.sequence, "changes": changes}
-    told = f"datasheet {sequence} restored as sequence {done.sequence}"
-    app.emit(result, f"Node {node}: {told}; {_said(done.written)}.{lines}")
+    sentence = f"datasheet {sequence} restored as sequence {done.sequence}"
+    app.emit(result, f"Node {node}: {sentence}; {_said(done.written)}.{lines}")
 
 
 def _to_json(node: str, written: WriteResult) -> dict[str, Any]:
@@ -373,8 +373,8 @@ def _to_json(node: str, written: WriteResult) -> dict[str, Any]:
 
 
 def _said(written: WriteResult) -> str:
-    told = f"{written.octets} octets written and read back" if written.octets else "nothing to do, it is already there"
-    return f"{told} ({written.seconds:.2f} s)"
+    text = f"{written.octets} octets written and read back" if written.octets else "nothing to do, it is already there"
+    return f"{text} ({written.seconds:.2f} s)"
 
 
 @command("teds-provision read 8d4d --nfc udp:localhost:54321 --output node.json")
@@ -403,8 +403,8 @@ def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
         write_file(output, text)
     total = sum(map(len, done.image.blocks.values()))
     into = f" into {output}." if output else "."
-    told = f"{len(done.image.blocks)} TEDS, {total} octets read from {done.image.uuid.hex()}{into}"
-    app.emit(json.loads(text), told if output is not None else text.rstrip("\n"))
+    sentence = f"{len(done.image.blocks)} TEDS, {total} octets read from {done.image.uuid.hex()}{into}"
+    app.emit(json.loads(text), sentence if output is not None else text.rstrip("\n"))
 
 
 @click.group(epilog=examples("teds-provision draft list", "teds-provision draft drop 8d4d"))
@@ -440,8 +440,8 @@ def drop(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     if done.draft is None:
         app.emit({"uuid": node, "dropped": False}, f"Node {node} has no draft.")
         return
-    told = f"{'Plan: drop' if dry_run else 'Dropped'} the {done.draft.stage} draft of node {node}."
-    app.emit({"uuid": node, "dropped": not dry_run}, told)
+    text = f"{'Plan: drop' if dry_run else 'Dropped'} the {done.draft.stage} draft of node {node}."
+    app.emit({"uuid": node, "dropped": not dry_run}, text)
 
 
 draft.add_command(list_, "list")
@@ -454,7 +454,7 @@ draft.add_command(drop, "drop")
 def history(app: App, uuid: str) -> None:
     """List a node's earlier datasheets, newest first; write UUID --from SEQUENCE restores one, signed again."""
     node, records = provisioning.commands.history_of(app.station(), uuid)
-    told = [
+    rows = [
         {
             "sequence": record.sequence,
             "epoch": record.epoch,
@@ -470,6 +470,6 @@ def history(app: App, uuid: str) -> None:
         for row in records
     ]
     app.emit(
-        {"uuid": node.hex(), "history": told},
+        {"uuid": node.hex(), "history": rows},
         "\n".join(map(str.rstrip, lines)) or f"No datasheets are known for node {node.hex()}.",
     )

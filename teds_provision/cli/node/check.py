@@ -94,26 +94,26 @@ def check(app: App, factory: bool, explain: bool, yes: bool, dry_run: bool, link
     )
 
 
-def _explained(told: ExplainedRequest | str) -> dict[str, str | None]:
+def _explained(explained: ExplainedRequest | str) -> dict[str, str | None]:
     """Return the test agreement in hex; without one only ``problem``."""
-    if isinstance(told, str):
-        return {"problem": told}
-    reply = told.reply
+    if isinstance(explained, str):
+        return {"problem": explained}
+    reply = explained.reply
     return {
-        "request": told.request.hex(),
-        "security_teds": told.security_teds.hex(),
+        "request": explained.request.hex(),
+        "security_teds": explained.security_teds.hex(),
         "nonce": reply[:16].hex(),
         "epoch": reply[16:20].hex(),
         "en": reply[20:85].hex(),
-        "t": told.transcript.hex(),
-        "okm": told.okm.hex(),
-        "m": told.confirmation_key.hex(),
-        "tag_n": told.tag_due.hex(),
+        "t": explained.transcript.hex(),
+        "okm": explained.okm.hex(),
+        "m": explained.confirmation_key.hex(),
+        "tag_n": explained.tag_due.hex(),
         "tag_n_received": reply[85:101].hex(),
         "sig_n_received": reply[101:].hex(),
-        "tag_s": told.station_tag.hex(),
-        "problem": told.problem or None,
-        "slip": told.slip,
+        "tag_s": explained.station_tag.hex(),
+        "problem": explained.problem or None,
+        "slip": explained.slip,
     }
 
 
@@ -151,10 +151,10 @@ def _table(console: Console, report: CheckReport) -> None:
     console.print(f"{report.uuid.hex()}: {counts}")
     if report.explained is None:
         return
-    told = _explained(report.explained)
+    explained = _explained(report.explained)
     console.print("A test agreement, never confirmed and ended on the node; none of these values is a key in use:")
     for key, name in _EXPLAINED.items():
-        if (value := told.get(key)) is not None:
+        if (value := explained.get(key)) is not None:
             console.print(f"{name:<18} {value}", markup=False, highlight=False, soft_wrap=True)
-    if told["problem"]:
-        console.print(told["problem"], markup=False, highlight=False, soft_wrap=True)
+    if explained["problem"]:
+        console.print(explained["problem"], markup=False, highlight=False, soft_wrap=True)

@@ -54,30 +54,30 @@ def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run:
         app.confirm(f"Revoke node {octets.hex()}? Its keys will be deleted here.", yes=yes)
     with station.lock("revoke", app.note):
         done = handover.life.revoke(station, octets, why)
-    told = {
+    result = {
         "uuid": octets.hex(),
         "fingerprint": done.entry.fingerprint,
         "why": done.entry.why,
         "created": done.entry.created,
         "fresh": done.fresh,
     }
-    app.emit(told, f"Node {octets.hex()} is revoked: {done.entry.why}" + ("" if done.fresh else " (already known)."))
+    app.emit(result, f"Node {octets.hex()} is revoked: {done.entry.why}" + ("" if done.fresh else " (already known)."))
 
 
 def _lift(app: App, station: Station, uuid: bytes, *, yes: bool, dry_run: bool) -> None:
     entry = station.policy.revocation(uuid)
-    told: dict[str, Any] = {"lifted": uuid.hex(), "why": entry.why if entry else None, "fresh": entry is not None}
+    result: dict[str, Any] = {"lifted": uuid.hex(), "why": entry.why if entry else None, "fresh": entry is not None}
     if entry is None:
-        app.emit(told, f"Nothing to do: node {uuid.hex()} is not revoked here.")
+        app.emit(result, f"Nothing to do: node {uuid.hex()} is not revoked here.")
         return
     if dry_run:
-        app.emit({**told, "plan": True}, f"Plan: lift the ban on {uuid.hex()}: {entry.why}")
+        app.emit({**result, "plan": True}, f"Plan: lift the ban on {uuid.hex()}: {entry.why}")
         return
     station.unlock()
     app.confirm(f"Lift the ban on node {uuid.hex()} ({entry.why}, {entry.created})?", yes=yes)
     with station.lock("revoke --lift", app.note):
         handover.deny.lift(station, uuid)
-    app.emit(told, f"The ban on node {uuid.hex()} is lifted here. To use it, whitelist it and agree on a key.")
+    app.emit(result, f"The ban on node {uuid.hex()} is lifted here. To use it, whitelist it and agree on a key.")
 
 
 @command("teds-provision decommission 8d4d --yes --via can --can udp_multicast:239.74.163.2")
@@ -113,8 +113,8 @@ def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, lin
         receipt = _reset(app, station, octets, links, force=force)
         left = handover.life.retire(station, octets, receipt)
     state = "is out of service and signed that it is in factory state" if receipt else "is out of service, unconfirmed"
-    told = _result(octets, receipt) | {"fresh": True, "removed": left.to_json()}
-    app.emit(told, f"Node {octets.hex()} {state}.{_handed_on(left, 'Removed from')}")
+    result = _result(octets, receipt) | {"fresh": True, "removed": left.to_json()}
+    app.emit(result, f"Node {octets.hex()} {state}.{_handed_on(left, 'Removed from')}")
 
 
 def _handed_on(moved: HandedOn, verb: str) -> str:
@@ -196,16 +196,16 @@ def replace(
     station.unlock(octets)
     with station.lock("replace", app.note):
         plan = handover.life.plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
-        told, text = _takeover(plan)
-        told["groups"] = station.groups.of(spare if plan.done else octets)
+        result, text = _takeover(plan)
+        result["groups"] = station.groups.of(spare if plan.done else octets)
         if dry_run:
-            app.emit({**told, "plan": True}, f"Plan: {text}.")
+            app.emit({**result, "plan": True}, f"Plan: {text}.")
             return
         if plan.done:
             moved = handover.life.hand_on(station, plan)
             rest = _handed_on(moved, "Moved")
             text = "It has already taken over." if rest else "Nothing to do: it has already taken over."
-            app.emit({**told, "moved": moved.to_json(), "fresh": False}, f"{text}{rest}")
+            app.emit({**result, "moved": moved.to_json(), "fresh": False}, f"{text}{rest}")
             return
         app.confirm(f"{text}?", yes=yes)
         receipt = _reset(app, station, octets, links, force=True) if links_given(ctx) else None
@@ -214,14 +214,14 @@ def replace(
         app.warn(warning)
     confirmed = receipt is not None
     next_step = f"Next, run provision (or sign and write) for {spare.hex()}."
-    told |= {"confirmed": confirmed, "fresh": True, "warnings": list(warnings), "moved": moved.to_json()}
-    app.emit(told, f"{text}.{_handed_on(moved, 'Moved')}\n{next_step}")
+    result |= {"confirmed": confirmed, "fresh": True, "warnings": list(warnings), "moved": moved.to_json()}
+    app.emit(result, f"{text}.{_handed_on(moved, 'Moved')}\n{next_step}")
 
 
 def _takeover(plan: TakeoverPlan) -> tuple[dict[str, Any], str]:
     """Return what one node takes over from another, for scripts and in a sentence."""
     taken = plan.new if plan.done else plan.old
-    told = {
+    result = {
         "old": plan.old.uuid.hex(),
         "new": plan.new.uuid.hex(),
         "name": taken.name,
@@ -230,4 +230,4 @@ def _takeover(plan: TakeoverPlan) -> tuple[dict[str, Any], str]:
     }
     given = [f"{what} {value}" for what, value in (("name", taken.name), ("profile", taken.profile)) if value]
     text = f"{plan.new.uuid.hex()} takes over from {plan.old.uuid.hex()}"
-    return told, f"{text}: {', '.join(given) or 'no name or profile'}"
+    return result, f"{text}: {', '.join(given) or 'no name or profile'}"

@@ -156,8 +156,8 @@ def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) 
         written = f", datasheet {says['sequence']} by {says['written_by']}" if says["written_by"] else ""
         banned = f", revoked by {', '.join(says['revoked'])}" if says["revoked"] else ""
         held = f"held by {holders} (epoch {says['epoch']})" if says["holders"] else "no holder"
-        told = f"{held}{written}, firmware {_reported(says['firmware'])}{banned}"
-        line = "  ".join(filter(None, (node["uuid"], shown(node["name"] or ""), told)))
+        sentence = f"{held}{written}, firmware {_reported(says['firmware'])}{banned}"
+        line = "  ".join(filter(None, (node["uuid"], shown(node["name"] or ""), sentence)))
         app.lines([
             line,
             *(f"  {conflict['name']}: {shown(conflict['why'])}" for conflict in node["conflicts"]),
@@ -342,8 +342,10 @@ def label(app: App, uuid: str, output: Path) -> None:
     station = app.station()
     made = label_of(station, station.nodes.resolve(uuid))
     write_label(made, output)
-    told = {"label": {"text": made.text, "uuid": made.uuid.hex(), "fingerprint": made.fingerprint, "file": str(output)}}
-    app.emit(told, f"{output}: {made.text}")
+    result = {
+        "label": {"text": made.text, "uuid": made.uuid.hex(), "fingerprint": made.fingerprint, "file": str(output)}
+    }
+    app.emit(result, f"{output}: {made.text}")
 
 
 # ``nodes --fits``: whether datasheets suffice for a task.

@@ -18,7 +18,7 @@ import click
 from teds_provision import firmware_image, plant, provisioning, station, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.node.build import calibration_json, order_options
-from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, said_here, yes_option
+from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, options_given, yes_option
 from teds_provision.cli.rendering import firmware_words, print_table, reporter_for
 from teds_provision.errors import TedsProvisionError, UsageError, WrongImageError
 from teds_provision.lazy import late
@@ -143,7 +143,7 @@ def provision(
     --yes accepts the node on the reader. A finished node keeps its datasheet: only what you name (--profile,
     --calibration, --name) changes, or what you confirm after seeing the changes.
     """
-    adopt = adopt and bool(said_here("adopt"))  # a setting of that name is meant for ncap run
+    adopt = adopt and bool(options_given("adopt"))  # a setting of that name is meant for ncap run
     order = replace(order, choose=app.chooses_item(), adopt=adopt)
     if order.adopt and (batch is not None or job is not None):
         raise UsageError("The sheet or job already defines what each board gets.", hint="Drop --adopt.")
@@ -186,9 +186,9 @@ def provision(
     for warning in boards.warnings:
         app.warn(warning)
     if dry_run and everything:
-        _tell_plans(app, boards)
+        _print_plans(app, boards)
     elif dry_run:
-        _tell_plan(app, boards.plan())
+        _print_plan(app, boards.plan())
     elif request.several:
         boards.unlock()  # asked for before the screen shows instructions
         begun = None if several else reporter  # with several readers one board may be begun while another one ends
@@ -266,16 +266,16 @@ def _many(app: App, boards: BatchRun, operator: Operator, screen: Screen, *, tot
     try:
         for board in boards.many(operator):
             if boards.expected and not app.json:
-                _tell_one_of(app, boards, board)
+                _print_one_of(app, boards, board)
             elif not screen.tells:
-                _tell_board(app, board, warn=not boards.expected, **_of_line(boards, board.uuid))
+                _print_board(app, board, warn=not boards.expected, **_of_line(boards, board.uuid))
             screen.ended(board)
     finally:
         screen.close()
         if boards.expected:
-            _tell_warnings(app, boards)
+            _print_warnings(app, boards)
         if totals:
-            _tell_totals(app, boards)
+            _print_totals(app, boards)
     error = boards.totals().error if totals else None
     if error is not None and app.json:
         raise click.exceptions.Exit(error.exit_code)
@@ -283,33 +283,33 @@ def _many(app: App, boards: BatchRun, operator: Operator, screen: Screen, *, tot
         raise error
 
 
-# -- telling -----------------------------------------------------------------------------------------------------------
+# -- printing ----------------------------------------------------------------------------------------------------------
 
 
-def _tell_plan(app: App, plan: ProvisionPlan) -> None:
+def _print_plan(app: App, plan: ProvisionPlan) -> None:
     changes = "".join(f"\n  {text}" for text in plan.changes) or "\n  no changes"
     text = f"Plan for {plan.uuid.hex()} ({plan.state.name.lower()}): {', '.join(plan.steps)}.{changes}"
     for warning in plan.warnings:
         app.warn(warning)
-    told = {
+    result = {
         "uuid": plan.uuid.hex(),
         "state": plan.state.name.lower(),
         "plan": list(plan.steps),
         "changes": list(plan.changes),
         "warnings": list(plan.warnings),
     }
-    app.emit(told, text)
+    app.emit(result, text)
 
 
-def _tell_plans(app: App, boards: BatchRun) -> None:
+def _print_plans(app: App, boards: BatchRun) -> None:
     """Print a plan for each selected node of the bus, and finally their number; the worst refusal ends the command."""
     planned = 0
     for plan in boards.plans():
         if isinstance(plan, provisioning.batch.ProvisionPlan):
             planned += 1
-            _tell_plan(app, plan)
+            _print_plan(app, plan)
         else:
-            _tell_board(app, plan)
+            _print_board(app, plan)
     nodes = "1 node" if planned == 1 else f"{planned or 'No'} nodes"
     app.emit({"totals": {"planned": planned, "failed": boards.ended}}, f"{nodes} would be provisioned.")
     if boards.worst is not None:
@@ -353,7 +353,7 @@ def _print_result(
     )
 
 
-def _tell_board(app: App, board: BoardResult, *, warn: bool = True, **line: Any) -> None:
+def _print_board(app: App, board: BoardResult, *, warn: bool = True, **line: Any) -> None:
     """One line of JSON, or what a person reads: UUID, time and row of the sheet on each; ``line``: its unit."""
     if board.done is not None:
         failure = board.failure
@@ -372,7 +372,7 @@ def _tell_board(app: App, board: BoardResult, *, warn: bool = True, **line: Any)
         app.fail_line(board.error, **of)
 
 
-def _tell_one_of(app: App, boards: BatchRun, board: BoardResult) -> None:
+def _print_one_of(app: App, boards: BatchRun, board: BoardResult) -> None:
     """Print one line for one of many on a bus: ``37 of 200  8d4d…  arm 3  authentic  1.2 s``.
 
     With the reason of a failure.
@@ -385,7 +385,7 @@ def _tell_one_of(app: App, boards: BatchRun, board: BoardResult) -> None:
         app.note(f"{board.uuid.hex()}: {board.failure.message}\n  → {board.failure.hint}".removesuffix("\n  → "))
 
 
-def _tell_warnings(app: App, boards: BatchRun) -> None:
+def _print_warnings(app: App, boards: BatchRun) -> None:
     """Print each warning about boards of a bus once, with the boards that have it.
 
     A board is named by its UUID if it has no name, or shares it as boards do that are named after their type.
@@ -405,9 +405,9 @@ def _tell_warnings(app: App, boards: BatchRun) -> None:
         app.warn(f"{', '.join(shown)}{more}: {warning}")
 
 
-def _tell_totals(app: App, boards: BatchRun) -> None:
+def _print_totals(app: App, boards: BatchRun) -> None:
     totals = boards.totals()
-    told: dict[str, Any] = {
+    members: dict[str, Any] = {
         "passed": totals.passed,
         "failed": totals.failed,
         "skipped": totals.skipped,
@@ -415,7 +415,7 @@ def _tell_totals(app: App, boards: BatchRun) -> None:
         "first_pass": totals.first_pass,
         "steps": totals.steps,
     }
-    result: dict[str, Any] = {"totals": told}
+    result: dict[str, Any] = {"totals": members}
     if totals.error is not None:
         result["error"] = problem_of(totals.error)
     share = "" if totals.first_pass is None else f", {totals.first_pass:.1%} at the first attempt"
@@ -616,7 +616,7 @@ class OperatorScreen:
             for line in [*air, *big(word[0]), *air]:
                 console.print(Text(f"    {line}".ljust(console.width)), style=word[1], no_wrap=True)
         if board is not None:
-            self._tell_end(board)
+            self._print_end(board)
         for line in ["", *big(f"{boards.passed}/{len(boards)}"), ""]:
             console.print(Text(f"    {line}"), no_wrap=True)
         self._line(f"{mark}{now}", style="bold")
@@ -626,7 +626,7 @@ class OperatorScreen:
             style = "green" if end.result == "passed" else "red"
             self._line(f"{line}  {self._name(end)}", style=style)
 
-    def _tell_end(self, board: BoardResult) -> None:
+    def _print_end(self, board: BoardResult) -> None:
         """Seconds and which board; of one that failed why, and what to do, in a few lines."""
         from rich.text import Text
 

@@ -552,9 +552,9 @@ def _entries(file: ShownFile) -> list[dict[str, Any]]:
     entries = []
     for number, shown in enumerate(file.teds):
         entry = {"file": file.name, **shown_to_json(shown)}
-        said = file.conversions.get(number)
-        if said is not None:
-            entry["conversion"] = [finding_to_json(finding) for finding in said]
+        conversion = file.conversions.get(number)
+        if conversion is not None:
+            entry["conversion"] = [finding_to_json(finding) for finding in conversion]
         entries.append(entry)
     return entries
 

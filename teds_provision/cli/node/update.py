@@ -107,9 +107,9 @@ def update(
     planned, ended = _look(app, station, links, boards, order)
     if dry_run:
         for plan in planned:
-            _tell_plan(app, plan, order)
+            _print_plan(app, plan, order)
         if len(boards) > 1:
-            _tell_planned_totals(app, planned, ended)
+            _print_planned_totals(app, planned, ended)
         _conclude(app, ended)
         return
     orders = _asked(app, planned, order, yes=yes, ended=ended)
@@ -139,7 +139,7 @@ def _look(
         plan = provisioning.update.plan_or_refusal(station, links, uuid, order, of)
         if isinstance(plan, provisioning.update.BoardUpdate):
             refused.append(plan)
-            _tell(app, plan, order)
+            _print_board_update(app, plan, order)
         else:
             planned.append(plan)
     return planned, refused
@@ -160,7 +160,7 @@ def _asked(
                     plan.uuid, "refused", provisioning.update.version_of(plan.report), 0, 0.0, refused
                 )
                 ended.append(board)
-                _tell(app, board, order)
+                _print_board_update(app, board, order)
                 continue
             allowed = replace(order, other_board=True)
         orders.append((plan.uuid, allowed))
@@ -199,11 +199,11 @@ def _update(
             if table is not None:
                 table.ended(board)
             else:
-                _tell(app, board, orders[0][1])
+                _print_board_update(app, board, orders[0][1])
     finally:
         if table is not None:
             table.close()
-    _tell_totals(app, ended, time.monotonic() - began)
+    _print_totals(app, ended, time.monotonic() - began)
     _conclude(app, ended)
 
 
@@ -221,11 +221,11 @@ def _conclude(app: App, ended: Sequence[BoardUpdate]) -> None:
     raise click.exceptions.Exit(worst.exit_code)
 
 
-# -- telling -----------------------------------------------------------------------------------------------------------
+# -- printing ----------------------------------------------------------------------------------------------------------
 
 
 def _to_json(board: BoardUpdate, order: UpdateOrder) -> dict[str, Any]:
-    told: dict[str, Any] = {
+    result: dict[str, Any] = {
         "uuid": board.uuid.hex(),
         "from": board.before,
         "to": order.image.version_text,
@@ -235,44 +235,44 @@ def _to_json(board: BoardUpdate, order: UpdateOrder) -> dict[str, Any]:
         "result": board.result,
     }
     if board.error is not None:
-        told["error"] = problem_of(board.error)
-    return told
+        result["error"] = problem_of(board.error)
+    return result
 
 
-def _tell(app: App, board: BoardUpdate, order: UpdateOrder) -> None:
+def _print_board_update(app: App, board: BoardUpdate, order: UpdateOrder) -> None:
     if app.json:
         app.emit(_to_json(board, order))
     elif board.error is not None:
         app.fail_line(board.error, uuid=board.uuid.hex())
     else:
         before = f"{board.before} → " if board.result == "updated" else ""
-        told = f"{board.uuid.hex()}  {before}{order.image.version_text}  {board.result}  {board.seconds:.1f} s"
-        app.emit({}, told)
+        text = f"{board.uuid.hex()}  {before}{order.image.version_text}  {board.result}  {board.seconds:.1f} s"
+        app.emit({}, text)
 
 
-def _tell_totals(app: App, ended: Sequence[BoardUpdate], seconds: float) -> None:
+def _print_totals(app: App, ended: Sequence[BoardUpdate], seconds: float) -> None:
     counted = Counter(board.result for board in ended)
     totals: dict[str, Any] = {name: counted[name] for name in provisioning.update.RESULTS}
     words = ", ".join(f"{count} {name}" for name, count in totals.items() if count)
     app.emit({"totals": totals | {"seconds": round(seconds, 3)}}, f"{words or 'nothing to do'} in {seconds:.1f} s")
 
 
-def _tell_planned_totals(app: App, planned: Sequence[UpdatePlan], ended: Sequence[BoardUpdate]) -> None:
+def _print_planned_totals(app: App, planned: Sequence[UpdatePlan], ended: Sequence[BoardUpdate]) -> None:
     """Print what a dry run found, of all boards."""
     counted = Counter(board.result for board in ended) + Counter(_planned(plan) for plan in planned)
     totals = {name: counted[name] for name in ("planned", *provisioning.update.RESULTS)}
     octets, seconds = sum(plan.octets for plan in planned), sum(plan.seconds for plan in planned)
     words = ", ".join(f"{count} {name}" for name, count in totals.items() if count)
-    told = {"totals": totals | {"octets": octets, "seconds": round(seconds, 1)}}
-    app.emit(told, f"{words}; {octets} octets, about {seconds:.0f} s one board after the other")
+    result = {"totals": totals | {"octets": octets, "seconds": round(seconds, 1)}}
+    app.emit(result, f"{words}; {octets} octets, about {seconds:.0f} s one board after the other")
 
 
 def _planned(plan: UpdatePlan) -> str:
     return "already" if plan.stage == "nothing" else "planned"
 
 
-def _tell_plan(app: App, plan: UpdatePlan, order: UpdateOrder) -> None:
-    told = {
+def _print_plan(app: App, plan: UpdatePlan, order: UpdateOrder) -> None:
+    result = {
         "uuid": plan.uuid.hex(),
         "plan": plan.stage,
         "from": provisioning.update.version_of(plan.report),
@@ -283,7 +283,7 @@ def _tell_plan(app: App, plan: UpdatePlan, order: UpdateOrder) -> None:
         "interrupts": list(plan.interrupts),
         **({"question": plan.question} if plan.question else {}),
     }
-    app.emit(told, _plan_text(plan, order))
+    app.emit(result, _plan_text(plan, order))
 
 
 _STAGES: Final = {

@@ -11,7 +11,7 @@ import click
 
 from teds_provision import provisioning
 from teds_provision.cli.context import App, pass_app, to_json
-from teds_provision.cli.options import command, link_options, said_here
+from teds_provision.cli.options import command, link_options, options_given
 from teds_provision.cli.rendering import aligned, firmware_words, print_table, reporter_for
 from teds_provision.errors import UsageError
 from teds_provision.files import json_files
@@ -50,7 +50,7 @@ def verify(
     Exits 0 for "authentic", 4 for "unsigned" and "not authentic", 5 for "unproven", 6 for a harmful calibration;
     for several files, with the worst.
     """
-    node = len(what) == 1 and bool(said_here("via", "nfc", "can", "ble"))
+    node = len(what) == 1 and bool(options_given("via", "nfc", "can", "ble"))
     if not node and are_files(what):
         if accept_firmware:
             raise UsageError("--accept-firmware applies to a node.", hint="Verify the node itself.")

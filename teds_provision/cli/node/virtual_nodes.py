@@ -453,7 +453,7 @@ def _boards(
             lag=0 if wrapped is None else node_room.wrapped.wrapped_source.LAG,
             battery=None if percent is None else hardware_room.board.Battery(percent),
             shown=lines.observer_of(uuid.hex()),
-            tell=app.warn,
+            notify=app.warn,
         )
 
     return make
@@ -502,7 +502,7 @@ def _servers(
         nodes[0].when_restarted(reader.restarted)
         servers.append(reader)
     if can:
-        bus = can_room.server.CanServer(can, tell=app.warn)
+        bus = can_room.server.CanServer(can, notify=app.warn)
         for node in nodes:
             tapped = node.in_factory_state if nfc is None else lambda: False
             bus.add(node, counts_as_tapped=tapped, measuring=node)
@@ -617,11 +617,11 @@ class ActuatorLines:
             with self._condition:
                 while not self._news and not self._events and not self._stop.is_set():
                     self._condition.wait()
-            self._tell_news()
+            self._print_news()
             self._stop.wait(_EVERY_SECONDS)
-        self._tell_news()
+        self._print_news()
 
-    def _tell_news(self) -> None:
+    def _print_news(self) -> None:
         with self._condition:
             news, self._news = self._news, {}
             events, self._events = self._events, []

@@ -99,18 +99,20 @@ def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     station = app.station()
     octets = plant.status.resolve(station, uuid)
     entry = station.pins.entry(octets)
-    told = f"{octets.hex()}{f' ({entry.name})' if entry and entry.name else ''}"
+    sentence = f"{octets.hex()}{f' ({entry.name})' if entry and entry.name else ''}"
     pinned = entry.fingerprint if entry is not None else None
     if entry is None and not provisioning.whitelist.is_pinned(station, octets):
-        text = f"{told} is not on the whitelist (nothing to do)."
+        text = f"{sentence} is not on the whitelist (nothing to do)."
     elif dry_run:
-        text = f"Plan: remove {told} from the whitelist and forget its key {(pinned or 'as last seen')[:32]}."
+        text = f"Plan: remove {sentence} from the whitelist and forget its key {(pinned or 'as last seen')[:32]}."
     else:
-        app.confirm(f"Remove {told} from the whitelist and forget its pinned key?", yes=yes)
+        app.confirm(f"Remove {sentence} from the whitelist and forget its pinned key?", yes=yes)
         station.unlock()
         with station.lock("whitelist remove", app.note):
             provisioning.whitelist.remove(station, octets)
-        text = f"{told} is {'no longer on the whitelist' if entry else 'not on the whitelist; its key is forgotten'}."
+        text = (
+            f"{sentence} is {'no longer on the whitelist' if entry else 'not on the whitelist; its key is forgotten'}."
+        )
     _emit(app, station, text, removed=entry is not None and not dry_run)
 
 

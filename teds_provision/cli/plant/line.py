@@ -101,13 +101,13 @@ def job() -> None:
 )
 @dry_run_option
 @pass_app
-def new(app: App, /, output: Path | None, dry_run: bool, **told: Any) -> None:
+def new(app: App, /, output: Path | None, dry_run: bool, **settings: Any) -> None:
     """Create and sign a job; this station must be a keeper."""
     station = app.station()
     roster = plant.jobs.roster_of(station)
     if not roster.has(station.identity.fingerprint, "keeper"):
         raise PolicyError("This station is not a keeper, so no station would accept its job.", hint="Ask a keeper.")
-    drafted = _drafted(station, roster, told)
+    drafted = _drafted(station, roster, settings)
     if dry_run:  # an invalid job is refused in a plan too
         protocol.plant.job.seal_job(drafted, protocol.keys.SoftwareKey.generate())
     else:
@@ -121,34 +121,34 @@ def new(app: App, /, output: Path | None, dry_run: bool, **told: Any) -> None:
     )
 
 
-def _drafted(station: Station, roster: Roster, told: dict[str, Any]) -> Job:
-    if (told["count"] is None) == (told["listed"] is None):
+def _drafted(station: Station, roster: Roster, settings: dict[str, Any]) -> Job:
+    if (settings["count"] is None) == (settings["listed"] is None):
         raise UsageError("A job needs a number of boards or a list of boards.", hint="Use one of --count and --list.")
-    path = teds.profile.load.find_profile(told["profile"], teds.profile.load.default_folders(station.home))
+    path = teds.profile.load.find_profile(settings["profile"], teds.profile.load.default_folders(station.home))
     teds.profile.load.load_profile(path, teds.profile.load.default_folders(station.home)).build(
         bytes(10)
     )  # else no station could work on the job
-    boards = _boards(told["listed"]) if told["listed"] is not None else {}
-    total = told["count"] or len(boards)
-    sign = told["sign"]
-    begins = told["not_before"]
+    boards = _boards(settings["listed"]) if settings["listed"] is not None else {}
+    total = settings["count"] or len(boards)
+    sign = settings["sign"]
+    begins = settings["not_before"]
     return protocol.plant.job.Job(
         str(uuid4()),
         roster.registry,
-        told["title"],
+        settings["title"],
         path.stem,
         teds.profile.load.files_digest(path, teds.profile.load.default_folders(station.home)),
-        _rule(told, boards),
-        told["count"],
+        _rule(settings, boards),
+        settings["count"],
         boards,
         _time(begins) if begins is not None else datetime.now(UTC).replace(microsecond=0),
-        _time(told["ends"]),
-        _allotments(roster, told["stations"], total),
-        told["assurance"],
+        _time(settings["ends"]),
+        _allotments(roster, settings["stations"], total),
+        settings["assurance"],
         sign if sign == "station" else _office(roster, sign),
-        not told["no_evidence"],
-        tuple(_block(text) for text in told["read_only"]),
-        told["name"],
+        not settings["no_evidence"],
+        tuple(_block(text) for text in settings["read_only"]),
+        settings["name"],
     )
 
 
@@ -165,25 +165,25 @@ def _boards(path: Path) -> dict[bytes, str]:
     return {node.uuid: node.fingerprint or "" for node in listed}
 
 
-def _rule(told: dict[str, Any], boards: dict[bytes, str]) -> CalibrationRule:
-    given = [name for name in ("calibration", "calibrations", "calibration_age") if told[name] is not None]
+def _rule(settings: dict[str, Any], boards: dict[bytes, str]) -> CalibrationRule:
+    given = [name for name in ("calibration", "calibrations", "calibration_age") if settings[name] is not None]
     if len(given) > 1:
         named = " and ".join(f"--{name.replace('_', '-')}" for name in given)
         raise UsageError("A job takes one calibration option.", hint=f"Use one of {named}.")
     rule = protocol.plant.job.CalibrationRule
-    if told["calibration"] is not None:
-        return rule("one", plant.jobs.digest_of_file(told["calibration"]))
-    if told["calibration_age"] is not None:
-        return rule("any", max_age_days=told["calibration_age"])
-    if told["calibrations"] is None:
+    if settings["calibration"] is not None:
+        return rule("one", plant.jobs.digest_of_file(settings["calibration"]))
+    if settings["calibration_age"] is not None:
+        return rule("any", max_age_days=settings["calibration_age"])
+    if settings["calibrations"] is None:
         return rule()
     by_uuid: dict[bytes, str] = {}
-    for path in sorted(told["calibrations"].glob("*")):
+    for path in sorted(settings["calibrations"].glob("*")):
         if len(path.stem) == 20 and set(path.stem) <= set("0123456789abcdef") and path.is_file():
             by_uuid[bytes.fromhex(path.stem)] = plant.jobs.digest_of_file(path)
     if not by_uuid or boards.keys() - by_uuid.keys():
         lacking = next(iter(boards.keys() - by_uuid.keys()), b"").hex() or "UUID"
-        raise NotFoundError(f"There is no calibration {lacking}.* in {told['calibrations']}.")
+        raise NotFoundError(f"There is no calibration {lacking}.* in {settings['calibrations']}.")
     return rule("list", by_uuid=by_uuid)
 
 
@@ -227,9 +227,9 @@ def _to_json(station: Station, found: Job) -> dict[str, Any]:
     """Return a job with its state here; its own members as they were signed."""
     row = station.plant.line.job(found.id)
     given, passed, _ = station.plant.line.count_units(found.id)
-    said = found.unsigned()
+    members = found.unsigned()
     return {
-        **said,
+        **members,
         "H": found.hash,
         "state": row.state if row is not None else "draft",
         "units": given,
@@ -250,20 +250,20 @@ def list_jobs(app: App) -> None:
     plant.jobs.take_received(station)
     rows = station.plant.line.jobs()
     found = [plant.jobs.kept_job(station, row) for row in rows]
-    told = [_to_json(station, job) for job in found]
+    lines = [_to_json(station, job) for job in found]
 
     def table(console: Console) -> None:
         from rich.table import Table
 
         shown = Table("id", "title", "profile", "boards", "passed here", "until", "state", box=None, pad_edge=False)
-        for job, said in zip(found, told, strict=True):
+        for job, members in zip(found, lines, strict=True):
             until = local_time(job.ends.isoformat())
-            counted = f"{said['passed']} of {job.total}"
-            shown.add_row(job.id[:8], job.title, job.profile, str(job.total), counted, until, said["state"])
+            counted = f"{members['passed']} of {job.total}"
+            shown.add_row(job.id[:8], job.title, job.profile, str(job.total), counted, until, members["state"])
         print_table(console, shown)
 
     app.emit(
-        {"jobs": told}, table if told else "There are no jobs yet. To create one, at a keeper: teds-provision job new"
+        {"jobs": lines}, table if lines else "There are no jobs yet. To create one, at a keeper: teds-provision job new"
     )
 
 
@@ -275,7 +275,7 @@ def show(app: App, which: str) -> None:
     station = app.station()
     found = plant.jobs.find_job(station, which)
     roster = plant.jobs.roster_of(station)
-    said = _to_json(station, found)
+    members = _to_json(station, found)
     who = ", ".join(f"{roster.name_of(key)} {number}" for key, number in found.stations.items())
     lines = [
         f"job          {found.id}",
@@ -283,15 +283,15 @@ def show(app: App, which: str) -> None:
         f"signed by    {roster.name_of(found.signer)}",
         f"profile      {found.profile}  {found.profile_sha256[:16]}",
         f"calibration  {found.calibration.rule}",
-        f"boards       {found.total}{', by list' if found.boards else ''}; {said['units']} given here",
+        f"boards       {found.total}{', by list' if found.boards else ''}; {members['units']} given here",
         f"stations     {who}",
         f"from, until  {local_time(found.not_before.isoformat())}, {local_time(found.ends.isoformat())}",
         f"assurance    {found.assurance}",
         f"signs        {'each station' if found.office is None else roster.name_of(found.office)}",
         f"evidence     {'yes' if found.evidence else 'no'}",
-        f"state        {said['state']}",
+        f"state        {members['state']}",
     ]
-    app.emit(said, "\n".join(lines))
+    app.emit(members, "\n".join(lines))
 
 
 @command("teds-provision job send 0b5f", "teds-provision job send 0b5f --files /media/stick", name="send")
@@ -364,8 +364,8 @@ def status(app: App, which: str, evidence: Sequence[str], csv_file: Path | None)
     parts = plant.yield_stats.yield_stats(station, found, attempts)
     if csv_file is not None:
         write_file(csv_file, plant.yield_stats.to_csv(station, attempts))
-    told = {**_to_json(station, found), "stations": [part.to_json() for part in parts]}
-    app.emit(told, lambda console: _table(console, found, parts, station.fingerprint))
+    result = {**_to_json(station, found), "stations": [part.to_json() for part in parts]}
+    app.emit(result, lambda console: _table(console, found, parts, station.fingerprint))
 
 
 def _table(console: Console, found: Job, parts: list[StationYield], here: str) -> None:
@@ -495,15 +495,17 @@ def once(app: App, file: Path, output: Path, jump: bool) -> None:
 
 def _print_answer(app: App, station: Station, signed_request: AnsweredRequest, *, end: bool = False) -> None:
     request, answered = signed_request.request, signed_request.answer
-    told: dict[str, Any] = {"uuid": request.uuid.hex(), "job": request.job, "from": request.signer}
+    result: dict[str, Any] = {"uuid": request.uuid.hex(), "job": request.job, "from": request.signer}
     roster = station.plant.roster
     name = roster.name_of(request.signer) if roster is not None else request.signer[:16]
     if not answered.refused:
-        app.emit({**told, "sequence": answered.sequence}, f"signed   {request.uuid.hex()}  {answered.sequence}  {name}")
+        app.emit(
+            {**result, "sequence": answered.sequence}, f"signed   {request.uuid.hex()}  {answered.sequence}  {name}"
+        )
         return
     if end:
         raise plant.sign_requests.OfficeRefusedError(f"Not signed ({answered.refused}): {answered.why}.")
-    refused = {**told, "refused": answered.refused, "why": answered.why}
+    refused = {**result, "refused": answered.refused, "why": answered.why}
     app.emit(refused, f"refused  {request.uuid.hex()}  {answered.refused}  {name}: {answered.why}")
 
 
@@ -581,7 +583,7 @@ def _json(judged: JudgedEvidence) -> str:
 def list_evidence(app: App, uuids: tuple[str, ...], job: str | None) -> None:
     """List the evidence that this station keeps, by board and attempt."""
     rows = list(_rows(app.station(), uuids, job))
-    told = [
+    lines = [
         {
             "uuid": row.uuid.hex(),
             "job": row.job,
@@ -604,7 +606,7 @@ def list_evidence(app: App, uuids: tuple[str, ...], job: str | None) -> None:
         print_table(console, shown)
 
     none = "There is no evidence yet. To collect it: teds-provision provision --evidence"
-    app.emit({"evidence": told}, table if told else none)
+    app.emit({"evidence": lines}, table if lines else none)
 
 
 @command(
@@ -624,9 +626,9 @@ def export(app: App, folder: Path, uuids: tuple[str, ...], job: str | None, dry_
     """
     station = app.station()
     files = plant.evidence.export(station, _rows(station, uuids, job), folder, write=not dry_run)
-    told = {"folder": str(folder), "files": len(files), "written": sum(files.values())}
+    result = {"folder": str(folder), "files": len(files), "written": sum(files.values())}
     word = "Would write" if dry_run else "Wrote"
-    app.emit(told, f"{word} {told['written']} of {told['files']} files to {folder}.")
+    app.emit(result, f"{word} {result['written']} of {result['files']} files to {folder}.")
 
 
 def _rows(station: Station, uuids: tuple[str, ...], job: str | None) -> Iterator[EvidenceRow]:

@@ -95,14 +95,14 @@ def _emit_change(
         plan = {"plan": dry_run, "draft": None} if dry_run or file is not None else {}
         app.emit({**_to_json(before), **plan}, f"Nothing to do: roster {before.version} already says so.")
         return
-    said = "\n".join(plant.owner.changes(before, draft))
+    changes = "\n".join(plant.owner.changes(before, draft))
     if dry_run or file is not None:
         if file is not None and not dry_run:
             write_new(file, plant.owner.write_draft(draft), mode=SHARED)
-        told = f"Draft: {file}" if file is not None and not dry_run else "Plan only; nothing was changed."
-        app.emit({**_to_json(draft), "plan": dry_run, "draft": str(file) if file else None}, f"{said}\n{told}")
+        text = f"Draft: {file}" if file is not None and not dry_run else "Plan only; nothing was changed."
+        app.emit({**_to_json(draft), "plan": dry_run, "draft": str(file) if file else None}, f"{changes}\n{text}")
         return
-    app.note(said)
+    app.note(changes)
     app.confirm("Sign this roster?", yes=yes)
     station.unlock()
     with station.lock("registry", app.note):
@@ -171,18 +171,18 @@ def create(app: App, name: str, days: int, output: Path | None, yes: bool, dry_r
     station = app.station()
     draft = plant.owner.draft_first(station, name, timedelta(days=days))
     past = list(plant.backlog.backlog(station))
-    said = "\n".join([*plant.owner.changes(None, draft), _past(past)])
+    changes = "\n".join([*plant.owner.changes(None, draft), _past(past)])
     if dry_run:
-        app.emit({**_to_json(draft), "roster": None, "events": len(past), "plan": True}, f"Plan:\n{said}")
+        app.emit({**_to_json(draft), "roster": None, "events": len(past), "plan": True}, f"Plan:\n{changes}")
         return
-    app.note(said)
+    app.note(changes)
     app.confirm("Create this registry?", yes=yes)
     station.unlock()
     with station.lock("registry create", app.note):
         signed = plant.owner.signed(station, draft)
         if output is not None:
             write_new(output, signed.octets + b"\n", mode=SHARED)
-        events = plant.owner.join(station, signed, url=None, told=list(plant.backlog.backlog(station)))
+        events = plant.owner.join(station, signed, url=None, events=list(plant.backlog.backlog(station)))
     text = f"Registry {signed.registry} of {name} was created. Next: registry connect --files DIR"
     app.emit({**_to_json(signed), "roster": signed.octets.decode(), "events": events}, text)
 
@@ -352,11 +352,11 @@ def sign(app: App, file: Path, output: Path, yes: bool, dry_run: bool) -> None:
     draft = plant.owner.read_draft(read_file(file), station.ca)
     before = station.plant.roster
     same = before is not None and before.registry == draft.registry
-    said = "\n".join(plant.owner.changes(before if same else None, draft))
+    changes = "\n".join(plant.owner.changes(before if same else None, draft))
     if dry_run:
-        app.emit({**_to_json(draft), "plan": True}, f"Plan:\n{said}")
+        app.emit({**_to_json(draft), "plan": True}, f"Plan:\n{changes}")
         return
-    app.note(said)
+    app.note(changes)
     app.confirm("Sign this roster?", yes=yes)
     station.unlock()
     signed = plant.owner.signed(station, draft)
@@ -420,25 +420,25 @@ def connect(app: App, url: str | None, files: Path | None, roster_file: Path | N
             f"This station already belongs to registry {joined.registry}.", hint="Leave it first: registry disconnect"
         )
     past = [] if same else list(plant.backlog.backlog(station))
-    said = "\n".join([
+    text = "\n".join([
         f"{found.name}, registry {found.registry}, roster {found.version} until {_time(found.expires)}",
         f"  CA {keys.fingerprint(station.ca)}",
         f"  as {' '.join(_in_order(found.roles_of(station.fingerprint)))}",
         _past(past),
     ])  # fmt: skip
-    told = {"registry": found.registry, "version": found.version, "events": len(past)}
+    result = {"registry": found.registry, "version": found.version, "events": len(past)}
     if dry_run:
-        app.emit({**told, "plan": True}, f"Plan: join {said}")
+        app.emit({**result, "plan": True}, f"Plan: join {text}")
         return
-    app.note(said)
+    app.note(text)
     if not same:
         app.confirm("Join this registry?", yes=yes)
     station.unlock()
     with station.lock("registry connect", app.note):
         place = plant.membership.FILES + str(files.resolve()) if files else plant.connecting.absolute(url or "")
-        events = plant.owner.join(station, found, url=place, told=past)
+        events = plant.owner.join(station, found, url=place, events=past)
     post.close()
-    app.emit({**told, "events": events}, f"Joined {found.name}. Next: teds-provision registry sync")
+    app.emit({**result, "events": events}, f"Joined {found.name}. Next: teds-provision registry sync")
 
 
 @command("teds-provision registry disconnect --yes", name="disconnect")
@@ -449,14 +449,14 @@ def disconnect(app: App, yes: bool, dry_run: bool) -> None:
     """Leave the registry. Keys, pins and pages stay; the roster no longer applies here."""
     station = app.station()
     held = plant.apply_pages.require_roster(station)
-    said = (
+    text = (
         f"Leave {held.name}: this station stops publishing, and trusts every station that the CA certified again,"
         " removed ones included. It stays on the roster until the owner runs: registry remove"
     )
     if dry_run:
-        app.emit({"registry": held.registry, "plan": True}, f"Plan: {said}")
+        app.emit({"registry": held.registry, "plan": True}, f"Plan: {text}")
         return
-    app.note(said)
+    app.note(text)
     app.confirm("Leave this registry?", yes=yes)
     with station.lock("registry disconnect", app.note):
         plant.membership.disconnect(station)
@@ -493,13 +493,13 @@ def sync(app: App, files: Path | None) -> None:
     finally:
         post.close()
     alarms = [alarm for alarm in station.plant.alarms.all() if not alarm.seen]
-    told = {
+    result = {
         "pushed": done.pushed,
         "fetched": done.fetched,
         "returned": done.returned,
         "parcels": {"in": done.parcels_in, "out": done.parcels_out, "waiting": done.waiting},
         "alarms": [_alarm(station, alarm) for alarm in alarms],
-        "told": done.told,
+        "told": done.remarks,
         "rosters": done.rosters,
         "open_doors": doors,
     }
@@ -507,7 +507,7 @@ def sync(app: App, files: Path | None) -> None:
         app.warn(
             f"The database allows what it should not: {', '.join(doors)}. As its superuser, run: registry sql | psql"
         )
-    app.emit(told, _synced(station, done, alarms))
+    app.emit(result, _synced(station, done, alarms))
     if alarms:
         raise click.exceptions.Exit(4)
 
@@ -520,7 +520,7 @@ def _synced(station: Station, done: SyncResult, alarms: Sequence[Any]) -> str:
         waits = f"{_count(done.waiting, 'parcel')} {'waits' if done.waiting == 1 else 'wait'}"
         lines.append(f"{waits} for confirmation: teds-provision import-keys --received")
     lines += [f"roster {version} is now in force" for version in done.rosters]
-    lines += done.told
+    lines += done.remarks
     lines += [f"ALARM {_alarm_line(station, alarm)}" for alarm in alarms]
     return "\n".join(lines)
 
@@ -558,7 +558,7 @@ def status(app: App) -> None:
     record = station.plant.joined
     assert record is not None
     found = plant.status.status(station, record, held)
-    told = {
+    result = {
         "registry": held.registry,
         "name": held.name,
         "roster": held.version,
@@ -572,7 +572,7 @@ def status(app: App) -> None:
         "heads": list(found.heads),
         "open_doors": station.plant.doors(),
     }
-    app.emit(told, _shown(station, found))
+    app.emit(result, _shown(station, found))
     if found.exit_code:
         raise click.exceptions.Exit(found.exit_code)
 
@@ -652,17 +652,17 @@ def log(app: App, node: str | None, name: str | None, since: str | None) -> None
             raise NotFoundError(f"{name!r} is not in the roster.", hint="See: teds-provision registry status")
         of = found.fingerprint
     uuid = None if node is None else plant.status.resolve(station, node)
-    said = plant.status.log(station, uuid=uuid, of=of, since=moment(since) if since else None)
+    statements = plant.status.log(station, uuid=uuid, of=of, since=moment(since) if since else None)
     if app.json:
         more = (
             (stated, {"fingerprint_of_station": stated.station, "page": stated.number, "counts": stated.counts})
-            for stated in said
+            for stated in statements
         )
         print_json_list(
-            "events", ({**stated.event, "station": held.name_of(stated.station), **told} for stated, told in more)
+            "events", ({**stated.event, "station": held.name_of(stated.station), **facts} for stated, facts in more)
         )
         return
-    for stated in said:
+    for stated in statements:
         counts = "" if stated.counts else "  (does not count)"
         who = f"{held.name_of(stated.station)} {stated.number}"
         app.lines([sanitize(f"{stated.event['at']}  {who}  {stated.event['act']}  {_members(stated.event)}{counts}")])
@@ -701,20 +701,20 @@ def vouch(app: App, nodes: Sequence[str], every: bool, yes: bool, dry_run: bool)
     station = app.station()
     uuids = None if every else [station.nodes.resolve(text) for text in nodes]
     found = plant.membership.vouchable(station, uuids)
-    said = "\n".join(f"  {uuid.hex()}  signed by {signer}" for uuid, _, signer in found) or "  none"
-    told = {"nodes": [{"uuid": uuid.hex(), "teds_sha256": digest} for uuid, digest, _ in found]}
+    lines = "\n".join(f"  {uuid.hex()}  signed by {signer}" for uuid, _, signer in found) or "  none"
+    result = {"nodes": [{"uuid": uuid.hex(), "teds_sha256": digest} for uuid, digest, _ in found]}
     if dry_run:
-        app.emit({**told, "done": 0, "plan": True}, f"Plan: vouch for these datasheets:\n{said}")
+        app.emit({**result, "done": 0, "plan": True}, f"Plan: vouch for these datasheets:\n{lines}")
         return
     if not found:
-        app.emit({**told, "done": 0}, "Nothing to do: no datasheet needs a keeper's word.")
+        app.emit({**result, "done": 0}, "Nothing to do: no datasheet needs a keeper's word.")
         return
-    app.note(f"Datasheets that are authentic here but not in the plant:\n{said}")
+    app.note(f"Datasheets that are authentic here but not in the plant:\n{lines}")
     app.confirm("Vouch for them?", yes=yes)
     station.unlock()
     with station.lock("registry vouch", app.note):
         done = plant.membership.vouch(station, found)
-    app.emit({**told, "done": done}, f"Vouched for {_count(done, 'datasheet')}. To tell the others: registry sync")
+    app.emit({**result, "done": done}, f"Vouched for {_count(done, 'datasheet')}. To tell the others: registry sync")
 
 
 @command("teds-provision registry accept west --page 4f1c09aa77e012bd", name="accept")

@@ -31,7 +31,7 @@ from teds_provision.cli.options import (
     file_units_option,
     foxglove_address,
     foxglove_options,
-    said_here,
+    options_given,
     tracing,
 )
 from teds_provision.cli.rendering import count_of, shown
@@ -138,9 +138,9 @@ def run(
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise UsageError(f"ncap run needs {', '.join(missing)}.", hint=how_to_install("ncap"))
-    if said_here("yes") and not wished["adopt"]:
+    if options_given("yes") and not wished["adopt"]:
         raise UsageError("--yes requires --adopt.", hint="Add --adopt --detection transparent.")
-    if said_here("unverified") and not wished["adopt"]:
+    if options_given("unverified") and not wished["adopt"]:
         raise UsageError("--unverified requires --adopt.", hint="Add --adopt --detection transparent.")
     wished["unverified"] = wished["unverified"] and wished["adopt"]
     if wished["measure"] is None and not wished["unverified"] and (wished["rate"] is not None or wished["frozen"]):
@@ -235,15 +235,15 @@ class DaemonLog:
                 self._app.note(_sentence(event))
 
 
-def _dated(told: Any) -> Any:
+def _dated(members: Any) -> Any:
     """Return the API's answer with moments as everywhere on the command line: ISO 8601 in place of unix seconds."""
-    if isinstance(told, list):
-        return [_dated(element) for element in told]
-    if not isinstance(told, dict):
-        return told
+    if isinstance(members, list):
+        return [_dated(element) for element in members]
+    if not isinstance(members, dict):
+        return members
     return {
         key: _moment(element) if key in _MOMENTS and _is_number(element) else _dated(element)
-        for key, element in told.items()
+        for key, element in members.items()
     }
 
 
@@ -263,8 +263,8 @@ def _sentence(event: dict[str, Any]) -> str:
             ready += f"\nFoxglove: {event['foxglove']}"
         return ready if event.get("links") else f"{ready}\n{_NO_LINK}"
     facts = {key: value for key, value in event.items() if key not in ("event", "time", "state") and value}
-    told = ", ".join(f"{key} {_text(value)}" for key, value in facts.items())
-    return f"{event['event']} {event.get('state', '')}: {told}"
+    text = ", ".join(f"{key} {_text(value)}" for key, value in facts.items())
+    return f"{event['event']} {event.get('state', '')}: {text}"
 
 
 def _text(value: Any) -> str:
@@ -323,8 +323,8 @@ def _status(console: Console, found: dict[str, Any]) -> None:
         console.print(f"Foxglove: {found['foxglove']}", markup=False)
     for known in found.get("sinks", ()):
         why = known["error"] or known["detail"]
-        told = f"{known['state']}, {known['dropped']} dropped{f': {why}' if why else ''}"
-        console.print(f"{shown(known['name'])}: {told}", markup=False)
+        text = f"{known['state']}, {known['dropped']} dropped{f': {why}' if why else ''}"
+        console.print(f"{shown(known['name'])}: {text}", markup=False)
 
 
 def _verdict(node: dict[str, Any]) -> str:
@@ -401,8 +401,8 @@ def _stop(app: App, wanted: str) -> None:
             raise NotFoundError(f"No measurement {wanted!r} is kept.", hint=f"Kept: {known}.")
         for id_ in ends:
             running.end_measurement(id_)
-    told = "; ".join(f"{id_} ({named[id_]})" for id_ in ends)
-    app.emit({"stopped": ends}, f"Ended: {told}." if ends else "Nothing to do: no measurement is kept.")
+    text = "; ".join(f"{id_} ({named[id_]})" for id_ in ends)
+    app.emit({"stopped": ends}, f"Ended: {text}." if ends else "Nothing to do: no measurement is kept.")
 
 
 def _match_lines(station: Station, found: MatchSurvey, present: Set[str]) -> list[str]:

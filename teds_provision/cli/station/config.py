@@ -117,8 +117,8 @@ def _check_value(root: click.Context, name: str, value: Any, place: Path) -> Non
     try:
         option.process_value(click.Context(command, parent=root, info_name=path), value)
     except click.BadParameter as error:
-        said = error.message.rstrip(".")
-        raise BadDataError(f"{place}: {name} = {value!r}: {said}.", hint="Fix that line.") from error
+        reason = error.message.rstrip(".")
+        raise BadDataError(f"{place}: {name} = {value!r}: {reason}.", hint="Fix that line.") from error
 
 
 def _parameter(root: click.Context, name: str) -> tuple[str, click.Command, click.Parameter] | None:
@@ -183,8 +183,8 @@ def set_(app: App, ctx: click.Context, name: str, value: str) -> None:
 def unset(app: App, name: str) -> None:
     """Remove a setting from config.toml; comments and the other settings stay."""
     changed = _edit(app, "config unset", name, None)
-    told = f"Removed {name}." if changed else f"Nothing to do: {name} is not set in config.toml."
-    app.emit({"settings": [], "removed": name if changed else None}, told)
+    text = f"Removed {name}." if changed else f"Nothing to do: {name} is not set in config.toml."
+    app.emit({"settings": [], "removed": name if changed else None}, text)
 
 
 def _typed(root: click.Context, name: str, value: str) -> Any:
@@ -275,9 +275,9 @@ def _edited(text: str, table: list[str], key: str, value: Any) -> str:
     if there is None:
         lines += [*([""] if lines else []), f"[{'.'.join(table)}]", f"{key} = {_toml(value)}"]
         return "\n".join([*lines, ""])
-    said = [n for n in range(start, end) if lines[n].strip() and not lines[n].lstrip().startswith("#")]
+    set_lines = [n for n in range(start, end) if lines[n].strip() and not lines[n].lstrip().startswith("#")]
     first = next((n for n in range(start, end) if not lines[n].startswith("#")), end) if not table else start
-    lines.insert(said[-1] + 1 if said else first, f"{key} = {_toml(value)}")
+    lines.insert(set_lines[-1] + 1 if set_lines else first, f"{key} = {_toml(value)}")
     return "\n".join([*lines, ""])
 
 

@@ -121,9 +121,9 @@ def export_keys(
     shown = handover_room.outgoing.plan_exports(station, order)
     outputs = handover_room.outgoing.outputs_of(output, len(shown)) if output is not None else []
     if dry_run:
-        told = _exported(shown, outputs, station)
+        result = _exported(shown, outputs, station)
         id_ = None if shown[0].earlier is None else shown[0].id
-        app.emit({**told, "id": id_, "plan": True}, _plan_text(shown, station))
+        app.emit({**result, "id": id_, "plan": True}, _plan_text(shown, station))
         return
     app.note(_plan_text(shown, station))
     app.confirm(f"{mode.capitalize()} {_count(shown)}?", yes=yes)
@@ -131,27 +131,27 @@ def export_keys(
         # A person may have taken minutes to answer. What they said yes to is done, or nothing is.
         plans = shown if station.version() == state else handover_room.outgoing.plan_exports(station, order)
         require_same([plan.content for plan in plans] == [plan.content for plan in shown])
-        told = _exported(plans, outputs, station)
+        result = _exported(plans, outputs, station)
         if send:
             names = [plant.parcels.send_export(station, plan, datetime.now(UTC)) for plan in plans]
-            app.emit({**told, "parcels": names}, f"{_count(plans)} will leave with the next registry sync.")
+            app.emit({**result, "parcels": names}, f"{_count(plans)} will leave with the next registry sync.")
             return
         done = handover_room.outgoing.export_all(station, plans, outputs)
-    _tell_export(app, plans, outputs, told, done)
+    _print_export(app, plans, outputs, result, done)
 
 
-def _tell_export(
-    app: App, plans: Sequence[ExportPlan], outputs: Sequence[Path], told: dict[str, Any], done: Sequence[ExportResult]
+def _print_export(
+    app: App, plans: Sequence[ExportPlan], outputs: Sequence[Path], result: dict[str, Any], done: Sequence[ExportResult]
 ) -> None:
-    for bundle, exported in zip(told["bundles"], done, strict=True):
+    for bundle, exported in zip(result["bundles"], done, strict=True):
         bundle |= {"sha256": exported.sha256, "octets": exported.octets, "fresh": exported.fresh}
     fresh = any(exported.fresh for exported in done)
-    told |= {"sha256": done[0].sha256, "octets": sum(exported.octets for exported in done), "fresh": fresh}
+    result |= {"sha256": done[0].sha256, "octets": sum(exported.octets for exported in done), "fresh": fresh}
     again = "" if fresh else " (nothing to do: it already exists)"
     moved = plans[0].mode == "move"
     next_step = "\nTo complete the move with its receipt: teds-provision handover receipt FILE.receipt" if moved else ""
     files = ", ".join(map(str, outputs))
-    app.emit(told, f"{_count(plans)} in {files}, handover {plans[0].id}{again}.{next_step}")
+    app.emit(result, f"{_count(plans)} in {files}, handover {plans[0].id}{again}.{next_step}")
 
 
 def _count(plans: Sequence[ExportPlan]) -> str:
@@ -282,7 +282,7 @@ def import_keys(
     outcomes: list[dict[str, Any]] = []
     if links_given(ctx) if prove is None else prove:
         outcomes = _prove(app, station, done, links)
-    _tell_import(app, station, done, receipt, _import_plan(shown), outcomes)
+    _print_import(app, station, done, receipt, _import_plan(shown), outcomes)
     if prove and any(outcome["why"] for outcome in outcomes):
         raise click.exceptions.Exit(LinkError.exit_code)
 
@@ -291,7 +291,7 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
     """Show each waiting parcel with its reason; take in those that the user confirms."""
     plant.apply_pages.require_roster(station)
     station.unlock()
-    parcels, told = station.plant.parcels, list[dict[str, Any]]()
+    parcels, results = station.plant.parcels, list[dict[str, Any]]()
     for row in parcels.all("in", "waiting", "later"):
         if row.kind != "bundle":
             continue
@@ -303,7 +303,7 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
             continue
         app.note(f"{_import_text(station, shown)}\nReason for waiting: {row.detail or 'it has just arrived'}")
         one = {**_import_plan(shown), "parcel": row.id, "why": row.detail}
-        told.append(one)
+        results.append(one)
         if dry_run:
             continue
         app.confirm("Import this parcel?", yes=yes)
@@ -312,9 +312,9 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
             _require_as_shown(plan, shown)
             done = plant.parcels.import_parcel(station, row, plan)
         one["fresh"] = done.fresh
-    count = f"{len(told)} parcel{'s' * (len(told) != 1)}"
+    count = f"{len(results)} parcel{'s' * (len(results) != 1)}"
     text = f"{count}." if dry_run else f"{count} imported; the receipts leave with the next sync."
-    app.emit({"received": told, "plan": dry_run}, text if told else "Nothing waits.")
+    app.emit({"received": results, "plan": dry_run}, text if results else "Nothing waits.")
 
 
 @contextmanager
@@ -354,10 +354,10 @@ def _import_plan(plan: ImportPlan | ImportResult) -> dict[str, Any]:
     bundle = plan.opened.bundle
     nodes = ((planned.node.uuid.hex(), planned.decision, planned.why) for planned in plan.nodes)
     denied = [{"uuid": revocation.uuid.hex(), "why": revocation.why} for revocation in plan.denied]
-    told = _import_result(bundle.sender, bundle.mode, bundle.id, nodes, denied)
+    result = _import_result(bundle.sender, bundle.mode, bundle.id, nodes, denied)
     notes = {planned.node.uuid.hex(): list(planned.notes) for planned in plan.nodes if planned.notes}
     passed_over = [{"uuid": revocation.uuid.hex(), "why": why} for revocation, why in plan.passed_over]
-    return told | {"notes": notes, "revocations_passed_over": passed_over}
+    return result | {"notes": notes, "revocations_passed_over": passed_over}
 
 
 def _taken_before(done: ImportResult) -> dict[str, Any]:
@@ -430,16 +430,27 @@ def _prove(app: App, station: Station, done: ImportResult, links: LinkSettings) 
     ]
 
 
-def _tell_import(
-    app: App, station: Station, done: ImportResult, receipt: Path, told: dict[str, Any], outcomes: list[dict[str, Any]]
+def _print_import(
+    app: App,
+    station: Station,
+    done: ImportResult,
+    receipt: Path,
+    result: dict[str, Any],
+    outcomes: list[dict[str, Any]],
 ) -> None:
-    imported = told["imported"]
+    imported = result["imported"]
     known = handover_room.incoming.proven_of(station, map(bytes.fromhex, imported))
     proven = [uuid for uuid in imported if bytes.fromhex(uuid) in known] if known else []
     pending = [uuid for uuid in imported if bytes.fromhex(uuid) not in known] if known else imported
     not_met = {outcome["uuid"]: outcome["why"] for outcome in outcomes if outcome["why"]}
-    told |= {"receipt": str(receipt), "fresh": done.fresh, "proven": proven, "pending": pending, "not_proven": not_met}
-    app.emit(told, _summary(done, receipt, not_met, pending, sum(bool(outcome["rotated"]) for outcome in outcomes)))
+    result |= {
+        "receipt": str(receipt),
+        "fresh": done.fresh,
+        "proven": proven,
+        "pending": pending,
+        "not_proven": not_met,
+    }
+    app.emit(result, _summary(done, receipt, not_met, pending, sum(bool(outcome["rotated"]) for outcome in outcomes)))
 
 
 def _summary(done: ImportResult, receipt: Path, not_met: dict[str, str], pending: list[str], rotated: int) -> str:
@@ -515,9 +526,9 @@ def receipt(app: App, file: Path) -> None:
         raise NotFoundError(f"There is no receipt (*.receipt) in {file}.")
     with station.lock("handover receipt", app.note):
         closed, failed = _close_all(app, station, files, go_on=file.is_dir())
-    told = [_closed(result) for result in closed]
+    results = [_closed(result) for result in closed]
     text = "\n".join(_closed_text(station, result) for result in closed)
-    app.conclude({**told[0], "receipts": told} if told else {"receipts": []}, text or None, failed)
+    app.conclude({**results[0], "receipts": results} if results else {"receipts": []}, text or None, failed)
 
 
 def _close_all(
@@ -583,6 +594,6 @@ def undo(app: App, id_: str, yes: bool, dry_run: bool) -> None:
     app.confirm("Undo this move? The receiver may still have the keys until they are rotated.", yes=yes)
     with station.lock("handover undo", app.note):
         done = handover_room.pending.undo(station, handover_room.pending.find_handover(station, id_))
-    told = {"id": row.id, "state": "undone", "nodes": [uuid.hex() for uuid in done.uuids], "fresh": done.fresh}
+    result = {"id": row.id, "state": "undone", "nodes": [uuid.hex() for uuid in done.uuids], "fresh": done.fresh}
     text = f"{count_of(len(done.uuids))} back on this station; each key is rotated at the next contact."
-    app.emit(told, text if done.fresh else "Nothing to do: this move was already undone.")
+    app.emit(result, text if done.fresh else "Nothing to do: this move was already undone.")

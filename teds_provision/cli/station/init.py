@@ -83,7 +83,7 @@ def init(
         station = app.station()
     else:
         station, why = station_room.station.initialise(
-            app.home, name=name, keystore=keystore, ask=app.ask_secret, tell=app.note
+            app.home, name=name, keystore=keystore, ask=app.ask_secret, notify=app.note
         )
         app.closing(station.close)
         _require_same(station, name, keystore)
@@ -127,14 +127,14 @@ def _request(app: App, name: str | None, keystore: str | None, path: Path) -> No
     if fresh:
         write_new(path, octets)
     digits = protocol.keys.fingerprint(asked.station)
-    told = {
+    result = {
         "name": asked.name,
         "public_key": protocol.keys.to_pem(asked.station),
         "fingerprint": digits,
         "request": str(path),
     }
     app.emit(
-        {**told, "ca": None},
+        {**result, "ca": None},
         f"Certificate request of station {asked.name}: {path}.\n"
         f"Compare by voice:\n  {handover.trust.spoken(digits)}\n"
         f"On the station with the CA key: teds-provision trust ca sign {quote(path.name)}"

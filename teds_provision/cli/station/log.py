@@ -78,9 +78,9 @@ def log(
         return
     entries = _CountedEntries(audit_log.chosen(choice, after))
     if app.json:
-        _tell_json(entries, verdict, after)
+        _print_json(entries, verdict, after)
     else:
-        _tell_lines(app, entries, verdict, after, narrowed=choice != store.AuditFilter())
+        _print_lines(app, entries, verdict, after, narrowed=choice != store.AuditFilter())
 
 
 class _CountedEntries:
@@ -99,7 +99,7 @@ class _CountedEntries:
             yield entry
 
 
-def _tell_json(entries: _CountedEntries, verdict: AuditVerdict, after: int) -> None:
+def _print_json(entries: _CountedEntries, verdict: AuditVerdict, after: int) -> None:
     """Print one object, written as it is read; exits 7 if the chain is broken."""
     out = sys.stdout
     out.write('{"entries": [')
@@ -120,7 +120,7 @@ def _tell_json(entries: _CountedEntries, verdict: AuditVerdict, after: int) -> N
         raise click.exceptions.Exit(7)
 
 
-def _tell_lines(app: App, entries: _CountedEntries, verdict: AuditVerdict, after: int, *, narrowed: bool) -> None:
+def _print_lines(app: App, entries: _CountedEntries, verdict: AuditVerdict, after: int, *, narrowed: bool) -> None:
     """Print a line for each entry; if only some were requested (``narrowed``), how many came."""
     sys.stdout.writelines(_line(entry) + "\n" for entry in entries)
     sys.stdout.flush()

@@ -150,21 +150,23 @@ def _demand(demand: dict[str, Any]) -> str:
 def check(app: App, names: tuple[str, ...]) -> None:
     """Report every mistake with file, line and field. Exits 8 if there is one."""
     folders = default_folders(app.home)
-    told: list[dict[str, Any]] = []
+    results: list[dict[str, Any]] = []
     errors: list[ProfileProblem] = []
     for name in names:
         path = find_profile(name, folders)
         _, problems = check_profile(path, folders)
         wrong = [problem for problem in problems if problem.severity == "error"]
         errors += wrong
-        told.append({"name": path.stem, "file": str(path), "ok": not wrong, "problems": list(map(_problem, problems))})
+        results.append(
+            {"name": path.stem, "file": str(path), "ok": not wrong, "problems": list(map(_problem, problems))}
+        )
         for problem in problems:
             app.note(f"{problem.severity}: {problem}")  # not with --json, where they stand in the object
     if errors:
         more = f" ({len(errors) - 1} more, listed above)" if len(errors) > 1 and not app.json else ""
         raise BadDataError(f"{errors[0]}{more}")
-    good = ", ".join(entry["name"] for entry in told)
-    app.emit({"profiles": told}, _plain(f"{good}: no mistakes found."))
+    good = ", ".join(entry["name"] for entry in results)
+    app.emit({"profiles": results}, _plain(f"{good}: no mistakes found."))
 
 
 def _problem(problem: ProfileProblem) -> dict[str, Any]:
@@ -261,8 +263,8 @@ def new(
             except OSError as error:
                 raise StoreError(f"Cannot create {path.parent}: {error.strerror}.") from error
         write_new(path, text.encode("utf-8"), mode=SHARED)
-    said = _plain(f"{path} {'already exists' if done else 'written'}.")
-    app.emit({"profiles": [{"name": name, "file": str(path)}], **more}, said)
+    sentence = _plain(f"{path} {'already exists' if done else 'written'}.")
+    app.emit({"profiles": [{"name": name, "file": str(path)}], **more}, sentence)
 
 
 def _sensor(source: str | None, message: str | None, mapping: Path | None) -> WrappedSensor | None:

@@ -78,9 +78,9 @@ def add(
     station = app.station()
     found = _candidates(station, name, file, folder, role, fingerprint)
     fresh = [key for key in found if not key.known]
-    told = {"trusted": [_record(key.record) for key in found], "added": len(fresh)}
+    result = {"trusted": [_record(key.record) for key in found], "added": len(fresh)}
     if dry_run:
-        app.emit({**told, "plan": True}, _shown(found))
+        app.emit({**result, "plan": True}, _shown(found))
         return
     _add(app, station, [key for key in found if key.known or _agreed(app, key, yes or fingerprint is not None)])
 
@@ -91,9 +91,9 @@ def _add(app: App, station: Station, chosen: list[Candidate]) -> None:
         station.unlock()  # whom this station trusts is sealed under its vault
     with station.lock("trust add", app.note):
         added = handover.trust.add(station, chosen)
-    told = {"trusted": [_record(candidate.record) for candidate in chosen], "added": added}
+    result = {"trusted": [_record(candidate.record) for candidate in chosen], "added": added}
     names = ", ".join(candidate.record.name for candidate in fresh)
-    app.emit(told, f"Now trusted: {names}." if added else "Nothing to do.")
+    app.emit(result, f"Now trusted: {names}." if added else "Nothing to do.")
 
 
 def _candidates(
@@ -163,17 +163,17 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
     station = app.station()
     record = handover.trust.find_trusted(station, name)
     plan = handover.trust.plan_removal(station, record)
-    told = {"removed": _record(record), "ends": _ends(plan)}
+    result = {"removed": _record(record), "ends": _ends(plan)}
     text = f"{record.role} {record.name}, {record.fingerprint[:32]}"
     if dry_run:
-        app.emit({**told, "plan": True}, "\n".join([f"Plan: stop trusting the {text}.", *_ended(plan)]))
+        app.emit({**result, "plan": True}, "\n".join([f"Plan: stop trusting the {text}.", *_ended(plan)]))
         return
     app.note("\n".join([f"Trusted as {text}", *_ended(plan)]))
     app.confirm(f"Stop trusting the {text}?", yes=yes)
     station.unlock()
     with station.lock("trust remove", app.note):
         done = handover.trust.remove(station, handover.trust.find_trusted(station, name))
-    app.emit({**told, "ends": _ends(done)}, "\n".join([f"No longer trusted: {text}.", *_ended(done)]))
+    app.emit({**result, "ends": _ends(done)}, "\n".join([f"No longer trusted: {text}.", *_ended(done)]))
 
 
 def _ends(removal: Removal) -> dict[str, Any]:
@@ -210,7 +210,7 @@ def list_(app: App) -> None:
     records = station.policy.listed()
     ca, certificate = station.ca, station.identity.certificate
     certified = {record.fingerprint: certificate(ca, record.point) is not None for record in records}
-    told = [
+    keys = [
         {
             **_record(record),
             "added": record.added,
@@ -228,7 +228,7 @@ def list_(app: App) -> None:
         if record.role == "station" and station.policy.in_roster(record.fingerprint):
             mark = "  member of the plant"
         lines.append(f"{record.role:<14} {record.name}  {record.fingerprint[:16]}{mark}")
-    app.emit({"trusted": told, "own": own}, "\n".join(lines))
+    app.emit({"trusted": keys, "own": own}, "\n".join(lines))
 
 
 @trust.group(
@@ -271,7 +271,7 @@ def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> Non
     station = app.station()
     wanted = handover.trust.read_request(read_limited(request, handover.trust.MAX_OCTETS, "request"))
     digits = protocol.keys.fingerprint(wanted.station)
-    told = {
+    result = {
         "name": wanted.name,
         "fingerprint": digits,
         "ca": protocol.keys.fingerprint(station.ca),
@@ -279,7 +279,7 @@ def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> Non
     }
     shown = f"Station {wanted.name}\n  {handover.trust.spoken(digits)}"
     if dry_run:
-        app.emit({**told, "plan": True}, f"Plan: certify\n{shown}")
+        app.emit({**result, "plan": True}, f"Plan: certify\n{shown}")
         return
     station.unlock()
     app.note(shown)
@@ -291,7 +291,7 @@ def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> Non
             write_new(output, octets)
     there = f"On that station: teds-provision init --certificate {output}"
     text = f"{wanted.name} ({digits[:16]}) is certified: {output}. {there}"
-    app.emit({**told, "fresh": fresh}, text if fresh else f"Nothing to do: {output} already exists.")
+    app.emit({**result, "fresh": fresh}, text if fresh else f"Nothing to do: {output} already exists.")
 
 
 @ca.command(

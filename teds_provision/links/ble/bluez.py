@@ -70,10 +70,12 @@ async def _adapters(bus_address: str | None) -> list[AdapterFacts]:
     for path, interfaces in sorted(objects.items()):
         properties = interfaces.get(_ADAPTER)
         if properties is not None:
-            said = {name: value.value for name, value in properties.items()}
+            values = {name: value.value for name, value in properties.items()}
             held = sum(_is_held(other, path) for other in objects.values())
-            central = "central" in said.get("Roles", ["central"])
-            found.append(AdapterFacts(path.rpartition("/")[2], said["Address"], bool(said["Powered"]), central, held))
+            central = "central" in values.get("Roles", ["central"])
+            found.append(
+                AdapterFacts(path.rpartition("/")[2], values["Address"], bool(values["Powered"]), central, held)
+            )
     return found
 
 

@@ -54,8 +54,8 @@ class RememberedNodes:
         self._known: dict[str, Identity] = {}
         self._changed = False
         with suppress(OSError, ValueError, TypeError, AttributeError, TedsProvisionError):
-            said = json.loads(read_limited(path, _MOST_OCTETS, "cache"))
-            self._known = {address: Identity.decode(bytes.fromhex(octets)) for address, octets in said.items()}
+            document = json.loads(read_limited(path, _MOST_OCTETS, "cache"))
+            self._known = {address: Identity.decode(bytes.fromhex(octets)) for address, octets in document.items()}
 
     def items(self) -> list[tuple[str, Identity]]:
         """Every address and who was there, the newest first."""
@@ -221,12 +221,12 @@ class BlePort(MeasuringLink):
         """
         where = f"at {self.spec.address} " if self.spec.address else ""
         notice(Notice("waiting", f"Looking for the node {where}over BLE ({self.spec.text}).", seconds))
-        told: set[bytes] = set()
+        reported: set[bytes] = set()
         for candidate in self._candidates(wanted, time.monotonic() + seconds):
-            contact = self._ask(candidate, wanted, notice, told)
+            contact = self._ask(candidate, wanted, notice, reported)
             if contact is not None:
                 return contact
-        others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in told))}" if told else ""
+        others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in reported))}" if reported else ""
         raise NoNodeError(
             f"The node did not answer over BLE {where}within {seconds:g} s{others}.",
             hint="A node advertises for 60 s after a tap, and as long as it has a key. Bring it closer, or tap it.",
@@ -241,13 +241,13 @@ class BlePort(MeasuringLink):
         notice(Notice("waiting", f"Looking for nodes over BLE ({self.spec.text}).", seconds))
         began = time.monotonic()
         until, enough = began + seconds, began + min(listen, seconds)
-        told: set[bytes] = set()
+        reported: set[bytes] = set()
         found: dict[str, Contact] = {}
         asked: dict[str, float] = {}
         while (left := until - time.monotonic()) > 0:
             for address in [self.spec.address] if self.spec.address else self._all_new(left, asked, found, enough):
                 in_use = self._is_up(address)
-                contact = self._ask(address, _anyone, notice, told)
+                contact = self._ask(address, _anyone, notice, reported)
                 asked[address] = time.monotonic()
                 if contact is not None:
                     if not in_use:  # there may be twenty: each is connected again when its turn comes
@@ -354,7 +354,7 @@ class BlePort(MeasuringLink):
         return sorted(first_at)
 
     def _ask(
-        self, address: str, wanted: Callable[[Identity], bool], notice: NoticeSink, told: set[bytes]
+        self, address: str, wanted: Callable[[Identity], bool], notice: NoticeSink, reported: set[bytes]
     ) -> Contact | None:
         """Connect and read Identify; the connection stays only if it is the wanted node."""
         link = self._link(address, notice)
@@ -373,8 +373,8 @@ class BlePort(MeasuringLink):
         self._known.remember_node(address, identity)
         if not wanted(identity):
             self._leave(link, in_use=in_use)
-            if identity.uuid not in told:
-                told.add(identity.uuid)
+            if identity.uuid not in reported:
+                reported.add(identity.uuid)
                 uuid = identity.uuid.hex()
                 notice(
                     Notice("foreign-tag", f"Node {uuid} is at {address}, but it is not the node that was requested.")

@@ -68,7 +68,7 @@ class WatchedPort(Protocol):
         """Report other stations that use our source address."""
 
 
-def _tells_a_start(frame: Frame) -> bool:
+def _is_start(frame: Frame) -> bool:
     """Return True for an Announce of a node that started; a pressed button is no reason to ask."""
     announce = Announce.decode(frame.identifier, frame.data) if is_announce(frame.identifier) else None
     return announce is not None and not announce.pressed
@@ -99,7 +99,7 @@ class Arrivals:
         bus = self._port.bus()
         if bus is not self._bus:
             self._bus = bus
-            self._listener = bus.listen(_tells_a_start, most=256)
+            self._listener = bus.listen(_is_start, most=256)
         clashing: set[int] = set()
         address = self._port.spec.node
         for news in self._all(stop, clashing) if address is None else self._one(address, clashing):

@@ -72,11 +72,11 @@ def ask_all(
     with bus.gather(transaction) as asked:
         body = bytes([transaction]) + IDENTIFY.encode()
         bus.send(Frame(FUNCTIONAL | bus.own, single(body, fd=fd), fd))
-        told: set[int] = set()
+        reported: set[int] = set()
         for node in _news(bus, asked, silence, longest):
             identity = _read(asked.replies, node)
-            if identity is not None and node not in told:
-                told.add(node)
+            if identity is not None and node not in reported:
+                reported.add(node)
                 yield node, identity
         gathering = asked.replies
     yield FunctionalAnswers(

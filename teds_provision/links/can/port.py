@@ -77,7 +77,7 @@ class CanPort(MeasuringLink):
         self._closed = False
         self._transaction = secrets.randbelow(256)
         self._lock = threading.Lock()
-        self._rival_told = False
+        self._rival_reported = False
         self._streams = CanStreams()
 
     @property
@@ -210,7 +210,7 @@ class CanPort(MeasuringLink):
         wanted one is not found elsewhere, LinkError when the bus fails.
         """
         until = time.monotonic() + seconds
-        told: set[bytes] = set()
+        reported: set[bytes] = set()
         notice(Notice("waiting", f"Looking for the node on {self.spec.text}.", seconds))
         if self.spec.node is None and address is not None and 1 <= address <= LAST_NODE:
             # ask at the node's last address: there is no random wait, unlike after a broadcast
@@ -221,17 +221,17 @@ class CanPort(MeasuringLink):
         while (left := until - time.monotonic()) > 0:
             round_ends = time.monotonic() + min(_ROUND_SECONDS, left)
             if self.spec.node is not None:
-                contact = self._at(self.spec.node, wanted, notice, told)
+                contact = self._at(self.spec.node, wanted, notice, reported)
             else:
-                contact = self._among_all(wanted, left, notice, told)
+                contact = self._among_all(wanted, left, notice, reported)
             if contact is not None:
                 return contact
             time.sleep(max(0.0, round_ends - time.monotonic()))
-        raise self._nobody(seconds, told)
+        raise self._nobody(seconds, reported)
 
-    def _nobody(self, seconds: float, told: set[bytes]) -> NoNodeError:
+    def _nobody(self, seconds: float, reported: set[bytes]) -> NoNodeError:
         where = f"at 0x{self.spec.node:02X} on {self.spec.text}" if self.spec.node else f"on {self.spec.text}"
-        others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in told))}" if told else ""
+        others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in reported))}" if reported else ""
         return NoNodeError(
             f"The node did not answer {where} within {seconds:g} s{others}.",
             hint="Check its power, the bit rate and the address; teds-provision identify --via can lists the"
@@ -249,11 +249,11 @@ class CanPort(MeasuringLink):
         began = time.monotonic()
         until, enough = began + seconds, began + min(listen, seconds)
         notice(Notice("waiting", f"Asking every node on {self.spec.text}.", seconds))
-        found, told = FunctionalAnswers(), set[str]()
+        found, reported = FunctionalAnswers(), set[str]()
 
         def once(shown: Notice) -> None:
-            if shown.text not in told:
-                told.add(shown.text)
+            if shown.text not in reported:
+                reported.add(shown.text)
                 notice(shown)
 
         while self.spec.node is None and (left := until - time.monotonic()) > 0:
@@ -343,12 +343,12 @@ class CanPort(MeasuringLink):
     def report_rivals(self, notice: NoticeSink) -> None:
         """Report another station under our source address, once."""
         rivals = self.bus().conflicts
-        if not self._rival_told and rivals.seen():
-            self._rival_told = True
+        if not self._rival_reported and rivals.seen():
+            self._rival_reported = True
             notice(Notice("conflict", f"{rivals.text} {rivals.hint}"))
 
     def _at(
-        self, node: int, wanted: Callable[[Identity], bool], notice: NoticeSink, told: set[bytes]
+        self, node: int, wanted: Callable[[Identity], bool], notice: NoticeSink, reported: set[bytes]
     ) -> Contact | None:
         """Ask one address who is there."""
         identity = self.identify(node)
@@ -356,11 +356,11 @@ class CanPort(MeasuringLink):
             return None
         if wanted(identity):
             return self.contact(node, identity)
-        _report_unwanted(notice, told, node, identity)
+        _report_unwanted(notice, reported, node, identity)
         return None
 
     def _among_all(
-        self, wanted: Callable[[Identity], bool], seconds: float, notice: NoticeSink, told: set[bytes]
+        self, wanted: Callable[[Identity], bool], seconds: float, notice: NoticeSink, reported: set[bytes]
     ) -> Contact | None:
         """Ask everyone; ends with the first answer that is wanted."""
         found = FunctionalAnswers()
@@ -377,15 +377,15 @@ class CanPort(MeasuringLink):
         for node, identity in sorted(found.identities.items()):
             if wanted(identity):
                 return self.contact(node, identity)
-            _report_unwanted(notice, told, node, identity)
+            _report_unwanted(notice, reported, node, identity)
         self.report_rivals(notice)
         if found.conflicts:
             raise conflict(min(found.conflicts))
         return None
 
 
-def _report_unwanted(notice: NoticeSink, told: set[bytes], node: int, identity: Identity) -> None:
-    if identity.uuid not in told:
-        told.add(identity.uuid)
+def _report_unwanted(notice: NoticeSink, reported: set[bytes], node: int, identity: Identity) -> None:
+    if identity.uuid not in reported:
+        reported.add(identity.uuid)
         text = f"Node {identity.uuid.hex()} answers at 0x{node:02X}, but it is not the node that was requested."
         notice(Notice("foreign-tag", text))

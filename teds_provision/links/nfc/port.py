@@ -128,7 +128,7 @@ class NfcPort:
         Raises NoNodeError after ``seconds``, NoReaderError when the reader is gone by then. ``address`` is of no use
         here.
         """
-        until, told, never = time.monotonic() + seconds, "", threading.Event()
+        until, reported, never = time.monotonic() + seconds, "", threading.Event()
         waiting = False
         seen: NodeInField | ForeignTag | None = None
         while (left := until - time.monotonic()) > 0:
@@ -136,7 +136,7 @@ class NfcPort:
             if isinstance(seen, NodeInField) and wanted(seen.identity):
                 return self._contact(seen, notice)
             if seen is not None:
-                told = _report_tag(seen, told, notice)
+                reported = _report_tag(seen, reported, notice)
                 self._stay(seen, never, _LOOK_AGAIN)
                 continue
             if not waiting:
@@ -167,7 +167,7 @@ class NfcPort:
         """
         here: bytes | None = None  # the node of the visit that is not over yet
         link: NfcLink | None = None
-        gone_at, told = -_CHANGING, ""
+        gone_at, reported = -_CHANGING, ""
         waiting = Notice("waiting", f"Place a node on the reader{self._named}.")
         notice(waiting)
         while not stop.is_set():
@@ -182,10 +182,10 @@ class NfcPort:
                 stop.wait(_SHORT_PAUSE if time.monotonic() - gone_at < _CHANGING else _PAUSE)
                 continue
             if isinstance(seen, ForeignTag):
-                told = _report_tag(seen, told, notice)
+                reported = _report_tag(seen, reported, notice)
                 self._stay(seen, stop, _LOOK_AGAIN)
                 continue
-            told = ""
+            reported = ""
             if not same:
                 here = seen.identity.uuid
                 link = NfcLink(self, seen, notice)
@@ -387,15 +387,15 @@ def _contact(visit: NodeInField, link: NfcLink, trace: Trace | None) -> Contact:
     return Contact(visit.identity, link, visit.tag.uid, charging=visit.charging, ble=visit.ble, trace=trace)
 
 
-def _report_tag(seen: NodeInField | ForeignTag, told: str, notice: NoticeSink) -> str:
+def _report_tag(seen: NodeInField | ForeignTag, reported: str, notice: NoticeSink) -> str:
     """Report a foreign tag, unless it was the last one reported; return the reported text."""
     if isinstance(seen, ForeignTag):
         text = seen.text
-        if text != told:
+        if text != reported:
             notice(Notice("foreign-tag", text))
     else:
         text = f"Node {seen.identity.uuid.hex()} is not the one that is expected."
-        if text != told:
+        if text != reported:
             notice(Notice("waiting", text))
     return text
 

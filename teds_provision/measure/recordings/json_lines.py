@@ -41,12 +41,12 @@ class JsonLines(Recording):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._line = 0
-        told: set[bytes] = set()
+        reported: set[bytes] = set()
         for line in self._lines():
             if line.startswith(b'{"event":"channel"'):
                 self.know(self._channel(self._event(line)))
-            elif (data := _DATA.match(line)) and data[0] not in told and len(told) < MOST.channels:
-                told.add(data[0])
+            elif (data := _DATA.match(line)) and data[0] not in reported and len(reported) < MOST.channels:
+                reported.add(data[0])
                 event = self._event(line)
                 names = ("uuid", "name", "unit", "uncertainty", "unsigned", "unverified")
                 facts = {name: event[name] for name in names if event.get(name) is not None}

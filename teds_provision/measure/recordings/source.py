@@ -165,8 +165,8 @@ def facts_of(words: object, where: str) -> ChannelFacts:
     if not isinstance(words, dict):
         raise BadDataError(f"{where}: the facts of a channel are not a JSON object.")
     curve = words.get("calibration")
-    told = ((name, value) for name, value in words.items() if name in _FIELDS and name != "calibration")
-    kept: dict[str, Any] = {name: _fact(name, value, where) for name, value in told}
+    members = ((name, value) for name, value in words.items() if name in _FIELDS and name != "calibration")
+    kept: dict[str, Any] = {name: _fact(name, value, where) for name, value in members}
     if "uuid" not in kept or "number" not in kept:
         raise BadDataError(f"{where}: a channel has no UUID or no number.")
     try:

@@ -15,7 +15,7 @@ from teds_provision.measure.clock import ClockMap
 from teds_provision.protocol.operation.stream_commands import SOON, WAITS
 
 WAITING = 2.0  # seconds that the first node waits for the others
-TELLING = 1.0  # seconds until the notice that a trigger waits
+NOTICE_AFTER = 1.0  # seconds until the notice that a trigger waits
 TOGETHER = 15.0  # seconds that a trigger waits for all nodes, from the first one that is ready
 AHEAD, AHEAD_EACH = 0.25, 0.04  # seconds from the choice of a start time to it, and more for each node
 
@@ -101,7 +101,7 @@ class CommonStart:
 
     def tells(self) -> bool:
         """Return True once, when the "waiting for" notice is due."""
-        long = self._first is not None and time.monotonic() - self._first > TELLING
+        long = self._first is not None and time.monotonic() - self._first > NOTICE_AFTER
         tells = self._trigger and not self._triggered and long and not self._told
         self._told |= tells
         return tells

@@ -121,7 +121,7 @@ class FileSink(ThreadedSink):
         self._full: tuple[float, int, str] | None = None  # since when (unix), dropped until then, what is the matter
         self._tried = 0.0
         self._gaps: list[str] = []
-        self._unsaid: list[ClockSet] = []  # came while no part could be written
+        self._clock_sets_due: list[ClockSet] = []  # came while no part could be written
         self.reports: dict[str, NodeReport] = {}
         """The newest of each node."""
 
@@ -179,7 +179,7 @@ class FileSink(ThreadedSink):
                     first = entry.uuid not in self.reports
                     self.reports[entry.uuid] = entry
                     if first and entry.samples:
-                        self._tell_counts(entry)
+                        self._write_counts(entry)
                         continue
                 self._process_item(entry)
             self._close_part()
@@ -194,7 +194,7 @@ class FileSink(ThreadedSink):
     def _note(self, at: float, text: str) -> None:
         """Write words about the recording into the part, as its format has them."""
 
-    def _tell_counts(self, report: NodeReport) -> None:
+    def _write_counts(self, report: NodeReport) -> None:
         """Write what was counted of a node by now, as the beginning of a part needs it (summary.py)."""
         self._process_item(report)
 
@@ -241,7 +241,7 @@ class FileSink(ThreadedSink):
             self._learn(item)
         elif isinstance(item, ClockSet):
             self.station = replace(self.station, started=self.station.started + item.by)
-            self._unsaid.append(item)
+            self._clock_sets_due.append(item)
 
     def _wait_for_room(self, error: OSError) -> None:
         """Give the part up and wait; raises the error if it is another one than a full disk."""
@@ -287,7 +287,7 @@ class FileSink(ThreadedSink):
             was = what.replace(" is ", " was ")
             gap = f"The {was} from {iso(since)} to {iso(now)}: {missing} values are not recorded."
             self._note(now, gap)
-            for news in self._unsaid:
+            for news in self._clock_sets_due:
                 self._note(news.time, news.words)
             self.part.flush()
         except OSError as error:
@@ -295,7 +295,7 @@ class FileSink(ThreadedSink):
             if error.errno not in FULL:
                 raise
             return
-        self._full, self._unsaid = None, []
+        self._full, self._clock_sets_due = None, []
         self._gaps.append(gap)
         self._set_state("running", gap)
 
@@ -311,7 +311,7 @@ class FileSink(ThreadedSink):
     def _go_on(self) -> None:
         """Record the counts with which this part begins: those of a measurement go on from part to part."""
         for report in self.reports.values():
-            self._tell_counts(report)
+            self._write_counts(report)
 
     def _idle(self, now: float) -> None:
         if self._part is not None:
@@ -337,8 +337,8 @@ class FileSink(ThreadedSink):
                 with suppress(OSError):
                     self._mend(self._parts[-1])
         if self._gaps:
-            told = " ".join(self._gaps[-3:])
+            text = " ".join(self._gaps[-3:])
             raise StoreError(
-                f"{self.name} has {len(self._gaps)} {'gap' if len(self._gaps) == 1 else 'gaps'}. {told}",
+                f"{self.name} has {len(self._gaps)} {'gap' if len(self._gaps) == 1 else 'gaps'}. {text}",
                 hint="Free some space before the next run; what was written is intact.",
             )

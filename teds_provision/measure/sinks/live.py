@@ -384,8 +384,8 @@ class TopicSink(ThreadedSink):
     def _status(self, report: NodeReport) -> DiagnosticEntry:
         counters = {"lost": report.lost, "late": report.late, "bad": report.bad, "invalid": report.invalid}
         level = {"running": OK, "waiting": WARN, "ended": OK}.get(report.state, ERROR)
-        told = report.state == "running" and report.why
-        if level == OK and (told or any(counters.values())):
+        with_reason = report.state == "running" and report.why
+        if level == OK and (with_reason or any(counters.values())):
             level = WARN
         values = [("samples", str(report.samples)), *((name, str(count)) for name, count in counters.items())]
         if report.invalid_why:

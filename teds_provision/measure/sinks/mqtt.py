@@ -313,7 +313,7 @@ class MqttSink(ThreadedSink):
     def _finish(self) -> None:
         if self._client is None:
             return
-        if self._connected.is_set() and not self._said_offline():
+        if self._connected.is_set() and not self._publish_offline():
             self._cut()
         self._client.disconnect()
         self._client.loop_stop()
@@ -321,16 +321,16 @@ class MqttSink(ThreadedSink):
             why = self._why or f"the broker at {self._host}:{self._port} does not answer"
             self._fail(TedsProvisionError(f"{self.name} accepted nothing: {why}.", hint="Fix that and measure again."))
 
-    def _said_offline(self) -> bool:
+    def _publish_offline(self) -> bool:
         """Return True if the broker knows that this measurement has ended."""
         until = time.monotonic() + _FAREWELL
-        said = self._client.publish(self._status, "offline", qos=1, retain=True)
-        while said.rc == _FULL and time.monotonic() < until:
+        message = self._client.publish(self._status, "offline", qos=1, retain=True)
+        while message.rc == _FULL and time.monotonic() < until:
             time.sleep(TICK)
-            said = self._client.publish(self._status, "offline", qos=1, retain=True)
+            message = self._client.publish(self._status, "offline", qos=1, retain=True)
         with suppress(ValueError, RuntimeError):  # it was not taken
-            said.wait_for_publish(max(0.0, until - time.monotonic()))
-            return bool(said.is_published())
+            message.wait_for_publish(max(0.0, until - time.monotonic()))
+            return bool(message.is_published())
         return False
 
     def _cut(self) -> None:
@@ -378,8 +378,8 @@ def _no_password() -> str:
 def _in_words(error: BaseException, host: str, port: int) -> str:
     """Why no connection came about."""
     if isinstance(error, ssl.SSLCertVerificationError):
-        said = error.verify_message or str(error)
-        return f"the certificate of {host} does not verify: {said} (ca=PATH names the CA)"
+        reason = error.verify_message or str(error)
+        return f"the certificate of {host} does not verify: {reason} (ca=PATH names the CA)"
     if isinstance(error, ssl.SSLError):
         return f"TLS with {host}:{port} fails: {error.reason or error}"
     if isinstance(error, socket.gaierror):

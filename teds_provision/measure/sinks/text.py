@@ -59,18 +59,18 @@ class TextSink(FileSink):
 
     def _state(self, item: NodeReport) -> None:
         why = f"; {printable(item.why)}" if item.why else ""
-        said = f"{item.state}: {counted(item)}{why}"
-        without_when = said.rpartition("; again in ")[0] or said
+        text = f"{item.state}: {counted(item)}{why}"
+        without_when = text.rpartition("; again in ")[0] or text
         if self._states.get(item.uuid) != without_when:
             self._states[item.uuid] = without_when
-            self._line(f"# {iso(item.time)} {item.uuid} {said}")
+            self._line(f"# {iso(item.time)} {item.uuid} {text}")
 
     def _begin(self) -> None:
         self._headed = False
         if self.facts:
             self._header()
 
-    def _tell_counts(self, report: NodeReport) -> None:
+    def _write_counts(self, report: NodeReport) -> None:
         if self._headed:
             self._state(report)
 

@@ -127,7 +127,7 @@ def compounds_of(facts: Iterable[ChannelFacts]) -> list[Compound]:
         Compound("geometry_msgs/WrenchStamped", "wrench", (*_paths("wrench.force", f), *_paths("wrench.torque", t)))
         for f, t in pairs
     ]
-    return [*_told_apart(found), *(_range(facts) for facts in sensors.values() if is_range(facts))]
+    return [*_without_namesakes(found), *(_range(facts) for facts in sensors.values() if is_range(facts))]
 
 
 def _vectors(sensors: Mapping[int, ChannelFacts]) -> dict[object, list[list[ChannelFacts]]]:
@@ -191,7 +191,7 @@ def _range(facts: ChannelFacts) -> Compound:
     return Compound("sensor_msgs/Range", "", (("range", facts.number),), fixed)
 
 
-def _told_apart(found: list[Compound]) -> list[Compound]:
+def _without_namesakes(found: list[Compound]) -> list[Compound]:
     """Two of one kind get the number of their first channel behind the name."""
     names = [compound.name for compound in found]
     return [

@@ -171,9 +171,9 @@ class NodeDirectory:
                     for kept in (self._seen, self._channels, self._own_names, self._origins, self._texts):
                         kept.pop(stranger, None)
         if state is not None:
-            told = {key: value for key, value in facts.items() if key in ("problem", "place", "busy")}
-            told |= {} if verdict is None else {"verdict": verdict}
-            self._live.event("node", uuid=uuid, state=state, **told)
+            members = {key: value for key, value in facts.items() if key in ("problem", "place", "busy")}
+            members |= {} if verdict is None else {"verdict": verdict}
+            self._live.event("node", uuid=uuid, state=state, **members)
 
     def heard(self) -> frozenset[str]:
         """Return the nodes that answer on a link now, strangers of whitelist mode included."""

@@ -103,6 +103,6 @@ def _stranger(station: Station, node: Conversation, who: IdentifiedNode) -> Node
 def power_of(node: Conversation) -> dict[str, Any] | None:
     """Return the reply to 128.18 in an open session, None if the node has none."""
     try:
-        return PowerReply.decode(node.request(POWER, "to tell its power")).as_json()
+        return PowerReply.decode(node.request(POWER, "to report its power")).as_json()
     except (NodeRefusedError, BadDataError):
         return None

@@ -87,7 +87,7 @@ STRANGERS: Final = 2
 """Threads that look at nodes which are not on the whitelist: those that are on it never wait for a stranger."""
 MOST_KNOWN: Final = 512
 """Limit of nodes assumed on a bus: it has 239 addresses, but a device may send another UUID each time."""
-TELL_STRANGERS: Final = 10.0  # seconds between two words about how many strangers there are
+STRANGERS_EVERY: Final = 10.0  # seconds between two words about how many strangers there are
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 LOOK_AGAIN: Final = 30.0  # seconds until a node that could not be looked at is looked at again
 SILENT: Final = 37.5  # seconds after which a node has left that is not asked by itself
@@ -110,7 +110,7 @@ class LinkState:
     problem: Problem | None = None
     waiting: str = ""
     since: float = field(default_factory=time.time)
-    told: str = ""
+    notice_text: str = ""
 
 
 class LinkWatch:
@@ -142,7 +142,7 @@ class LinkWatch:
         self._workers = ThreadPoolExecutor(WORKERS, thread_name_prefix=f"look {place[:20]}")
         self._for_strangers = ThreadPoolExecutor(STRANGERS, thread_name_prefix=f"stranger {place[:20]}")
         self._for_rest = ThreadPoolExecutor(1, thread_name_prefix=f"rest {place[:20]}")
-        self._strangers_told, self._strangers_at = 0, -TELL_STRANGERS
+        self._strangers_reported, self._strangers_at = 0, -STRANGERS_EVERY
         self._pending: set[str] = set()
         self._guard = threading.Lock()
         self._borrowers: set[int] = set()
@@ -240,7 +240,7 @@ class LinkWatch:
                         self._gone(uuid)
             else:
                 self._see_who_left(SILENT)
-            self._tell_of_strangers()
+            self._report_strangers()
             self._anew.wait(self._waits.link)
 
     def _look_for_all(self) -> None:
@@ -333,8 +333,8 @@ class LinkWatch:
 
     def _publish_notice(self, notice: Notice) -> None:
         """Something else that a person should know of, once."""
-        if notice.text != self.state.told:
-            self.state.told = notice.text
+        if notice.text != self.state.notice_text:
+            self.state.notice_text = notice.text
             self._live.event("link", place=self.place, state=notice.kind, text=notice.text)
 
     def _publish_state(self, state: str, error: TedsProvisionError | None = None) -> None:
@@ -377,11 +377,11 @@ class LinkWatch:
         with self._guard:
             self._pending.discard(uuid)
 
-    def _tell_of_strangers(self) -> None:
+    def _report_strangers(self) -> None:
         """Report the number of nodes that whitelist mode ignores, if it changed, at a limited rate."""
         count, now = self._directory.strangers(self.place), time.monotonic()
-        if count != self._strangers_told and now - self._strangers_at >= TELL_STRANGERS:
-            self._strangers_told, self._strangers_at = count, now
+        if count != self._strangers_reported and now - self._strangers_at >= STRANGERS_EVERY:
+            self._strangers_reported, self._strangers_at = count, now
             self._live.event("link", place=self.place, state="strangers", count=count)
 
     def _wanted(self, contact: Contact) -> bool:

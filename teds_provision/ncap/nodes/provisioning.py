@@ -300,8 +300,8 @@ class _RunReporter:
         )  # fmt: skip
 
     def _step(self, name: str, result: str, detail: str) -> None:
-        said = {"name": name, "result": result, "detail": detail}
-        self._run.steps = [step for step in self._run.steps if step["name"] != name] + [said]
+        facts = {"name": name, "result": result, "detail": detail}
+        self._run.steps = [step for step in self._run.steps if step["name"] != name] + [facts]
         self._live.event("provision", uuid=self._run.uuid, state="running", step=name, result=result, detail=detail)
 
 

@@ -50,12 +50,12 @@ class BoardRow:
 
     def as_json(self, to: str) -> dict[str, Any]:
         """Return the row as the API shows it."""
-        told = vars(self).copy()
+        members = vars(self).copy()
         return {
-            "uuid": told.pop("uuid"),
-            "from": told.pop("before"),
+            "uuid": members.pop("uuid"),
+            "from": members.pop("before"),
             "to": to,
-            **told,
+            **members,
             "seconds": round(self.seconds, 3),
         }
 
@@ -105,19 +105,19 @@ class UpdateAction:
     def record(self) -> bytes:
         """Return what is kept on disk."""
         asked = vars(self.request) | {"other_board": sorted(self.request.other_board)}
-        told = vars(self) | {"request": asked, "rows": [vars(row) for row in self.rows.values()]}
-        return json.dumps({"format": _FORMAT, **told}, indent=1).encode()
+        members = vars(self) | {"request": asked, "rows": [vars(row) for row in self.rows.values()]}
+        return json.dumps({"format": _FORMAT, **members}, indent=1).encode()
 
     @classmethod
     def read(cls, octets: bytes) -> UpdateAction:
         """Return a kept action; raises ValueError, KeyError, TypeError for anything else."""
-        told = json.loads(octets)
-        if told.pop("format") != _FORMAT:
+        document = json.loads(octets)
+        if document.pop("format") != _FORMAT:
             raise ValueError("format")
-        asked = told.pop("request")
+        asked = document.pop("request")
         uuids, other = tuple(asked.pop("uuids")), frozenset(asked.pop("other_board"))
-        rows = {row["uuid"]: BoardRow(**row) for row in told.pop("rows")}
-        return cls(request=UpdateRequest(uuids, other, **asked), rows=rows, **told)
+        rows = {row["uuid"]: BoardRow(**row) for row in document.pop("rows")}
+        return cls(request=UpdateRequest(uuids, other, **asked), rows=rows, **document)
 
 
 class UpdateFolder:

@@ -69,7 +69,7 @@ _WAITED_FOR: Final = 60.0
 _PLANNED_WITHIN: Final = 20.0
 """Seconds for which the plan waits for a board's answer."""
 _LOOK: Final = 0.1
-_TOLD_EVERY: Final = 0.5
+_REPORT_EVERY: Final = 0.5
 """Seconds between two events about the upload to one board."""
 
 
@@ -389,7 +389,7 @@ class Updates:
 
     def _publish_progress(self, action: UpdateAction, row: BoardRow) -> None:
         now = time.monotonic()
-        if now - self._told.get(row.uuid, -_TOLD_EVERY) >= _TOLD_EVERY:
+        if now - self._told.get(row.uuid, -_REPORT_EVERY) >= _REPORT_EVERY:
             self._told[row.uuid] = now
             self._publish(action, row)
 
@@ -446,7 +446,7 @@ def _action_of(
 ) -> UpdateAction:
     if not request.uuids:
         raise UsageError("No board is named.", hint="Name nodes, or select them with match.")
-    told = {
+    members = {
         "version": image.version_text,
         "digest": image.digest.hex(),
         "board": image.board,
@@ -454,7 +454,7 @@ def _action_of(
         "security_counter": image.security_counter,
     }
     rows = {uuid: BoardRow(uuid) for uuid in request.uuids}
-    return UpdateAction(action_id, request, told, rows, owner, ACTOR.get(), time.time(), state)
+    return UpdateAction(action_id, request, members, rows, owner, ACTOR.get(), time.time(), state)
 
 
 def _order_of(request: UpdateRequest, image: FirmwareImage, *, other_board: bool = False) -> UpdateOrder:

@@ -86,8 +86,8 @@ def _noted(daemon: Daemon) -> Callable[[Request, Exception], Awaitable[Response]
 
     async def answer(request: Request, error: Exception) -> Response:
         assert isinstance(error, TedsProvisionError)
-        told = not isinstance(error, NotFoundError | StoreError) and "number" not in request.path_params
-        if request.method not in SAFE and told:
+        shown = not isinstance(error, NotFoundError | StoreError) and "number" not in request.path_params
+        if request.method not in SAFE and shown:
             await changing(note, request, error)
         return answer_error(request, error)
 

@@ -132,10 +132,10 @@ class _Session:
                         return
                     octets = message.get("bytes") or (message.get("text") or "").encode()
                     await self._pass_on(octets, lines)
-                    await self._tell()
+                    await self._send_news()
                     await asyncio.sleep(pace.delay(len(octets)))
                     continue
-                await self._tell()
+                await self._send_news()
 
     async def _pass_on(self, octets: bytes, lines: CheckedLines) -> None:
         """Give the good lines of a message to the node; a node that is behind holds the simulation up."""
@@ -153,7 +153,7 @@ class _Session:
         self.writer.write(b"".join(good))
         await self.writer.drain()
 
-    async def _tell(self) -> None:
+    async def _send_news(self) -> None:
         """Report the first line that was not taken as it came at once, and the others once a second."""
         now = time.monotonic()
         for name, news in (("skipped", self.skipped), ("limited", self.limited)):

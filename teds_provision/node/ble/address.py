@@ -60,9 +60,9 @@ class StaticAddress:
     def _read(self) -> tuple[bytes, bool]:
         """Return the content of the file; no address if there is none, or no valid one."""
         try:
-            said = json.loads(read_limited(self._path, 4096, "address"))
-            octets = bytes.fromhex(said["address"])
+            document = json.loads(read_limited(self._path, 4096, "address"))
+            octets = bytes.fromhex(document["address"])
         except (TedsProvisionError, ValueError, LookupError, TypeError, RecursionError):
             return b"", False
         good = len(octets) == _OCTETS and octets[0] & _STATIC == _STATIC
-        return (octets, bool(said.get("keyed"))) if good else (b"", False)
+        return (octets, bool(document.get("keyed"))) if good else (b"", False)

@@ -32,7 +32,7 @@ class EndpointTable:
     """The endpoints of one process by their addresses.
 
     ``at_time`` runs a job at a moment (monotonic); ``moved`` is called for an endpoint that takes another address,
-    before it does; ``tell`` receives messages for people. ``echoes``: the controller gives back what we send.
+    before it does; ``notify`` receives messages for people. ``echoes``: the controller gives back what we send.
     """
 
     def __init__(
@@ -40,11 +40,11 @@ class EndpointTable:
         seats: Sequence[CanEndpoint],
         at_time: Callable[[float, Callable[[], None]], None],
         moved: Callable[[CanEndpoint], None],
-        tell: Callable[[str], None],
+        notify: Callable[[str], None],
         *,
         echoes: bool,
     ) -> None:
-        self._endpoints, self._at_time, self._moved, self._tell, self._echoes = seats, at_time, moved, tell, echoes
+        self._endpoints, self._at_time, self._moved, self._notify, self._echoes = seats, at_time, moved, notify, echoes
         self._known: set[int] = set()
         self._at: dict[int, list[CanEndpoint]] = {}
         self._moves_due: dict[CanEndpoint, float] = {}
@@ -110,13 +110,13 @@ class EndpointTable:
         self._at_time(due, announce)
 
     def _contested(self, seat: CanEndpoint, announce: Announce) -> None:
-        now, before, told = time.monotonic(), seat.address, seat.claim.conflict
+        now, before, reported = time.monotonic(), seat.address, seat.claim.conflict
         address = seat.claim.handle_announce(announce, before, now, pinned=seat.handler.actuator_claimed())
         if (due := seat.claim.move_due) is not None and due != self._moves_due.get(seat):
             self._moves_due[seat] = due
             self._at_time(due, functools.partial(self._give_up_address, seat, due))
-        if seat.claim.conflict and not told:
-            self._tell(
+        if seat.claim.conflict and not reported:
+            self._notify(
                 f"Another node announces the UUID {seat.uuid.hex()} (or one of equal CRC-32) "
                 f"from the CAN address 0x{before:02x}: disconnect one of them."
             )
@@ -156,7 +156,7 @@ class CanServer:
 
     ``spec_text`` is the value of ``--can``; ``node=`` and ``source=`` mean nothing here, since a node's address is
     ``handler.can_address()`` and every base station is served. ``counts_as_tapped`` returns True if a request from the
-    bus counts as one by tap (a node built without NFC, in factory state). ``tell`` receives messages for people.
+    bus counts as one by tap (a node built without NFC, in factory state). ``notify`` receives messages for people.
     """
 
     def __init__(
@@ -165,10 +165,10 @@ class CanServer:
         handler: NodeHandler | None = None,
         *,
         counts_as_tapped: Callable[[], bool] = _never,
-        tell: Callable[[str], None] = _TOLD.warning,
+        notify: Callable[[str], None] = _TOLD.warning,
     ) -> None:
         self._spec = parse_spec(spec_text)
-        self._tell = tell
+        self._notify = notify
         self._nodes: list[tuple[NodeHandler, Callable[[], bool], MeasuringHandler | None]] = []
         self._bus: Bus | None = None
         self._workers: WorkerPool | None = None
@@ -236,7 +236,7 @@ class CanServer:
 
     def _seated(self) -> EndpointTable:
         echoes = bool(dict(self._spec.options).get("receive_own_messages"))
-        return EndpointTable(self._endpoints, self._at_time, self._moves, self._tell, echoes=echoes)
+        return EndpointTable(self._endpoints, self._at_time, self._moves, self._notify, echoes=echoes)
 
     def _moves(self, seat: CanEndpoint) -> None:
         """End what is under way from an endpoint's old address."""
@@ -383,8 +383,8 @@ class CanServer:
     def _request(self, seat: CanEndpoint, line: StationState, pair: Pair, frame: Frame) -> None:
         begun = Reassembly.begin(pair.peer, frame)
         if begun is not None and begun.length > seat.max_message + 1:  # refused in place of a flow control
-            said = single(bytes(begun.octets[:1]) + refusal(Reason.TOO_LARGE).encode(), fd=frame.fd)
-            self._out(seat, Frame(physical_id(pair.peer, pair.own), said, frame.fd))
+            answer = single(bytes(begun.octets[:1]) + refusal(Reason.TOO_LARGE).encode(), fd=frame.fd)
+            self._out(seat, Frame(physical_id(pair.peer, pair.own), answer, frame.fd))
             return
         pair.handle_frame(frame)
         while (body := pair.received()) is not None:

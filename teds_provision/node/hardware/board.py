@@ -17,7 +17,7 @@ from teds_provision.errors import BadDataError
 from teds_provision.node import sources
 from teds_provision.node.hardware.clock import NANOSECONDS, NodeClock
 from teds_provision.node.hardware.converter import Converter
-from teds_provision.node.sources.base import Reading, Source, SourceChannel, Tell
+from teds_provision.node.sources.base import Notify, Reading, Source, SourceChannel
 from teds_provision.protocol.operation.commands import PowerFlag, PowerReply
 from teds_provision.protocol.operation.hardware import ChannelHardware, RawReading
 from teds_provision.teds.sheet import Channel, ChannelKind, Sheet
@@ -97,7 +97,7 @@ class Board:
     """Channels of ``sheet``; ``source`` is the text of ``--source``, or a source that was made already.
 
     ``lag`` is how many nanoseconds after its tick a sample is taken, for a source that learns of it late. ``shown`` is
-    called with the state of actuators, from any thread, and must return at once; ``tell`` receives
+    called with the state of actuators, from any thread, and must return at once; ``notify`` receives
     messages for people. Raises BadDataError if a channel cannot be imitated, and errors of the source.
     """
 
@@ -110,11 +110,11 @@ class Board:
         battery: Battery | None = None,
         lag: int = 0,
         shown: Callable[[ActuatorReading], None] = lambda shown: None,
-        tell: Tell = lambda text: None,
+        notify: Notify = lambda text: None,
     ) -> None:
         self.clock = clock or NodeClock()
         self.battery, self.lag = battery, lag
-        self.shown, self.tell = shown, tell
+        self.shown, self.notify = shown, notify
         self.faults: set[int] = set()
         self.sampling: int | None = None
         self._lock = threading.Lock()
@@ -130,7 +130,7 @@ class Board:
         self._safe_state = {n: self._lowest(n) for n, facts in self.channels.items() if facts.actuator}
         self._bounds = {number: self._raw_limits(number) for number in self._safe_state}
         self._set_points = dict(self._safe_state)
-        self.source = sources.make_source(source, self.places, tell) if isinstance(source, str) else source
+        self.source = sources.make_source(source, self.places, notify) if isinstance(source, str) else source
 
     @property
     def places(self) -> list[SourceChannel]:

@@ -7,9 +7,9 @@ from typing import Final
 
 from teds_provision.errors import UsageError
 from teds_provision.node.sources import command, lines, noise, ramp, recorded, sine
-from teds_provision.node.sources.base import Source, SourceChannel, Tell
+from teds_provision.node.sources.base import Notify, Source, SourceChannel
 
-Maker = Callable[[str, Sequence[SourceChannel], Tell], Source]
+Maker = Callable[[str, Sequence[SourceChannel], Notify], Source]
 
 SOURCES: Final[dict[str, Maker]] = {
     "noise": noise.make,
@@ -37,10 +37,10 @@ def kind_of(text: str) -> str:
     return kind
 
 
-def make_source(text: str, places: Sequence[SourceChannel], tell: Tell) -> Source:
+def make_source(text: str, places: Sequence[SourceChannel], notify: Notify) -> Source:
     """Return the source that ``--source`` names, for these sensors.
 
     Raises UsageError, NotFoundError or BadDataError.
     """
     kind = kind_of(text)
-    return SOURCES[kind](text.partition(":")[2], places, tell)
+    return SOURCES[kind](text.partition(":")[2], places, notify)

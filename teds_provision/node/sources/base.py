@@ -44,7 +44,7 @@ class SourceChannel:
         return Reading(value=low + share * (high - low))
 
 
-Tell = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 class Source(Protocol):

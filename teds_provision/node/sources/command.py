@@ -11,7 +11,7 @@ import threading
 from collections.abc import Mapping, Sequence
 
 from teds_provision.errors import NotFoundError, UsageError
-from teds_provision.node.sources.base import SimulationClock, SourceChannel, Tell
+from teds_provision.node.sources.base import Notify, SimulationClock, SourceChannel
 from teds_provision.node.sources.lines import LineSource, feed
 
 _SECONDS_TO_END = 2.0
@@ -20,8 +20,8 @@ _SECONDS_TO_END = 2.0
 class CommandSource(LineSource):
     """Runs a program (no shell); lines need no ``t``: without one the node's clock is the host's."""
 
-    def __init__(self, places: Sequence[SourceChannel], tell: Tell, words: Sequence[str]) -> None:
-        super().__init__(places, tell, needs_time=False)
+    def __init__(self, places: Sequence[SourceChannel], notify: Notify, words: Sequence[str]) -> None:
+        super().__init__(places, notify, needs_time=False)
         self._words = list(words)
         self._process: subprocess.Popen[bytes] | None = None
         self._stopped = False
@@ -67,11 +67,11 @@ class CommandSource(LineSource):
         feed(lambda: os.read(descriptor, 65536), self.feed_line)
         code = self._process.wait()
         if not self._stopped:
-            self._tell(f"The program {self._words[0]} ended with {code}: from now on all values are invalid.")
+            self._notify(f"The program {self._words[0]} ended with {code}: from now on all values are invalid.")
             self.end()
 
 
-def make(argument: str, places: Sequence[SourceChannel], tell: Tell) -> CommandSource:
+def make(argument: str, places: Sequence[SourceChannel], notify: Notify) -> CommandSource:
     """``exec:./hand --rate 100``: words as a shell would part them."""
     try:
         words = shlex.split(argument)
@@ -79,4 +79,4 @@ def make(argument: str, places: Sequence[SourceChannel], tell: Tell) -> CommandS
         raise UsageError(f"exec: {error}.", hint="Close the quotes.") from error
     if not words:
         raise UsageError("exec: needs a program.", hint="Write --source 'exec:./hand --rate 100'.")
-    return CommandSource(places, tell, words)
+    return CommandSource(places, notify, words)

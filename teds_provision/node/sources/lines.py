@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import IO, Final, TypeGuard
 
 from teds_provision.errors import NoReaderError, UsageError
-from teds_provision.node.sources.base import Reading, SimulationClock, SourceChannel, Tell
+from teds_provision.node.sources.base import Notify, Reading, SimulationClock, SourceChannel
 
 LONGEST_LINE: Final = 1 << 20
 _LOOK_AROUND: Final = 0.2
-_TELL_EVERY: Final = 1000
+_NOTICE_EVERY: Final = 1000
 
 
 class LineSource:
@@ -34,9 +34,9 @@ class LineSource:
     Malformed lines are counted and reported (the first, then each thousandth), and change nothing.
     """
 
-    def __init__(self, places: Sequence[SourceChannel], tell: Tell, *, needs_time: bool = True) -> None:
+    def __init__(self, places: Sequence[SourceChannel], notify: Notify, *, needs_time: bool = True) -> None:
         self._numbers = {place.name: place.number for place in places if place.name}
-        self._tell, self._needs_time = tell, needs_time
+        self._notify, self._needs_time = notify, needs_time
         self._readings: dict[int, Reading | None] = {}
         self._drive: SimulationClock | None = None
         self._last: float | None = None
@@ -59,8 +59,8 @@ class LineSource:
         problem = self._taken(line)
         if problem:
             self.dropped += 1
-            if self.dropped == 1 or self.dropped % _TELL_EVERY == 0:
-                self._tell(f"A line of the source was skipped ({self.dropped} so far): {problem}.")
+            if self.dropped == 1 or self.dropped % _NOTICE_EVERY == 0:
+                self._notify(f"A line of the source was skipped ({self.dropped} so far): {problem}.")
         return problem
 
     def end(self) -> None:
@@ -149,8 +149,8 @@ def feed(read: Callable[[], bytes], take: Callable[[bytes], object]) -> None:
 class StandardInput(LineSource):
     """Lines from a pipe: standard input."""
 
-    def __init__(self, places: Sequence[SourceChannel], tell: Tell, stream: IO[bytes]) -> None:
-        super().__init__(places, tell)
+    def __init__(self, places: Sequence[SourceChannel], notify: Notify, stream: IO[bytes]) -> None:
+        super().__init__(places, notify)
         self._stream = stream
         self._stop = threading.Event()
 
@@ -170,15 +170,15 @@ class StandardInput(LineSource):
         descriptor = self._stream.fileno()
         feed(lambda: b"" if self._stop.is_set() else os.read(descriptor, 65536), self.feed_line)
         if not self._stop.is_set():
-            self._tell("Standard input has ended: from now on all values are invalid.")
+            self._notify("Standard input has ended: from now on all values are invalid.")
             self.end()
 
 
 class UnixSocket(LineSource):
     """Lines from a client of a Unix socket (mode 0600), one simulation after the other."""
 
-    def __init__(self, places: Sequence[SourceChannel], tell: Tell, path: Path, *, needs_time: bool = True) -> None:
-        super().__init__(places, tell, needs_time=needs_time)
+    def __init__(self, places: Sequence[SourceChannel], notify: Notify, path: Path, *, needs_time: bool = True) -> None:
+        super().__init__(places, notify, needs_time=needs_time)
         self._path = path
         self._listening: socket.socket | None = None
         self._peer: socket.socket | None = None
@@ -241,7 +241,7 @@ class UnixSocket(LineSource):
                 feed(lambda: self._receive(peer), self.feed_line)
                 self._peer = None
             if not self._stop.is_set():
-                self._tell("The simulation disconnected: until the next one connects, all values are invalid.")
+                self._notify("The simulation disconnected: until the next one connects, all values are invalid.")
                 self.end()
 
     def _receive(self, peer: socket.socket) -> bytes:
@@ -260,8 +260,8 @@ class Simulation(UnixSocket):
     A channel without a value is invalid alone, not with its whole message.
     """
 
-    def __init__(self, places: Sequence[SourceChannel], tell: Tell, path: Path) -> None:
-        super().__init__(places, tell, path, needs_time=False)
+    def __init__(self, places: Sequence[SourceChannel], notify: Notify, path: Path) -> None:
+        super().__init__(places, notify, path, needs_time=False)
 
     def at(self, channel: int, seconds: float) -> Reading | None:
         """Return the value of the last line; None while there is no simulation."""
@@ -277,20 +277,20 @@ def _answers(path: Path) -> bool:
         return True
 
 
-def make_stream(argument: str, places: Sequence[SourceChannel], tell: Tell) -> StandardInput:
+def make_stream(argument: str, places: Sequence[SourceChannel], notify: Notify) -> StandardInput:
     """``-`` reads standard input."""
-    return StandardInput(places, tell, sys.stdin.buffer)
+    return StandardInput(places, notify, sys.stdin.buffer)
 
 
-def make_socket(argument: str, places: Sequence[SourceChannel], tell: Tell) -> UnixSocket:
+def make_socket(argument: str, places: Sequence[SourceChannel], notify: Notify) -> UnixSocket:
     """Listen on a socket named as ``unix:/run/user/1000/hand.sock``."""
     if not argument:
         raise UsageError("unix: needs a path.", hint="Write --source unix:/tmp/hand.sock.")
-    return UnixSocket(places, tell, Path(argument))
+    return UnixSocket(places, notify, Path(argument))
 
 
-def make_simulation(argument: str, places: Sequence[SourceChannel], tell: Tell) -> Simulation:
+def make_simulation(argument: str, places: Sequence[SourceChannel], notify: Notify) -> Simulation:
     """``simulation:PATH``, as ``ncap`` uses it."""
     if not argument:
         raise UsageError("simulation: needs a path.", hint="Write --source simulation:/tmp/hand.sock.")
-    return Simulation(places, tell, Path(argument))
+    return Simulation(places, notify, Path(argument))

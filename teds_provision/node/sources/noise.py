@@ -6,7 +6,7 @@ import random
 from collections.abc import Sequence
 
 from teds_provision.errors import UsageError
-from teds_provision.node.sources.base import GeneratedSource, Reading, SourceChannel, Tell
+from teds_provision.node.sources.base import GeneratedSource, Notify, Reading, SourceChannel
 
 
 class Noise(GeneratedSource):
@@ -18,7 +18,7 @@ class Noise(GeneratedSource):
         return None if place is None else place.between(random.random())
 
 
-def make(argument: str, places: Sequence[SourceChannel], tell: Tell) -> Noise:
+def make(argument: str, places: Sequence[SourceChannel], notify: Notify) -> Noise:
     """``noise`` takes no argument."""
     if argument:
         raise UsageError(f"noise takes no argument, not {argument!r}.", hint="Write --source noise.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from teds_provision.node.sources.base import GeneratedSource, Reading, SourceChannel, Tell, seconds_of
+from teds_provision.node.sources.base import GeneratedSource, Notify, Reading, SourceChannel, seconds_of
 
 
 class Ramp(GeneratedSource):
@@ -20,6 +20,6 @@ class Ramp(GeneratedSource):
         return None if place is None else place.between((seconds / self.period) % 1.0)
 
 
-def make(argument: str, places: Sequence[SourceChannel], tell: Tell) -> Ramp:
+def make(argument: str, places: Sequence[SourceChannel], notify: Notify) -> Ramp:
     """Return the source of ``ramp:2`` or ``ramp:20ms``; 10 s by default."""
     return Ramp(places, seconds_of(argument or "10", "ramp"))

@@ -16,7 +16,7 @@ from typing import Final
 
 from teds_provision.errors import BadDataError, UsageError
 from teds_provision.files import read_text
-from teds_provision.node.sources.base import GeneratedSource, Reading, SourceChannel, Tell
+from teds_provision.node.sources.base import GeneratedSource, Notify, Reading, SourceChannel
 
 MOST_OCTETS: Final = 256 << 20
 _TIME_NAMES: Final = ("t", "time")
@@ -27,10 +27,14 @@ class RecordedSource(GeneratedSource):
     """Rows of readings: ``times`` ascend from 0, ``rows`` have one entry for each of ``columns`` (channel numbers)."""
 
     def __init__(
-        self, places: Sequence[SourceChannel], times: list[float], columns: dict[int, list[Reading | None]], tell: Tell
+        self,
+        places: Sequence[SourceChannel],
+        times: list[float],
+        columns: dict[int, list[Reading | None]],
+        notify: Notify,
     ) -> None:
         super().__init__(places)
-        self._times, self._columns, self._tell = times, columns, tell
+        self._times, self._columns, self._notify = times, columns, notify
         # the last row is worth as long as the one before it
         self._end = times[-1] + (times[-1] - times[-2] if len(times) > 1 else 0.0)
         self._told = False
@@ -41,21 +45,21 @@ class RecordedSource(GeneratedSource):
         if seconds > self._end:
             if not self._told:
                 self._told = True
-                self._tell("The file of values has ended: from now on all values are invalid.")
+                self._notify("The file of values has ended: from now on all values are invalid.")
             return None
         if column is None:
             return None
         return column[max(0, bisect.bisect_right(self._times, seconds) - 1)]
 
 
-def make(argument: str, places: Sequence[SourceChannel], tell: Tell) -> RecordedSource:
+def make(argument: str, places: Sequence[SourceChannel], notify: Notify) -> RecordedSource:
     """``file:run.csv``; raises NotFoundError, and BadDataError with the line that is wrong."""
     if not argument:
         raise UsageError("file: needs a file.", hint="Write --source file:run.csv.")
-    return read(Path(argument), places, tell)
+    return read(Path(argument), places, notify)
 
 
-def read(path: Path, places: Sequence[SourceChannel], tell: Tell) -> RecordedSource:
+def read(path: Path, places: Sequence[SourceChannel], notify: Notify) -> RecordedSource:
     """Read a file of at most 256 MiB whole."""
     lines = _lines(path)
     fields = list(csv.reader(line for _, line in lines))
@@ -68,7 +72,7 @@ def read(path: Path, places: Sequence[SourceChannel], tell: Tell) -> RecordedSou
         times.append(_time(path, line, row[at], times))
         for number, index, raw in columns:
             readings[number].append(_reading(_number(path, line, row[index]), raw=raw))
-    return RecordedSource(places, [time - times[0] for time in times], readings, tell)
+    return RecordedSource(places, [time - times[0] for time in times], readings, notify)
 
 
 def _rows(path: Path, lines: list[tuple[int, str]], fields: list[list[str]]) -> Iterator[tuple[int, list[str]]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from teds_provision.node.sources.base import GeneratedSource, Reading, SourceChannel, Tell, seconds_of
+from teds_provision.node.sources.base import GeneratedSource, Notify, Reading, SourceChannel, seconds_of
 
 
 class Sine(GeneratedSource):
@@ -24,6 +24,6 @@ class Sine(GeneratedSource):
         return place.between(0.5 + 0.5 * math.sin(2 * math.pi * phase))
 
 
-def make(argument: str, places: Sequence[SourceChannel], tell: Tell) -> Sine:
+def make(argument: str, places: Sequence[SourceChannel], notify: Notify) -> Sine:
     """Return the source of ``sine:2`` or ``sine:20ms``; 10 s by default."""
     return Sine(places, seconds_of(argument or "10", "sine"))

@@ -18,23 +18,23 @@ _WAIT: Final = 0.2
 _GATHER: Final = 0.002
 """Seconds in which frames gather that the kernel dates: reading each one when it comes costs twice the processor."""
 _FIRST_REOPEN, _LAST_REOPEN = 1.0, 30.0
-_TELL_EVERY: Final = 1000
+_NOTICE_EVERY: Final = 1000
 
-Tell = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 class MessageReader:
     """One wrapped message: decodes its frames into the values of its channels."""
 
-    def __init__(self, message: DbcMessage, tell: Tell) -> None:
-        self.message, self._tell = message, tell
+    def __init__(self, message: DbcMessage, notify: Notify) -> None:
+        self.message, self._notify = message, notify
         self.values = [LatestValues(channel) for channel in message.sensor.channels]
         self._by_name: Mapping[str, LatestValues] = {part.channel.name: part for part in self.values}
         self._j1939 = message.message.protocol == "j1939"
         self._silence = PERIODS_LATE * min(part.channel.period for part in self.values)
         self._address: int | None = None
         self._heard_at = 0.0
-        self._told_address = False
+        self._address_reported = False
         self.frames = self.bad = 0
 
     def handle(self, frame: SensorFrame) -> None:
@@ -45,8 +45,8 @@ class MessageReader:
             numbers = self.message.numbers(frame.data)
         except BadDataError as error:
             self.bad += 1
-            if self.bad == 1 or self.bad % _TELL_EVERY == 0:
-                self._tell(f"{error.message} ({self.bad} so far)")
+            if self.bad == 1 or self.bad % _NOTICE_EVERY == 0:
+                self._notify(f"{error.message} ({self.bad} so far)")
             return
         self.frames += 1
         for name, raw in numbers.items():
@@ -64,9 +64,9 @@ class MessageReader:
         if self._address is None or (address != self._address and frame.at - self._heard_at > self._silence):
             self._address = address
         elif address != self._address:
-            if not self._told_address:
-                self._told_address = True
-                self._tell(
+            if not self._address_reported:
+                self._address_reported = True
+                self._notify(
                     f"{self.message.message.name} also comes from the source address 0x{address:02x}; "
                     f"only 0x{self._address:02x} is read."
                 )
@@ -78,8 +78,8 @@ class MessageReader:
 class CanReader:
     """One thread that reads a bus for all its messages; a lost bus is opened again, values are invalid until then."""
 
-    def __init__(self, spec: CanSpec, readers: Sequence[MessageReader], tell: Tell) -> None:
-        self._spec, self._readers, self._tell = spec, readers, tell
+    def __init__(self, spec: CanSpec, readers: Sequence[MessageReader], notify: Notify) -> None:
+        self._spec, self._readers, self._notify = spec, readers, notify
         self._routes: dict[FrameKey, list[MessageReader]] = {}
         for reader in readers:
             self._routes.setdefault(reader.message.key, []).append(reader)
@@ -131,7 +131,7 @@ class CanReader:
                 time.sleep(_GATHER)
 
     def _lost(self, why: str) -> None:
-        self._tell(f"{why} The values of the wrapped sensors are invalid until the bus is back.")
+        self._notify(f"{why} The values of the wrapped sensors are invalid until the bus is back.")
         for reader in self._readers:
             reader.trouble(why.rstrip("."))
         if self._bus is not None:

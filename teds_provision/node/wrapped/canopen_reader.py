@@ -25,16 +25,16 @@ _RETRY: Final = 2.0
 _LEAST_POLL: Final = 0.05
 _LATEST_SECONDS: Final = 1.0
 
-Tell = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 class DeviceReader:
     """One device: its description, and the values of its channels."""
 
-    def __init__(self, path: Path, node_id: int, tell: Tell) -> None:
+    def __init__(self, path: Path, node_id: int, notify: Notify) -> None:
         octets, self.objects = canopen_device.load(path, node_id)
         self.sensor = canopen_device.described(path, octets, self.objects)
-        self.node_id, self._tell = node_id, tell
+        self.node_id, self._notify = node_id, notify
         self._variables = list(canopen_device.measured_objects(self.objects))
         self.values = [LatestValues(channel, "PDO") for channel in self.sensor.channels]
         self._by_object = {
@@ -58,7 +58,7 @@ class DeviceReader:
         for part in self.values:
             part.trouble(why)
         if why and why != self._told:
-            self._tell(f"CANopen device {self.node_id}: {why}.")
+            self._notify(f"CANopen device {self.node_id}: {why}.")
         self._told = why
 
     def prepare(self) -> bool:
@@ -134,8 +134,8 @@ class DeviceReader:
 class CanopenReader:
     """All devices of one bus: one thread of python-canopen for PDOs, one of ours that asks by SDO."""
 
-    def __init__(self, spec: CanSpec, devices: Sequence[DeviceReader], tell: Tell) -> None:
-        self._spec, self._devices, self._tell = spec, devices, tell
+    def __init__(self, spec: CanSpec, devices: Sequence[DeviceReader], notify: Notify) -> None:
+        self._spec, self._devices, self._notify = spec, devices, notify
         self._network: canopen.Network | None = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None

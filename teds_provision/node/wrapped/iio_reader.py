@@ -20,7 +20,7 @@ _LENGTH: Final = 256
 """Scans that the kernel's buffer holds."""
 _LARGEST: Final = 1 << 16
 
-Tell = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 def layout(scans: Sequence[ScanElement]) -> tuple[list[int], int]:
@@ -48,8 +48,8 @@ def raw_of(scan: ScanElement, octets: bytes) -> int:
 class IioReader:
     """One thread that reads a device into the values of its channels."""
 
-    def __init__(self, device: IioDevice, tell: Tell) -> None:
-        self._device, self._tell = device, tell
+    def __init__(self, device: IioDevice, notify: Notify) -> None:
+        self._device, self._notify = device, notify
         self.values = [LatestValues(channel, "reading") for channel in device.describe().channels]
         self._parts = list(zip(device.channels, self.values, strict=True))
         self._stop = threading.Event()
@@ -118,7 +118,9 @@ class IioReader:
             self._enable(device.folder / buffer / "enable")
             self._descriptor = os.open(device.character, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
-            self._tell(f"The buffer of {device.name} cannot be used ({error.strerror}): its files are read one by one.")
+            self._notify(
+                f"The buffer of {device.name} cannot be used ({error.strerror}): its files are read one by one."
+            )
             for path in reversed(self._enabled):
                 with contextlib.suppress(OSError):
                     path.write_text("0")

@@ -20,7 +20,7 @@ KIND_OF: Final[Mapping[str, str]] = {"dbc": "dbc", "canopen": "eds", "iio": "iio
 """Kind of Origin that each word of ``--source`` serves."""
 SOURCE_OF: Final = {origin: f"{word}:{'DEVICE' if word == 'iio' else 'FILE'}" for word, origin in KIND_OF.items()}
 
-Tell = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 class Reader(Protocol):
@@ -108,10 +108,10 @@ class WrappedRun:
     """
 
     def __init__(
-        self, place: SensorPlace, origins: Sequence[Origin], report: Callable[[int], Report], tell: Tell
+        self, place: SensorPlace, origins: Sequence[Origin], report: Callable[[int], Report], notify: Notify
     ) -> None:
         self._report = report
-        self._reader, self._values = _READERS[place.word](place, origins, tell)
+        self._reader, self._values = _READERS[place.word](place, origins, notify)
 
     def source(self, number: int) -> WrappedSource:
         """Return the source of the node with this number, counted from 0."""
@@ -137,40 +137,40 @@ def _require_same(origin: Origin, sensor: WrappedSensor, path: str) -> None:
         )
 
 
-def _dbc(place: SensorPlace, origins: Sequence[Origin], tell: Tell) -> Read:
+def _dbc(place: SensorPlace, origins: Sequence[Origin], notify: Notify) -> Read:
     spec = parse_spec(place.bus or "")
     readers = []
     for origin in origins:
         message = dbc_message.read(Path(place.argument), origin.name)
         _require_same(origin, message.sensor, place.argument)
-        readers.append(MessageReader(message, tell))
+        readers.append(MessageReader(message, notify))
     clashing = readers[0].message.clashing if readers else ()
     if clashing and place.beside is not None and parse_spec(place.beside).wire == spec.wire:
         raise UsageError(
             f"{place.argument} has messages with identifiers of the nodes' own frames: {', '.join(clashing[:5])}.",
             hint="Put the sensors on a bus of their own, or behind a gateway that filters these identifiers.",
         )
-    return CanReader(spec, readers, tell), [reader.values for reader in readers]
+    return CanReader(spec, readers, notify), [reader.values for reader in readers]
 
 
-def _canopen(place: SensorPlace, origins: Sequence[Origin], tell: Tell) -> Read:
+def _canopen(place: SensorPlace, origins: Sequence[Origin], notify: Notify) -> Read:
     devices = []
     for origin, node_id in zip(origins, place.node_ids, strict=True):
-        device = canopen_reader.DeviceReader(Path(place.argument), node_id, tell)
+        device = canopen_reader.DeviceReader(Path(place.argument), node_id, notify)
         _require_same(origin, device.sensor, place.argument)
         devices.append(device)
-    reader = canopen_reader.CanopenReader(parse_spec(place.bus or ""), devices, tell)
+    reader = canopen_reader.CanopenReader(parse_spec(place.bus or ""), devices, notify)
     return reader, [device.values for device in devices]
 
 
-def _iio(place: SensorPlace, origins: Sequence[Origin], tell: Tell) -> Read:
+def _iio(place: SensorPlace, origins: Sequence[Origin], notify: Notify) -> Read:
     device = iio_device.find(place.argument)
     _require_same(origins[0], device.describe(), place.argument)
-    reader = iio_reader.IioReader(device, tell)
+    reader = iio_reader.IioReader(device, notify)
     return reader, [reader.values]
 
 
-_READERS: Final[Mapping[str, Callable[[SensorPlace, Sequence[Origin], Tell], Read]]] = {
+_READERS: Final[Mapping[str, Callable[[SensorPlace, Sequence[Origin], Notify], Read]]] = {
     "dbc": _dbc,
     "canopen": _canopen,
     "iio": _iio,

@@ -128,11 +128,11 @@ def teds_fits(own: ChannelHardware, teds: bytes | None) -> bool:
     """
     if teds is None:
         return False
-    said = channel_from(decode(teds))
-    if said.kind is not own.kind or said.sample is None:
+    described = channel_from(decode(teds))
+    if described.kind is not own.kind or described.sample is None:
         return False
-    halts = not own.actuator or said.halt is None or said.halt == own.halt
-    return halts and (said.sample.model, said.sample.octets) == (own.model, own.octets)
+    halts = not own.actuator or described.halt is None or described.halt == own.halt
+    return halts and (described.sample.model, described.sample.octets) == (own.model, own.octets)
 
 
 def teds_period(teds: bytes | None) -> int:

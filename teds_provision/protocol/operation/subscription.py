@@ -114,8 +114,8 @@ class StreamPlan:
 def require_new_run(run: int, after: int) -> None:
     """Raise NotAuthenticError if a session's run is not above the last one: two runs would have one key."""
     if run <= after:
-        said = f"run {run} after run {after}" if after else f"run {run}; runs begin at 1"
-        raise NotAuthenticError(f"The node names {said}.", hint="Its firmware does not keep to the profile.")
+        text = f"run {run} after run {after}" if after else f"run {run}; runs begin at 1"
+        raise NotAuthenticError(f"The node names {text}.", hint="Its firmware does not keep to the profile.")
 
 
 def most_instants(kind: StreamKind, octets: int, most: int = MOST_OCTETS) -> int:

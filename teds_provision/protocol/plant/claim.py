@@ -50,44 +50,46 @@ class Claim:
 
         Signed and vouched digests, statements and liftings are sets of the whole plant, kept beside the claims.
         """
-        said = event.members
+        members = event.members
         match event.act:
             case "pinned":
-                self.pin = said["fingerprint"], said["assurance"]
+                self.pin = members["fingerprint"], members["assurance"]
             case "unpinned":
                 self.pin = None
             case "agreed":
-                agreed = said["epoch"], said["key_id"], said["fingerprint"]
+                agreed = members["epoch"], members["key_id"], members["fingerprint"]
                 if self.agreed is None or agreed[:2] >= self.agreed[:2]:
                     self.agreed = agreed
             case "took":
-                took = said["epoch"], said["key_id"]
+                took = members["epoch"], members["key_id"]
                 self.took = took if self.took is None else max(self.took, took)
             case "written":
                 written = (
-                    said["sequence"], said["teds_sha256"], said["epoch"],
-                    said["profile"], said["profile_sha256"], said["due"],
+                    members["sequence"], members["teds_sha256"], members["epoch"],
+                    members["profile"], members["profile_sha256"], members["due"],
                 )  # fmt: skip
                 if self.written is None or written[:2] >= self.written[:2]:
                     self.written = written
             case "gave":
-                self.gave.add((said["bundle"], said["peer"], said["epoch"], said["key_id"], said["mode"]))
+                self.gave.add(
+                    (members["bundle"], members["peer"], members["epoch"], members["key_id"], members["mode"])
+                )
             case "undone":
-                self.undone.add(said["bundle"])
+                self.undone.add(members["bundle"])
             case "refused":
-                self.refused.add((said["bundle"], said["peer"], said["why"]))
+                self.refused.add((members["bundle"], members["peer"], members["why"]))
             case "forgot":
-                self.forgot = max(self.forgot, said["epoch"])
+                self.forgot = max(self.forgot, members["epoch"])
             case "reset":
                 proven = reset_proven(event)
                 if proven is not None:
-                    self.resets.add((proven, said["epoch"]))
+                    self.resets.add((proven, members["epoch"]))
             case "named":
-                self.name = said["name"], event.at
+                self.name = members["name"], event.at
             case "grouped":
-                self.groups[said["group"]] = said["member"], event.at
+                self.groups[members["group"]] = members["member"], event.at
             case "firmware":
-                self.firmware = _runs(said["runs"]), event.at
+                self.firmware = _runs(members["runs"]), event.at
 
     def key(self) -> Key | None:
         """Return the greatest key that it agreed or took."""

@@ -94,12 +94,15 @@ def open_document(octets: bytes, find_key: Callable[[str], bytes | None], kind: 
         raise BadDataError(f"The header of {kind.what} does not hold exactly alg, kid and typ {kind.typ}.")
     verified = jose.verify_compact(octets, find_key, typ=kind.typ, max_octets=kind.most)
     members = load_exact(verified.payload, f"T{kind.what[1:]}")
-    told = members.get("format")
-    if told != kind.format:
-        newer = isinstance(told, str) and re.fullmatch(re.escape(kind.format[:-1]) + r"[1-9]\d{0,8}", told)
+    format_name = members.get("format")
+    if format_name != kind.format:
+        newer = isinstance(format_name, str) and re.fullmatch(
+            re.escape(kind.format[:-1]) + r"[1-9]\d{0,8}", format_name
+        )
         if newer:
             raise NewerFormatError(
-                f"T{kind.what[1:]} is of a newer version ({told}).", hint="Use a newer version of teds-provision."
+                f"T{kind.what[1:]} is of a newer version ({format_name}).",
+                hint="Use a newer version of teds-provision.",
             )
         raise BadDataError(f"The format of {kind.what} is not {kind.format}.")
     return SignedDocument(verified.kid, verified.signer, hash_of(octets), members, octets)

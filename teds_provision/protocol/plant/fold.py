@@ -47,7 +47,7 @@ class BanStatement:
     hash: str
     page_of: str
     counts: bool
-    said: Revocation
+    revocation: Revocation
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def merge_claims(
             for bundle, peer, epoch, key_id, mode in claim.given_keys()
         ),
         resets=resets,
-        bans=tuple(ban for ban in sorted(statements, key=lambda statement: (statement.said.created, statement.hash))
+        bans=tuple(ban for ban in sorted(statements, key=lambda seen: (seen.revocation.created, seen.hash))
                    if bans(roster, ban, own, liftings)),
         name=max(names)[1] if names else None,
         groups=_groups(roster, counted),
@@ -238,15 +238,15 @@ def bans(roster: Roster, statement: BanStatement, own: LocalState, liftings: Map
     Its signer is a keeper, or by one's own store holds or was given the node's key; a removed one's statement counts
     only from its own pages, up to ``last``. It ends when a keeper lifts it, its signer, or here an operator.
     """
-    signer = statement.said.sender
+    signer = statement.revocation.sender
     if roster.member(signer) is None and (statement.page_of != signer or not statement.counts):
         return False
     if "keeper" not in roster.roles_of(signer) and signer != own.station and signer not in own.holders:
         return False
     if (
         own.pin is not None
-        and statement.said.fingerprint is not None
-        and not same_key(own.pin, statement.said.fingerprint)
+        and statement.revocation.fingerprint is not None
+        and not same_key(own.pin, statement.revocation.fingerprint)
     ):
         return False
     lifted = any(lifter == signer or "keeper" in roster.roles_of(lifter) for lifter in liftings.get(statement.hash, ()))
@@ -272,8 +272,8 @@ def _weight(roster: Roster, station: str, at: str) -> tuple[bool, str, str]:
 
 
 def _groups(roster: Roster, claims: Mapping[str, Claim]) -> dict[str, bool]:
-    said: dict[str, list[tuple[tuple[bool, str, str], bool]]] = {}
+    statements: dict[str, list[tuple[tuple[bool, str, str], bool]]] = {}
     for station, claim in claims.items():
         for group, (member, at) in claim.groups.items():
-            said.setdefault(group, []).append((_weight(roster, station, at), member))
-    return {group: max(words)[1] for group, words in sorted(said.items())}
+            statements.setdefault(group, []).append((_weight(roster, station, at), member))
+    return {group: max(words)[1] for group, words in sorted(statements.items())}

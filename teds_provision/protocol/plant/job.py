@@ -202,34 +202,34 @@ def _nodes(fields: Fields) -> tuple[int | None, dict[bytes, str]]:
 
 
 def _calibration(fields: Fields) -> CalibrationRule:
-    told = Fields(fields.members.get("calibration"), "The calibration of the job")
-    rule = told.one_of("rule", ("none", "one", "list", "any"))
+    calibration = Fields(fields.members.get("calibration"), "The calibration of the job")
+    rule = calibration.one_of("rule", ("none", "one", "list", "any"))
     if rule == "one":
-        return CalibrationRule("one", told.text_of_form("sha256", "sha256"))
+        return CalibrationRule("one", calibration.text_of_form("sha256", "sha256"))
     if rule == "any":
-        return CalibrationRule("any", max_age_days=told.number("max_age_days", 1))
+        return CalibrationRule("any", max_age_days=calibration.number("max_age_days", 1))
     if rule == "list":
-        by_uuid = told.members.get("by_uuid")
+        by_uuid = calibration.members.get("by_uuid")
         if not isinstance(by_uuid, dict) or not 1 <= len(by_uuid) <= MOST_BOARDS:
-            raise told.bad("by_uuid", f"is no object of 1 to {MOST_BOARDS} boards")
+            raise calibration.bad("by_uuid", f"is no object of 1 to {MOST_BOARDS} boards")
         if not all(is_form("uuid", uuid) and is_form("sha256", digest) for uuid, digest in by_uuid.items()):
-            raise told.bad("by_uuid", "does not give each UUID a SHA-256")
+            raise calibration.bad("by_uuid", "does not give each UUID a SHA-256")
         return CalibrationRule("list", by_uuid={bytes.fromhex(uuid): digest for uuid, digest in by_uuid.items()})
     return CalibrationRule()
 
 
 def _stations(fields: Fields) -> dict[str, int]:
-    told = fields.members.get("stations")
-    if not isinstance(told, dict) or not 1 <= len(told) <= MOST_STATIONS:
+    stations = fields.members.get("stations")
+    if not isinstance(stations, dict) or not 1 <= len(stations) <= MOST_STATIONS:
         raise fields.bad("stations", f"is no object of 1 to {MOST_STATIONS} stations")
-    if not all(is_form("sha256", key) and is_number(number) for key, number in told.items()):
+    if not all(is_form("sha256", key) and is_number(number) for key, number in stations.items()):
         raise fields.bad("stations", "does not give each fingerprint an allotment")
-    return dict(told)
+    return dict(stations)
 
 
 def _sign(fields: Fields) -> str:
-    told = fields.members.get("sign")
-    return BY_STATION if told == BY_STATION else fields.text_of_form("sha256", "sign")
+    sign = fields.members.get("sign")
+    return BY_STATION if sign == BY_STATION else fields.text_of_form("sha256", "sign")
 
 
 def _block(fields: Fields, value: object) -> tuple[int, int]:

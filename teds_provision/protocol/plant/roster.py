@@ -228,10 +228,10 @@ def read_roster(members: object, ca: bytes, hash: str = "", octets: bytes = b"")
 
 def _roles(fields: Fields) -> frozenset[str]:
     """Return the known roles; a member without any reads, as ``audit``."""
-    told = fields.list_of("roles", MOST_ROLES)
-    if not all(isinstance(role, str) for role in told):
+    roles = fields.list_of("roles", MOST_ROLES)
+    if not all(isinstance(role, str) for role in roles):
         raise fields.bad("roles", "is no list of words")
-    return frozenset(role for role in ROLES if role in told) or frozenset({"audit"})
+    return frozenset(role for role in ROLES if role in roles) or frozenset({"audit"})
 
 
 def _signed(fields: Fields) -> Place | None:

@@ -168,10 +168,10 @@ class Answer:
 
     def unsigned(self) -> dict[str, Any]:
         """Return what the office signs, in the order of the contract."""
-        told: dict[str, Any] = {"format": SIGNED.format, "of": self.of}
+        members: dict[str, Any] = {"format": SIGNED.format, "of": self.of}
         if self.refused:
-            return {**told, "refused": self.refused, "why": self.why}
-        return {**told, "sequence": self.sequence, "security": base64.b64encode(self.security).decode()}
+            return {**members, "refused": self.refused, "why": self.why}
+        return {**members, "sequence": self.sequence, "security": base64.b64encode(self.security).decode()}
 
 
 def seal_answer(answer: Answer, office: PrivateKey) -> bytes:

@@ -276,10 +276,10 @@ class Plant:
         held = self.roster
         if held is None:
             return False
-        said = self.claims.of_nodes([uuid]).get(uuid, {})
+        claims = self.claims.of_nodes([uuid]).get(uuid, {})
         return any(
             seen is not None and seen[0] != runs and since <= seen[1] <= utc_now()
-            for station, text in said.items()
+            for station, text in claims.items()
             if held.roles_of(station) - {"audit"} and held.member(station) is not None
             for seen in (claim.Claim.from_json(text).firmware,)
         )
@@ -289,12 +289,12 @@ class Plant:
         if self.joined is not None and document.is_name(name):
             self.record_event("named", uuid, name=name)
 
-    def queue_event(self, told: Mapping[str, Any]) -> None:
+    def queue_event(self, members: Mapping[str, Any]) -> None:
         """Have an event that was made wait for the next page."""
-        uuid = told.get("uuid")
-        text = json.dumps(told, ensure_ascii=False, separators=(",", ":"))
+        uuid = members.get("uuid")
+        text = json.dumps(members, ensure_ascii=False, separators=(",", ":"))
         with self._store.together():
-            self._store.execute("INSERT INTO outbox(id, event) VALUES(?, ?)", (told["id"], text))
+            self._store.execute("INSERT INTO outbox(id, event) VALUES(?, ?)", (members["id"], text))
             if uuid is not None:  # its node is judged again at the next fold
                 self.claims.queue([bytes.fromhex(uuid)])
 

@@ -133,7 +133,7 @@ class StoreLock(_HeldFile):
 
     def _lock(self, descriptor: int) -> None:
         began = time.monotonic()
-        told, pause = False, _FIRST_POLL_SECONDS
+        reported, pause = False, _FIRST_POLL_SECONDS
         while True:
             try:
                 self._try_to_lock(descriptor)
@@ -147,12 +147,12 @@ class StoreLock(_HeldFile):
             if waited >= self._wait:
                 hint = "Wait for it to finish, or stop it."
                 raise StoreLockedError(f"The store is locked by {_holder(descriptor)}.", hint=hint)
-            if not told and waited >= _POLL_SECONDS and self._notice is not None:
+            if not reported and waited >= _POLL_SECONDS and self._notice is not None:
                 self._notice(f"Waiting for the store, locked by {_holder(descriptor)}.")
-                told = True
+                reported = True
             time.sleep(pause)
             # a durable step of another command takes milliseconds, and others wait for its end as well
-            pause = min(2 * pause, _POLL_SECONDS if told else _LAST_QUIET_POLL_SECONDS)
+            pause = min(2 * pause, _POLL_SECONDS if reported else _LAST_QUIET_POLL_SECONDS)
 
 
 class UsageLock(_HeldFile):
@@ -280,10 +280,10 @@ def _held_by(path: Path, *, shared: bool = False) -> str | None:
 
 def _holder(descriptor: int) -> str:
     try:
-        said = json.loads(_read_at_start(descriptor, 4096))
-        if Path("/proc/self").exists() and not Path(f"/proc/{int(said['pid'])}").exists():
+        holder = json.loads(_read_at_start(descriptor, 4096))
+        if Path("/proc/self").exists() and not Path(f"/proc/{int(holder['pid'])}").exists():
             return "another process"  # of several who shared it, the last to come has gone
-        return f"pid {int(said['pid'])} ({said['command']}) since {said['since']}"
+        return f"pid {int(holder['pid'])} ({holder['command']}) since {holder['since']}"
     except (OSError, ValueError, KeyError, TypeError):
         return "another process"
 
@@ -307,12 +307,12 @@ class _LockedOctet(_HeldFile):
         except OSError:
             return False  # no octet of this file was ever locked
         try:
-            said = fcntl.fcntl(descriptor, fcntl.F_OFD_GETLK, self._lock_struct())
+            answer = fcntl.fcntl(descriptor, fcntl.F_OFD_GETLK, self._lock_struct())
         except OSError:
             return False
         finally:
             os.close(descriptor)
-        return bool(struct.unpack_from("h", said)[0] != fcntl.F_UNLCK)
+        return bool(struct.unpack_from("h", answer)[0] != fcntl.F_UNLCK)
 
     def _lock_struct(self) -> bytes:
         place = int.from_bytes(hashlib.sha256(self._key).digest()[:6], "big")
@@ -341,16 +341,16 @@ class NodeLock(_LockedOctet):
         self._uuid, self._notice = uuid, notice
 
     def _acquire(self, descriptor: int) -> None:
-        until, told = time.monotonic() + _TURN_SECONDS, False
+        until, reported = time.monotonic() + _TURN_SECONDS, False
         while not self._try_to_lock(descriptor):
             if time.monotonic() >= until:
                 raise NodeBusyError(
                     f"Another command of this station is using node {self._uuid.hex()}.",
                     hint="Wait for it to finish, or stop it.",
                 )
-            if not told and self._notice is not None:
+            if not reported and self._notice is not None:
                 self._notice(f"Waiting: another command is using node {self._uuid.hex()}.")
-                told = True
+                reported = True
             time.sleep(_POLL_SECONDS)
 
 

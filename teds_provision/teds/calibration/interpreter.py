@@ -222,7 +222,7 @@ class ChannelInterpreter:
         above = low + np.mod(values - low, turn)
         return np.where((above <= high) | (above - high <= low + turn - above), above, above - turn)
 
-    def beyond(self, value: float, told: WrittenUnit | None = None) -> str:
+    def beyond(self, value: float, written: WrittenUnit | None = None) -> str:
         """Return why a value may not be set, as a sentence in the unit ``told``; "" if the datasheet's limits allow it.
 
         ``value`` is in :attr:`unit`; without ``told`` the sentence is in the display unit.
@@ -230,7 +230,7 @@ class ChannelInterpreter:
         low, high = self.limits
         if math.isfinite(value) and low - ROUNDING * abs(low) <= value <= high + ROUNDING * abs(high):
             return ""
-        unit = told or self.channel.shown
+        unit = written or self.channel.shown
         asked, *ends = (unit.from_si(self.unit.to_si(number)) for number in (value, low, high))
         text = f"{min(ends):.6g} to {max(ends):.6g} {unit.text}".strip()
         return f"{asked:.6g} {unit.text} exceeds the limits of channel {self.channel.label}, {text}."

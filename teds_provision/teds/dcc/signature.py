@@ -54,8 +54,8 @@ def read_checked(octets: bytes, file: str, trusted: Sequence[bytes], now: dateti
     if len(signatures) > 1:
         if anchors:
             raise NotAuthenticError(f"{file} has {len(signatures)} signatures; only one can be checked.")
-        told = f"The certificate has {len(signatures)} signatures; only one could be checked."
-        return replace(certificate_of(root, octets, file), unchecked=(told,))
+        text = f"The certificate has {len(signatures)} signatures; only one could be checked."
+        return replace(certificate_of(root, octets, file), unchecked=(text,))
     try:
         signed, notes = _verified(octets, file, signatures[0], anchors, now)
     except _UnsupportedError as error:

@@ -47,15 +47,15 @@ def profile_from_xml(octets: bytes, mapping: str, *, name: str, file: str = "the
     if len(channels) > _MOST_CHANNELS:
         raise BadDataError(f"{file} has {len(channels)} channels; a node has at most {_MOST_CHANNELS}.")
     lines = [f"# Made from {file.rpartition('/')[2]}."]
-    told = {**_table(rules, "values", by), **dict(_keys(root, _table(rules, "keys", by), file, by))}
-    lines += _lines({"title": name, **told})
+    values = {**_table(rules, "values", by), **dict(_keys(root, _table(rules, "keys", by), file, by))}
+    lines += _lines({"title": name, **values})
     own, fixed = _table(rules, "channel-keys", by), _table(rules, "channel-values", by)
     for count, element in enumerate(channels, 1):
-        said = {**fixed, **dict(_keys(element, own, f"{file}, channel {count}", by))}
-        number = str(said.pop("number", count))
+        channel_values = {**fixed, **dict(_keys(element, own, f"{file}, channel {count}", by))}
+        number = str(channel_values.pop("number", count))
         if not (number.isascii() and number.isdecimal()):
             raise BadDataError(f"{file}, channel {count}: {number!r} is no channel number.")
-        lines += ["", f"[channel.{int(number)}]", *_lines(said)]
+        lines += ["", f"[channel.{int(number)}]", *_lines(channel_values)]
     return "\n".join([*lines, ""])
 
 

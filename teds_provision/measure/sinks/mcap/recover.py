@@ -203,8 +203,10 @@ def _indexes(places: _Places) -> list[bytes]:
 
 def _names_all(found: dict[int, bytes], places: _Places) -> bool:
     """Return True if the contents of message indexes name exactly these messages."""
-    told = {channel: sorted(struct.iter_unpack("<QQ", index[6:])) for channel, index in found.items() if len(index) > 6}
-    return told == {channel: sorted(entries) for channel, entries in places.items()}
+    indexed = {
+        channel: sorted(struct.iter_unpack("<QQ", index[6:])) for channel, index in found.items() if len(index) > 6
+    }
+    return indexed == {channel: sorted(entries) for channel, entries in places.items()}
 
 
 class _Scan:

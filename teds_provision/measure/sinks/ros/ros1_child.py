@@ -46,13 +46,13 @@ _OUT = threading.Lock()
 
 def wait_for_master(rosgraph: Any) -> None:
     """Wait for a master: init_node without one would block for ever, without any message to pass on."""
-    told, parent = False, os.getppid()
+    reported, parent = False, os.getppid()
     while not rosgraph.is_master_online():
         if os.getppid() != parent:
             os._exit(0)  # a parent that was killed closes our stdin, which is not read yet
-        if not told:
+        if not reported:
             say(event="waiting", master=os.environ.get("ROS_MASTER_URI", "http://localhost:11311"))
-            told = True
+            reported = True
         time.sleep(WATCH)
 
 
