@@ -46,7 +46,7 @@ from teds_provision.provisioning.teds_read import list_blocks
 from teds_provision.provisioning.verify import Verification, require_authentic
 from teds_provision.shapes.problem import Problem, problem_of
 from teds_provision.station.station import Station
-from teds_provision.station.store.audit import ACTOR
+from teds_provision.station.store.audit import ACTOR, acting_for
 
 _log = logging.getLogger(__name__)
 WAITING: Final = 300.0  # seconds for a tap
@@ -157,11 +157,8 @@ class Provisioning:
         who = ACTOR.get()
 
         def work(node: Conversation) -> None:
-            before = ACTOR.set(who)  # the requester, when a node comes to another thread
-            try:
+            with acting_for(who):  # the requester, when a node comes to another thread
                 self._work(run, node, order)
-            finally:
-                ACTOR.reset(before)
 
         if uuid != NEXT and self._node_jobs.on_a_bus(uuid):
             self._publish(run)
@@ -248,10 +245,7 @@ class Provisioning:
             raise lost.cause from lost
         run.verdict = done.verified.verdict
         require_authentic(done.verified)
-        self._directory.show_sheet(uuid, None)
-        with suppress(TedsProvisionError):
-            self._directory.refresh([uuid])
-        self._directory.note(uuid, "verified", verdict=run.verdict, heard=None, looked=time.time(), problem=None)
+        _show_verified(self._directory, uuid, done.verified)
         run.state = "done"  # last: who hears it asks for the node next
         self._publish(run)
 
@@ -305,6 +299,14 @@ class _RunReporter:
         self._live.event("provision", uuid=self._run.uuid, state="running", step=name, result=result, detail=detail)
 
 
+def _show_verified(directory: NodeDirectory, uuid: str, verified: Verification) -> None:
+    """Show a node that was provisioned: its datasheet is the one that is kept now."""
+    directory.show_sheet(uuid, None)
+    with suppress(TedsProvisionError):
+        directory.refresh([uuid])
+    directory.note(uuid, "verified", verdict=verified.verdict, heard=None, looked=time.time(), problem=None)
+
+
 def _file(folder: Path, text: str | None, name: str | None) -> Path | None:
     """Return a calibration that came as text, as the file that the steps read; its suffix names the form."""
     if text is None:
@@ -355,11 +357,7 @@ class AutoProvisioner:
         self._refused.pop(uuid, None)
         if uuid in self._virtuals:
             verified = self._virtual(node, uuid)
-            self._directory.show_sheet(uuid, None)
-            self._directory.refresh([uuid])
-            self._directory.note(
-                uuid, "verified", problem=None, verdict=verified.verdict, heard=None, looked=time.time()
-            )
+            _show_verified(self._directory, uuid, verified)
             return True
         if (
             self._adopts()
@@ -405,10 +403,7 @@ class AutoProvisioner:
             self._refused[uuid] = error
             self._live.event("node", uuid=uuid, state="not adopted", problem=problem_of(error))
             return False
-        self._directory.show_sheet(uuid, None)
-        self._directory.refresh([uuid])
-        verdict = done.verified.verdict
-        self._directory.note(uuid, "verified", problem=None, verdict=verdict, heard=None, looked=time.time())
+        _show_verified(self._directory, uuid, done.verified)
         return True
 
     def _virtual(self, node: Conversation, uuid: str) -> Verification:

@@ -61,7 +61,7 @@ from teds_provision.provisioning.update import (
 )
 from teds_provision.shapes.problem import problem_of
 from teds_provision.station.station import Station
-from teds_provision.station.store.audit import ACTOR
+from teds_provision.station.store.audit import ACTOR, acting_for
 
 _log = logging.getLogger(__name__)
 _WAITED_FOR: Final = 60.0
@@ -276,11 +276,8 @@ class Updates:
             action.rows[uuid].state, action.rows[uuid].step = "waiting", None
 
         def one(uuid: str) -> BoardUpdate:
-            before = ACTOR.set(action.actor)  # on whose word, for the audit log
-            try:
+            with acting_for(action.actor):  # on whose word, for the audit log
                 return self._update(action, image, uuid)
-            finally:
-                ACTOR.reset(before)
 
         work = self._work = ParallelWork(left, one, at_once=action.request.parallel, name="update")
         threading.Thread(
@@ -310,12 +307,8 @@ class Updates:
         skipped = any(row.state == "skipped" for row in action.rows.values())
         self._end(action, "stopped" if skipped else "done")
         totals = {name: count for name, count in action.as_json()["totals"].items() if count and name != "seconds"}
-        before = ACTOR.set(action.actor)
-        try:
-            with suppress(StoreError):  # a full disk must not hide what happened
-                self._station.audit("update", None, "ended", id=action.id, to=action.image["version"], **totals)
-        finally:
-            ACTOR.reset(before)
+        with acting_for(action.actor), suppress(StoreError):  # a full disk must not hide what happened
+            self._station.audit("update", None, "ended", id=action.id, to=action.image["version"], **totals)
         self._publish(action)
 
     def _update(self, action: UpdateAction, image: FirmwareImage, uuid: str) -> BoardUpdate:

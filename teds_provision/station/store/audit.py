@@ -15,6 +15,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache
@@ -36,6 +37,16 @@ _RUN_OF_ENTRIES = "SELECT * FROM audit WHERE seq BETWEEN ? AND ? ORDER BY seq"
 
 
 _TOKEN = "token "
+
+
+@contextmanager
+def acting_for(actor: str | None) -> Iterator[None]:
+    """Do the block as an act of ``actor``, in whichever thread; None: of the user who runs this process."""
+    before = ACTOR.set(actor)
+    try:
+        yield
+    finally:
+        ACTOR.reset(before)
 
 
 def by_token(name: str) -> str:
