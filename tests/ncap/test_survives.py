@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 
 from teds_provision import client
+from teds_provision.cli.rendering import local_time
 from teds_provision.client import ApiError
 from teds_provision.ncap.settings import own_source
 from teds_provision.station import station as base_station
@@ -212,6 +213,8 @@ def test_a_node_that_leaves_is_shown_as_away_and_comes_back_verified(lab: Lab) -
     assert verdict(verified(lab.service, lab.node.uuid)) == "authentic"
     lab.node.kill()
     until(lambda: not lab.state()["present"])
+    seen = local_time(lab.state()["last_seen"])
+    assert f"  away, last seen {seen}  authentic" in lab.service.station.run("ncap", "status").out
     lab.power()
     until(lambda: lab.state()["present"])
     assert verdict(verified(lab.service, lab.node.uuid)) == "authentic"

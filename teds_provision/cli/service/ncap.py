@@ -34,7 +34,7 @@ from teds_provision.cli.options import (
     options_given,
     tracing,
 )
-from teds_provision.cli.rendering import count_of, shown
+from teds_provision.cli.rendering import count_of, local_time, shown
 from teds_provision.errors import NotFoundError, PolicyError, TedsProvisionError, UsageError
 from teds_provision.lazy import how_to_install, late
 from teds_provision.sanitize import by_name, counted
@@ -303,7 +303,7 @@ def _status(console: Console, found: dict[str, Any]) -> None:
     for link in found["links"]:
         console.print(_link(link), markup=False)
     for node in sorted(found["nodes"], key=lambda node: by_name(node["name"], node["uuid"])):
-        there = "there" if node["present"] else "away"
+        there = "there" if node["present"] else _away(node["last_seen"])
         name = shown(node["name"]) or "no name"
         problem = f": {node['problem']['message']}" if node["problem"] else ""
         running = node["measuring"] is not None and node["measuring"]["state"] == "running"
@@ -325,6 +325,10 @@ def _status(console: Console, found: dict[str, Any]) -> None:
         why = known["error"] or known["detail"]
         text = f"{known['state']}, {known['dropped']} dropped{f': {why}' if why else ''}"
         console.print(f"{shown(known['name'])}: {text}", markup=False)
+
+
+def _away(last_seen: str | None) -> str:
+    return f"away, last seen {local_time(last_seen)}" if last_seen else "away"
 
 
 def _verdict(node: dict[str, Any]) -> str:
