@@ -29,7 +29,6 @@ MANY_PARAMETERS = {
     "client.py provision": "the members of the request body, as keywords of the public client",
     "ncap/nodes/provisioning.py begin": "the members of that request body",
     "node/nfc/server.py __init__": "the tag's pace and sizes, each set by itself in tests of a link",
-    "ncap/dynamic_membership.py __init__": _WIRED,
     "ncap/measurement_supervisor.py __init__": _WIRED,
     "ncap/nodes/link_watch.py __init__": _WIRED,
     "provisioning/sign.py sign": "what a signature depends on, which each caller has from another place",

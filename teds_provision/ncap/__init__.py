@@ -8,7 +8,8 @@ module                      what it does
 ``waits``                   how long it pauses between looks
 ``daemon``                  begins and ends all of its parts, in order
 ``measurement_supervisor``  what it measures, across restarts
-``dynamic_membership``      who joins and leaves one that measures whoever comes
+``running_measurement``     one measurement: its nodes, their reports, its state
+``membership``              which nodes join, wait and are tried again, decided without threads
 ``sinks``, ``names``        where values go, and under which topics
 ``live``                    values and events to many clients, none of which holds up another
 ``nodes/``                  the nodes on its links, and what is done with them

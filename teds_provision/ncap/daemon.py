@@ -109,6 +109,7 @@ class Daemon:
             self.node_locks,
             self.measurements.session,
             self.measurements.is_measured,
+            self.measurements.lent_for,
             dead_man=settings.dead_man,
         )
         self.updates = Updates(

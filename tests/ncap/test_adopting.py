@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from teds_provision.client import ApiError
-from teds_provision.ncap.dynamic_membership import AGAIN
+from teds_provision.ncap.membership import AGAIN
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.teds.image import BlockId
 from tests.e2e.desk import Desk, Node

@@ -15,12 +15,14 @@ import pytest
 from teds_provision.errors import LinkError
 from teds_provision.links import Notice
 from teds_provision.measure.blocks import NodeReport
-from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor, RunningMeasurement
+from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor
+from teds_provision.ncap.membership import Member, Membership
 from teds_provision.ncap.nodes import link_watch
 from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
 from teds_provision.ncap.nodes.inspection import look
 from teds_provision.ncap.nodes.link_watch import MOST_KNOWN, LinkWatch
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
+from teds_provision.ncap.running_measurement import RunningMeasurement
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.station.store import KeptMeasurement
 from tests.bench import MemoryLink, contact, make_station
@@ -232,10 +234,12 @@ def test_what_a_measurement_says_of_a_node_that_it_has_no_more_is_no_problem(wat
     uuid, roster = "ab" * 10, watch._directory
     station = make_station(tmp_path)
     measuring = MeasurementSupervisor(station, roster, watch._live, NodeLocks(), nothing, nothing, nothing)
-    newcomers: Any = object()
     left, has = (
-        RunningMeasurement(KeptMeasurement(name, uuids=()), uuids, newcomers)
-        for name, uuids in (("unverified", ()), ("adopted", (uuid,)))
+        RunningMeasurement(kept, Membership(0.0, {uuid: Member() for uuid in uuids}), kept)
+        for kept, uuids in (
+            (KeptMeasurement("unverified", match="all"), ()),
+            (KeptMeasurement("adopted", match="all"), (uuid,)),
+        )
     )
     measuring._running = {"unverified": left, "adopted": has}
     measuring._report(has, NodeReport(uuid, "running"))

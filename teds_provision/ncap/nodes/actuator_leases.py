@@ -84,7 +84,7 @@ class _SharedSession:
 class ActuatorLeases:
     """The actuators that are held now, with a ``dead_man`` in ms.
 
-    ``measured`` gives the session of a node that is being measured.
+    ``measured`` gives the session of a node that is being measured, ``lent_for`` why a node is let go to a writer.
     """
 
     def __init__(
@@ -95,11 +95,13 @@ class ActuatorLeases:
         turns: NodeLocks,
         measured: Measured,
         is_measured: Callable[[str], bool],
+        lent_for: Callable[[str], str | None],
         *,
         dead_man: int = DEAD_MAN,
     ) -> None:
         self._station, self._live, self._node_jobs, self._node_locks = station, live, desk, turns
-        self._measured, self._is_measured, self._dead_man = measured, is_measured, dead_man
+        self._measured, self._is_measured, self._lent_for = measured, is_measured, lent_for
+        self._dead_man = dead_man
         self._held: dict[tuple[str, int], _HeldActuator] = {}
         self._shared: dict[str, _SharedSession] = {}
         self._last: dict[tuple[str, int], dict[str, Any]] = {}
@@ -254,6 +256,9 @@ class ActuatorLeases:
 
     @contextmanager
     def _own_session(self, uuid: str) -> Iterator[VerifiedSession]:
+        writer = self._lent_for(uuid)
+        if writer is not None:  # a claim would spoil what it writes: a datasheet does not change under one
+            raise NodeBusyError(f"Node {uuid} is busy: {writer}.", hint="Try again when that is done.")
         contact = self._node_jobs.contact(uuid)
         if contact is None:
             raise NoNodeError(f"Node {uuid} is not on any bus of this station.", hint="Connect it to a bus.")

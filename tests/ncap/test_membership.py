@@ -1,0 +1,180 @@
+"""Which nodes a measurement has, waits for and asks again: decided without threads, at times that are handed in."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import LinkError, NoRoomError, PolicyError, TedsProvisionError
+from teds_provision.measure.matching import NodeLoad
+from teds_provision.ncap.membership import (
+    AGAIN,
+    ASKED,
+    FIRST_ROUND,
+    GATHERING,
+    LOOK,
+    NO_ROOM,
+    QUIET,
+    AfterEnd,
+    Budget,
+    Member,
+    Membership,
+)
+from teds_provision.protocol.messages.identity import NodeState
+
+A, B, C = "aa" * 10, "bb" * 10, "cc" * 10
+LATER = FIRST_ROUND + 10.0
+
+
+def place(state: NodeState = NodeState.PROVISIONED) -> Any:
+    return SimpleNamespace(identity=SimpleNamespace(state=state))
+
+
+def joined(*uuids: str) -> Membership:
+    return Membership(0.0, {uuid: Member() for uuid in uuids})
+
+
+def released(membership: Membership, uuid: str) -> None:
+    membership.begin_leaving(uuid)
+    membership.leaving.discard(uuid)
+
+
+def test_nodes_that_come_together_join_together() -> None:
+    membership = joined(C)
+    membership.arrive(A, LATER)
+    assert not membership.gathered(LATER + QUIET / 2)
+    membership.arrive(B, LATER + QUIET / 2)
+    assert not membership.gathered(LATER + QUIET), "another one came just now"
+    assert membership.gathered(LATER + 2 * QUIET)
+    assert membership.begin_joining() == [A, B]
+    assert not membership.gathered(LATER + 1)
+
+
+def test_a_crowd_that_never_ends_does_not_keep_the_first_waiting() -> None:
+    membership = joined(C)
+    for number in range(20):
+        membership.arrive(f"{number:020x}", LATER + number * QUIET / 2)
+    assert membership.gathered(LATER + GATHERING)
+
+
+def test_at_the_beginning_all_have_three_seconds_to_answer() -> None:
+    membership = Membership(0.0)
+    for number in range(30):
+        membership.arrive(f"{number:020x}", number * 0.1)
+        assert not membership.gathered(number * 0.1 + QUIET)
+    assert membership.gathered(FIRST_ROUND)
+
+
+def test_a_node_counts_as_in_from_joining_until_its_lock_is_released() -> None:
+    membership = Membership(0.0)
+    membership.arrive(A, 0.0)
+    membership.begin_joining()
+    assert not membership.has(A), "it is being decided whether there is room"
+    membership.join(A)
+    assert (membership.has(A), membership.joined) == (True, (A,))
+    membership.begin_leaving(A)
+    assert (membership.has(A), membership.joined) == (True, (A,))
+    assert membership.may_come(A, says_factory=False), "where it answers meanwhile, it is tried again"
+    membership.leaving.discard(A)
+    assert not membership.has(A)
+
+
+@pytest.mark.parametrize(
+    ("room", "says_factory", "may"),
+    [(None, False, True), (None, True, False), (0.3, False, False)],
+    ids=["refused", "refused, and the adopter's", "no room"],
+)
+def test_a_node_that_waits_and_answers(room: float | None, says_factory: bool, may: bool) -> None:
+    membership = Membership(0.0)
+    assert membership.wait(A, 30.0, room)
+    assert not membership.wait(A, 40.0, room), "that it waits is no news"
+    assert membership.may_come(A, says_factory=says_factory) is may
+
+
+def test_a_node_without_room_is_tried_when_there_is_more_or_after_half_a_minute() -> None:
+    membership = joined(A)
+    released(membership, A)
+    membership.end(A, 0.0, NoRoomError("full"), last=place(), seen=place(), room=0.2)
+    assert membership.due(1.0, lambda _uuid: 0.2) == []
+    assert membership.due(1.0, lambda _uuid: 0.25) == [A]
+    membership.wait(A, AGAIN, 0.2)
+    assert membership.due(AGAIN, lambda _uuid: 0.2) == [A]
+    assert membership.due(AGAIN, lambda _uuid: 0.2) == []
+
+
+@pytest.mark.parametrize(
+    ("error", "last", "seen", "then"),
+    [
+        (LinkError("silent"), place(), None, AfterEnd.NOTHING),
+        (LinkError("silent"), place(), place(), AfterEnd.TRY),
+        (PolicyError("banned"), place(), place(), AfterEnd.NOTHING),
+        (PolicyError("no key"), place(NodeState.FACTORY), None, AfterEnd.ASK),
+        (None, place(), None, AfterEnd.NOTHING),
+    ],
+    ids=["lost", "seen elsewhere meanwhile", "refused", "without a key", "ended in order"],
+)
+def test_what_follows_when_a_session_has_ended(
+    error: TedsProvisionError | None, last: Any, seen: Any, then: AfterEnd
+) -> None:
+    membership = joined(A)
+    released(membership, A)
+    assert membership.end(A, 0.0, error, last=last, seen=seen, room=0.0) is then
+    assert membership.places[A] is last
+    assert (A in membership.lost) == (isinstance(error, LinkError) and seen is None)
+    assert (A in membership.waits) == isinstance(error, PolicyError)
+
+
+def test_a_lost_node_is_asked_ever_more_seldom_for_a_minute() -> None:
+    membership, last = joined(A), place()
+    released(membership, A)
+    membership.end(A, 0.0, LinkError("silent"), last=last, seen=last, room=0.0)
+    times = [step * LOOK for step in range(int(2 * ASKED / LOOK))]
+    asked = [time for time in times if membership.ask_now(time) == [last]]
+    pauses = [later - earlier for earlier, later in itertools.pairwise(asked)]
+    assert (asked[0] < 0.5, 5 < len(asked) < 15) == (True, True)
+    assert all(later >= earlier - LOOK for earlier, later in itertools.pairwise(pauses))
+    assert asked[-1] <= ASKED
+    assert not membership.lost
+
+
+def test_a_node_that_is_in_again_is_asked_for_no_more() -> None:
+    membership, last = joined(A), place()
+    released(membership, A)
+    membership.end(A, 0.0, LinkError("silent"), last=last, seen=last, room=0.0)
+    membership.arrive(A, 0.1)
+    membership.begin_joining()
+    assert membership.ask_now(10.0) == []
+    assert not membership.lost
+
+
+def test_after_a_change_of_the_store_all_but_those_without_room_are_tried() -> None:
+    membership = Membership(0.0)
+    membership.wait(A, 30.0, None)
+    membership.wait(B, 30.0, 0.1)
+    membership.elsewhere.add(C)
+    assert membership.select_again([B, C]) == [A, C]
+    assert membership.due(30.0, lambda _uuid: 0.0) == [B]
+    assert not membership.elsewhere
+
+
+def test_a_node_that_another_part_works_with_is_tried_a_moment_later() -> None:
+    membership = Membership(0.0)
+    membership.busy[A] = LOOK
+    assert membership.free_again(LOOK / 2) == []
+    assert membership.free_again(LOOK) == [A]
+    assert membership.free_again(2 * LOOK) == []
+
+
+def test_a_node_joins_only_as_far_as_bus_and_budget_have_room() -> None:
+    membership, load = joined(A, B), NodeLoad(0.2, 2, 50.0)
+    budget = Budget(150.0, 50.0, rows=False)
+    membership.members[A].load = load
+    membership.members[B].load = load
+    assert membership.why_no_room(B, 0.5, Budget()) == ""
+    assert membership.why_no_room(B, 0.001, Budget()) == NO_ROOM
+    assert "150" in membership.why_no_room(B, 0.5, budget)
+    assert membership.why_no_room(B, 0.5, dataclasses.replace(budget, limit=200.0)) == ""

@@ -1,0 +1,172 @@
+"""The supervisor of measurements, in this process: one that fails, or a store that fails, stops no other."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import NodeBusyError, NoNodeError, StoreError
+from teds_provision.links.discovery import Sighting
+from teds_provision.measure.buses import Buses
+from teds_provision.ncap.live import Live
+from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor, NodeLoan
+from teds_provision.ncap.membership import Member
+from teds_provision.ncap.nodes.actuator_leases import ActuatorLeases
+from teds_provision.ncap.nodes.directory import NodeDirectory
+from teds_provision.ncap.nodes.node_jobs import NodeJobs, NodeLocks
+from teds_provision.ncap.sinks import DaemonSinks
+from teds_provision.station.station import Station
+from teds_provision.station.store import KeptMeasurement, WhitelistEntry
+from tests.bench import make_station
+from tests.ncap.short_waits import SHORT
+from tests.pace import until
+
+NODE, OTHER = "ab" * 10, "cd" * 10
+
+
+class Service:
+    """A supervisor over a station without links."""
+
+    def __init__(self, folder: Path) -> None:
+        self.station: Station = make_station(folder)
+        self.station.unlock()
+        self.live, self.locks, self.buses = Live(), NodeLocks(), Buses()
+        self.directory = NodeDirectory(self.station, self.live)
+        sinks = DaemonSinks(self.station.home, actuators=False)
+        self.measurements = MeasurementSupervisor(
+            self.station, self.directory, self.live, self.locks, self.buses, sinks, lambda _point: True, waits=SHORT
+        )
+        self.locks.given = self.measurements.on_sighting
+
+    def state(self, measurement: str) -> tuple[str, str]:
+        every = {shown["id"]: (shown["state"], shown["why"]) for shown in self.measurements.all()}
+        return every[measurement]
+
+    def close(self) -> None:
+        self.measurements.stop()
+        self.buses.close()
+        self.station.close()
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[Service]:
+    made = Service(tmp_path / "home")
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def failing_once(service: Service, error: Exception, patch: pytest.MonkeyPatch) -> threading.Event:
+    """Let the next look at the store fail; the event is set once it was tried again."""
+    tried, again, version = threading.Event(), threading.Event(), service.station.version
+
+    def fails() -> object:
+        if tried.is_set():
+            again.set()
+            return version()
+        tried.set()
+        raise error
+
+    patch.setattr(service.station, "version", fails)
+    return again
+
+
+def test_a_store_that_cannot_be_read_for_a_moment_ends_no_measurement(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service.measurements.match("all")
+    until(lambda: service.state("run") == ("waiting", "no matching node is present"))
+    again = failing_once(service, StoreError("The disk is away."), monkeypatch)
+    assert again.wait(10)
+    assert service.state("run") == ("waiting", "no matching node is present")
+
+
+def test_a_bug_in_one_measurement_ends_that_one_alone(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = service.measurements.add({"match": "name:x*"})["id"]
+    service.measurements.match("all")
+    until(lambda: [service.state(one)[0] for one in (made, "run")] == ["waiting"] * 2)
+    again = failing_once(service, RuntimeError("bug"), monkeypatch)
+    assert again.wait(10), "the other one looks at the store"
+    until(lambda: "failed" in [service.state(one)[0] for one in (made, "run")])
+    states = {one: service.state(one) for one in (made, "run")}
+    assert sorted(state for state, _ in states.values()) == ["failed", "waiting"]
+    assert [why for state, why in states.values() if state == "failed"] == ["Unexpected RuntimeError."]
+
+
+def test_a_measurement_that_begins_while_a_writer_has_its_node_leaves_it_to_the_writer(service: Service) -> None:
+    loan = NodeLoan(NODE, "let go for write")
+    assert service.measurements.lend_node(loan) is False
+    kept = service.station.measurements.keep(KeptMeasurement("", uuids=tuple(map(bytes.fromhex, (NODE, OTHER)))))
+    running = service.measurements._begin(kept)
+
+    def begun() -> set[str]:
+        measurement = running.job.measurement if running.job is not None else None
+        supervisors = measurement.supervisors if measurement is not None and measurement.ready.is_set() else ()
+        return {supervisor.uuid.hex() for supervisor in supervisors if supervisor.begun}
+
+    until(lambda: begun() == {OTHER})
+    service.measurements.return_node(loan)
+    assert begun() == {NODE, OTHER}
+
+
+def test_an_actuator_of_a_node_that_a_writer_has_is_not_claimed(service: Service) -> None:
+    """The datasheet does not change under a claim: the command would be refused in the middle of what it writes."""
+    service.station.pins.put(WhitelistEntry(bytes.fromhex(NODE)))
+    measurements, jobs = service.measurements, NodeJobs(service.directory, service.locks, lambda _place: None)
+    leases = ActuatorLeases(
+        service.station,
+        service.live,
+        jobs,
+        service.locks,
+        measurements.session,
+        measurements.is_measured,
+        measurements.lent_for,
+    )
+    loan = NodeLoan(NODE, "let go for write")
+    measurements.lend_node(loan)
+    with pytest.raises(NodeBusyError, match="busy: let go for write"):
+        leases.put(NODE, 1, 0.5, None, None)
+    measurements.return_node(loan)
+    with pytest.raises(NoNodeError):
+        leases.put(NODE, 1, 0.5, None, None)
+
+
+def test_two_writers_of_one_node_wait_for_each_other_and_those_of_others_do_not(service: Service) -> None:
+    loans = [NodeLoan(NODE, "let go for write"), NodeLoan(OTHER, "let go for write")]
+    with service.measurements._one_at_a_time(NODE):
+        first = threading.Thread(target=service.measurements.lend_node, args=(loans[0],), daemon=True)
+        first.start()
+        assert service.measurements.lend_node(loans[1]) is False
+        assert service.measurements.lent_for(OTHER) == "let go for write"
+        assert service.measurements.lent_for(NODE) is None
+    first.join(10)
+    assert service.measurements.lent_for(NODE) == "let go for write"
+
+
+@pytest.mark.parametrize(("state", "ended"), [("running", ["This station holds no key of node"]), ("ended", [])])
+def test_a_node_that_may_not_be_measured_is_ended_or_refused_by_its_own_supervisor(
+    service: Service, state: str, ended: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that begins again, as after `reset`, was ended before it looked, and no client heard why."""
+    service.measurements.match("all")
+    until(lambda: service.state("run")[0] == "waiting")
+    running, whys = service.measurements._running["run"], list[str]()
+    supervisor: Any = SimpleNamespace(stop=whys.append, done=threading.Event())
+    followed = threading.Event()
+
+    def seen() -> list[Sighting]:
+        followed.set()
+        return []
+
+    monkeypatch.setattr(service.buses.presence, "all", seen)
+    running.reports[NODE] = {"state": state}
+    running.membership.members[NODE] = Member(supervisor=supervisor)
+    service.measurements.look_who_is_meant()
+    assert followed.wait(10)
+    assert [why[: len("This station holds no key of node")] for why in whys] == ended
