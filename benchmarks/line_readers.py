@@ -26,9 +26,9 @@ from benchmarks.commands import PASSPHRASE, finished, started
 from benchmarks.machine import line as machine
 from benchmarks.provisioning import next_node, next_nodes, nodes
 from teds_provision import plant
-from teds_provision.demo.cluster import Cluster, programs, running
 from teds_provision.handover import trust
 from teds_provision.links.ports import free_port
+from teds_provision.plant.demo.cluster import Cluster, programs, running
 from teds_provision.protocol.plant.document import open_request
 from teds_provision.station.station import initialise
 from teds_provision.vault import forget_vaults

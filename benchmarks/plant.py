@@ -22,9 +22,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from teds_provision.demo import cluster
 from teds_provision.links.ports import free_port
 from teds_provision.plant import postgres, schema, scram
+from teds_provision.plant.demo import cluster
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.sync import sync
 from teds_provision.protocol.keys import SoftwareKey, fingerprint

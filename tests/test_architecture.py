@@ -13,12 +13,15 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.optional_rooms import OPTIONAL, Hook, load, rooms
+
 PACKAGE = Path(__file__).parent.parent / "teds_provision"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
-# Room: the rooms that it may import. All may import errors, lazy, limits, sanitize, json_decoder, itself;
-# all but protocol also files and portable.
-WITHOUT_FILES = {"errors", "sanitize", "lazy", "limits", "portable", "protocol", "json_decoder"}
+# Room: the rooms that it may import. All may import those of _FOR_ALL and itself; all but protocol also files and
+# portable.
+_FOR_ALL = {"errors", "sanitize", "lazy", "limits", "json_decoder", "optional_rooms"}
+WITHOUT_FILES = {"errors", "sanitize", "lazy", "limits", "portable", "protocol", "json_decoder", "optional_rooms"}
 _BELOW_PROVISIONING = {"station", "links", "vault", "protocol", "teds", "shapes"}
 ARROWS = {
     "shapes": set(),
@@ -29,6 +32,7 @@ ARROWS = {
     "sanitize": set(),
     "lazy": set(),
     "limits": set(),
+    "optional_rooms": set(),
     "json_decoder": set(),
     "firmware_image": set(),
     "teds": set(),
@@ -40,22 +44,21 @@ ARROWS = {
     "trace": {"links", "protocol", "teds"},
     "provisioning": _BELOW_PROVISIONING | {"firmware_image"},
     "handover": _BELOW_PROVISIONING | {"provisioning"},
-    "plant": _BELOW_PROVISIONING | {"provisioning", "handover"},
     "measure": _BELOW_PROVISIONING | {"provisioning", "handover"},
     "client": {"api", "shapes"},
     "describe": _BELOW_PROVISIONING | {"provisioning", "handover", "measure", "api"},
     "ncap": _BELOW_PROVISIONING
-    | {"provisioning", "handover", "plant", "measure", "node", "client", "api", "describe"}
+    | {"provisioning", "handover", "measure", "node", "client", "api", "describe"}
     | {"firmware_image"},
-    "check": _BELOW_PROVISIONING | {"provisioning"},
     "backup": {"station", "vault", "protocol", "teds"},
     "doctor": {"station", "links", "vault", "protocol", "teds"},
-    "demo": _BELOW_PROVISIONING | {"provisioning", "handover", "plant", "measure", "client"},
+    "demo": _BELOW_PROVISIONING | {"provisioning", "handover", "measure", "client"},
     "cli": _BELOW_PROVISIONING
-    | {"provisioning", "handover", "backup", "doctor", "demo", "node", "measure", "check", "ncap", "client", "api"}
-    | {"trace", "plant", "describe", "firmware_image"},
+    | {"provisioning", "handover", "backup", "doctor", "demo", "node", "measure", "ncap", "client", "api"}
+    | {"trace", "describe", "firmware_image"},
     "__main__": {"cli"},
 }
+ARROWS |= {room: set(ARROWS) - {"__main__"} for room in OPTIONAL}  # above all others, and not one above another
 # Too slow to load before they are needed: --help, --version and a pure decode must not wait for them.
 HEAVY = {"nfc", "ndef", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11"}
 HEAVY |= {"mcap", "cyclonedds", "paho", "starlette", "uvicorn", "websockets"}
@@ -91,7 +94,7 @@ def parsed(path: Path) -> ast.Module:
 
 def may_import(room: str) -> set[str]:
     files = set() if room in WITHOUT_FILES else {"files", "portable"}
-    return ARROWS[room] | files | {room, "errors", "sanitize", "lazy", "limits", "json_decoder", "__version__"}
+    return ARROWS[room] | files | {room, *_FOR_ALL, "__version__"}
 
 
 def test_arrows_between_rooms_point_one_way() -> None:
@@ -120,7 +123,9 @@ def file_of(name: str) -> Path | None:
 
 
 def test_the_rooms_are_those_of_the_page() -> None:
-    assert {room_of(path) for path in MODULES} - {"__init__"} == set(ARROWS)
+    there = {room_of(path) for path in MODULES} - {"__init__"}
+    assert there | set(OPTIONAL) == set(ARROWS)
+    assert {room for room in OPTIONAL if room in there} == set(rooms())
 
 
 def test_what_a_room_names_it_gives() -> None:
@@ -331,3 +336,43 @@ def test_measure_and_ncap_know_a_link_by_its_capabilities_alone() -> None:
 )
 def test_each_way_to_know_a_link_is_seen(code: str) -> None:
     assert list(places_that_know_a_link(ast.parse(code)))
+
+
+def test_no_room_of_the_core_imports_an_optional_room() -> None:
+    """Nor does it name a module of one: what a room adds, it registers (docs/extending.md)."""
+    dotted = re.compile(rf"teds_provision\.({'|'.join(OPTIONAL)})\b")
+    core = [path for path in MODULES if room_of(path) not in OPTIONAL]
+    imported = [
+        f"{name_of(path)}:{line} imports {name}"
+        for path in core
+        for name, line in imports(parsed(path))
+        if name.startswith("teds_provision.") and name.split(".")[1] in OPTIONAL
+    ]
+    late = [
+        f"{name_of(path)}:{node.lineno} names {node.value}"
+        for path in core
+        for node in ast.walk(parsed(path))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and dotted.match(node.value)
+    ]
+    assert not imported + late
+
+
+def test_what_a_room_registers_is_there_and_asked_for() -> None:
+    from teds_provision.cli.table import COMMANDS
+
+    for name, room in rooms().items():
+        for row in (row for rows in room.sections.values() for row in rows.values()):
+            assert load(name, f"{row.module}:{row.attribute}")
+        for place in (*room.extends.values(), *room.hooks.values()):
+            assert load(name, place), place
+        assert set(room.extends) | set(room.helps) <= set(COMMANDS)
+        assert room.groups <= set(COMMANDS)
+    asked = {
+        node.args[0].value
+        for path in MODULES
+        if room_of(path) not in OPTIONAL
+        for node in ast.walk(parsed(path))
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == Hook.__name__
+        if isinstance(node.args[0], ast.Constant)
+    }
+    assert {hook for room in rooms().values() for hook in room.hooks} <= asked

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.station.store import NodeRecord
 from tests.bench import make_station
 from tests.cli.shell import clean_environment
 
@@ -94,6 +95,24 @@ def test_the_command_the_link_and_the_check_are_there(copy: Path, tmp_path: Path
     assert "serial-lines" in run(copy, *program, "doctor").stdout
 
 
+def test_the_optional_room_adds_what_it_registers(copy: Path, tmp_path: Path) -> None:
+    with make_station(tmp_path / "home") as station:
+        station.nodes.put(NodeRecord(bytes(10), profile="load-cell"))
+    program = ("-m", "teds_provision", "--home", tmp_path / "home", "--json")
+    assert json.loads(run(copy, *program, "stock").stdout) == {"types": {"load-cell": 1}}
+    assert json.loads(run(copy, *program, "nodes", "--count").stdout) == {"count": 1}
+    assert len(json.loads(run(copy, *program, "nodes").stdout)["nodes"]) == 1
+    assert "0 boards have no type." in run(copy, *program, "doctor").stdout
+    assert "Count the boards of each type." in run(copy, *program, "--help").stdout
+    shutil.move(copy / "teds_provision" / "stock", tmp_path / "stock")  # the same tree without it
+    try:
+        assert json.loads(run(copy, *program, "nodes", "--count").stdout)["error"]["code"] == "usage"
+        assert "stock" not in run(copy, *program, "--help").stdout
+        assert "boards have no type" not in run(copy, *program, "doctor").stdout
+    finally:
+        shutil.move(tmp_path / "stock", copy / "teds_provision" / "stock")
+
+
 def test_the_sink_the_source_and_the_class_work(copy: Path, tmp_path: Path) -> None:
     code = f"""
 from teds_provision.measure.sinks import open_sink
@@ -121,6 +140,7 @@ from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.station.store import KeptMeasurement
+from teds_provision.station.store import NodeRecord
 from tests.bench import make_station
 from tests.measure.hall import provisioned
 

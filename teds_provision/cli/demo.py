@@ -20,63 +20,29 @@ Next, with your own node (or a virtual one: node create, node run):
   teds-provision provision    waits for a tap, then does every step; run it again to continue
   teds-provision measure      records and publishes calibrated values
   teds-provision doctor       finds problems with reader, bus or store, and how to fix them
-  teds-provision demo --page  runs a base station with its web page
-  teds-provision demo --plant runs three stations that share keys through a registry"""
+  teds-provision demo --page  runs a base station with its web page"""
 
 
-@command(
-    "teds-provision demo", "teds-provision demo --page", "teds-provision demo --plant", "teds-provision demo --line"
-)
+@command("teds-provision demo", "teds-provision demo --page")
 @click.option("--page", is_flag=True, help="Run a base station with its page and virtual nodes until Ctrl-C.")
-@click.option("--plant", is_flag=True, help="Three stations and a registry: shared keys, and a stolen station.")
-@click.option("--line", is_flag=True, help="Play a line: an order, an office that signs, proof of every board.")
 @click.option("--http", metavar="HOST:PORT", help="With --page: the address to serve on (default: a free local port).")
 @pass_app
-def demo(app: App, *, page: bool, plant: bool, line: bool, http: str | None) -> None:
+def demo(app: App, *, page: bool, http: str | None, more: str = "") -> None:
     """Two base stations and two virtual nodes: provision over NFC and CAN, hand over, measure, move an actuator.
 
     Uses temporary homes and vaults, communicates on this machine only, and leaves nothing behind.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: a folder and a process are to be taken away
-    if page + plant + line > 1:
-        raise UsageError("Give one of --page, --plant and --line.")
     if page:
         _page(app, http)
         return
     if http is not None:
         raise UsageError("--http requires --page.", hint="Run: teds-provision demo --page --http 127.0.0.1:8351")
-    if plant:
-        _plant(app)
-        return
-    if line:
-        _line(app)
-        return
     done = demo_room.story.run_demo(reporter_for(app), lambda text: app.note(f"\n{text}"))
     steps = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
     app.emit(
         {"uuid": done.uuid.hex(), "steps": steps, "verdict": done.verdict},
-        f"\nDone: {len(steps)} steps, the sensor is {done.verdict} and in the hands of station crane.\n{NEXT}",
-    )
-
-
-def _line(app: App) -> None:
-    done = demo_room.line.run_line(reporter_for(app), lambda text: app.note(f"\n{text}"))
-    rows = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
-    words = ", ".join(f"{count} {word}" for word, count in sorted(done.evidence.items()))
-    app.emit(
-        {"steps": rows, "passed": done.passed, "evidence": done.evidence, "refused": list(done.refused)},
-        f"\nDone: {done.passed} boards passed, refused: {', '.join(done.refused)}; evidence that holds: {words}.",
-    )
-
-
-def _plant(app: App) -> None:
-    done = demo_room.plant.run_plant_demo(reporter_for(app), lambda text: app.note(f"\n{text}"))
-    steps = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
-    result = {"steps": steps, "by": done.by, "before": done.before, "after": done.after, "seconds": done.seconds}
-    app.emit(
-        result,
-        f"\nDone in {done.seconds:.0f} s: the board was {done.before} at south; with what the stolen station signed, it"
-        f" is {done.after}.\nYour own plant: docs/plant.md",
+        f"\nDone: {len(steps)} steps, the sensor is {done.verdict} and in the hands of station crane.\n{NEXT}{more}",
     )
 
 

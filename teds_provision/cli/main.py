@@ -33,10 +33,11 @@ if TYPE_CHECKING:
     import pathlib
     from pathlib import Path
 
-    from teds_provision.cli import file_kinds, shell_completion, start
+    from teds_provision.cli import extending, file_kinds, shell_completion, start
 else:
     shell_completion, start = late("teds_provision.cli.shell_completion"), late("teds_provision.cli.start")
     file_kinds = late("teds_provision.cli.file_kinds")  # for errors about a file
+    extending = late("teds_provision.cli.extending")  # once a command is used
     difflib, json, pathlib = late("difflib"), late("json"), late("pathlib")  # --help needs none of them
 
 ENVIRONMENT_PREFIX = "TEDS_PROVISION"
@@ -67,9 +68,10 @@ class LazyGroup(click.Group):
         entry = COMMANDS.get(cmd_name)
         if entry is None:
             return None
-        module = importlib.import_module(f"teds_provision.cli.{entry.module}")
+        module = importlib.import_module(f"teds_provision.{entry.room}.{entry.module}")
         command = getattr(module, entry.attribute)
         assert isinstance(command, click.Command)
+        extending.extend(cmd_name, command)
         _read_by_name(command, cmd_name)
         for teach in self.teachers:
             teach(command)

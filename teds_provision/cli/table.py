@@ -1,22 +1,18 @@
 """Every command of the tool: its module and its line in ``--help``.
 
 The group's help is drawn from this table alone, so that ``--help`` imports no command and none of their libraries.
+Commands of optional rooms come from what those register.
 """
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Final
 
+from teds_provision.optional_rooms import CommandRow as Entry
+from teds_provision.optional_rooms import rooms
 
-class Entry(NamedTuple):
-    """Place of a command (module under ``teds_provision.cli``, attribute) and its one-line help."""
-
-    module: str
-    attribute: str
-    help: str
-
-
-SECTIONS: Final[dict[str, dict[str, Entry]]] = {
+_LAST: Final = "Try it out"
+_CORE: Final[dict[str, dict[str, Entry]]] = {
     "Start here": {
         "init": Entry("station.init", "init", "Create this station's identity and CA key, or show them."),
         "provision": Entry(
@@ -85,26 +81,33 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "unlock": Entry("station.vault", "unlock", "Keep the vault unlocked in memory for a while."),
         "lock": Entry("station.vault", "lock", "Lock the vault again."),
     },
-    "The plant": {
-        "registry": Entry(
-            "plant.registry", "registry", "Connect an owner's stations, so that each knows what the others did."
-        ),
-    },
-    "The line": {
-        "job": Entry("plant.line", "job", "Define what a line may build, and follow its progress."),
-        "signer": Entry("plant.line", "signer", "Sign what a line builds, as the office of a job."),
-        "evidence": Entry("plant.line", "evidence", "List, export and verify evidence of every board."),
-    },
     "Try it out": {
         "demo": Entry("demo", "demo", "Run two stations and a virtual node on this machine, start to finish."),
-        "node": Entry("node.virtual_nodes", "node", "Create and run virtual nodes; check a real board's firmware."),
+        "node": Entry("node.virtual_nodes", "node", "Create and run virtual nodes."),
     },
 }
+
+
+def _sections() -> dict[str, dict[str, Entry]]:
+    """Return the sections of the core, and before its last one those of the rooms that are present."""
+    found = {title: dict(rows) for title, rows in _CORE.items()}
+    last = found.pop(_LAST)
+    for name, room in rooms().items():
+        for title, rows in room.sections.items():
+            found.setdefault(title, {}).update({command: row._replace(room=name) for command, row in rows.items()})
+    found[_LAST] = last
+    for room in rooms().values():
+        for rows in found.values():
+            rows.update({name: rows[name]._replace(help=text) for name, text in room.helps.items() if name in rows})
+    return found
+
+
+SECTIONS: Final = _sections()
 """Sections of ``--help``; a name of two words is a line of help only: its first word is below as a command."""
 
 COMMANDS: Final = {name: entry for section in SECTIONS.values() for name, entry in section.items() if " " not in name}
 GROUPS: Final = frozenset(
     {"draft", "vault", "group", "trace", "trust", "config", "profile", "whitelist", "handover", "node", "ncap", "names"}
-    | {"calibrate", "evidence", "job", "record", "registry", "signer"}
-)
+    | {"calibrate", "record"}
+).union(*(room.groups for room in rooms().values()))
 """The commands that have commands of their own."""

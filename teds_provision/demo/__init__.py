@@ -5,6 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.demo import cluster, line, page, plant, story
+    from teds_provision.demo import page, story
 else:
     __getattr__ = lazy(__name__)

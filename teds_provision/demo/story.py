@@ -265,7 +265,7 @@ def _run(demo: Demo) -> DemoResult:
     demo.say("Two base stations with their own keys, and a virtual sensor on a reader, in a process of its own.")
     first, second = new_station(demo, "bench"), new_station(demo, "crane")
     with demo.steps.step("start node") as step:
-        demo.uuid = demo.stack.enter_context(_node(demo, "node", PROFILE, "--nfc", demo.nfc))
+        demo.uuid = demo.stack.enter_context(virtual_node(demo, "node", PROFILE, "--nfc", demo.nfc))
         step.detail = f"{demo.uuid.hex()} on {demo.nfc} and {demo.can}"
     demo.say("Tap: station bench provisions the sensor over NFC.")
     done = provision_over(demo, first, "nfc", demo.uuid, BuildOrder(PROFILE))
@@ -284,7 +284,7 @@ def _run(demo: Demo) -> DemoResult:
 def _measure(demo: Demo, station: Station) -> None:
     files = calibrations(demo.folder)
     with demo.steps.step("start node") as step:
-        gripper = demo.stack.enter_context(_node(demo, "gripper", GRIPPER))
+        gripper = demo.stack.enter_context(virtual_node(demo, "gripper", GRIPPER))
         step.detail = f"{gripper.hex()}, a gripper on {demo.can}"
     provision_gripper(demo, station, gripper, files[GRIPPER])
     calibrate_sensor(demo, station, files["angle"])
@@ -316,7 +316,7 @@ def _over_can(demo: Demo, station: Station) -> None:
 
 
 @contextmanager
-def _node(demo: Demo, name: str, profile: str, *links: str) -> Iterator[bytes]:
+def virtual_node(demo: Demo, name: str, profile: str, *links: str) -> Iterator[bytes]:
     """Run a virtual transducer in a process while the context lasts; yield its UUID."""
     folder = make_node(demo, name, profile)
     with run_node(folder, *links, "--can", demo.can, "--source", "sine:4") as uuid:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from teds_provision.errors import TedsProvisionError
+from teds_provision.optional_rooms import Hook
 from teds_provision.station.store.row_sample import RowSample
 
 Result = Literal["ok", "warning", "failed", "skipped"]
@@ -60,7 +61,9 @@ class System:
 
 Look = Callable[[System], Iterator[Finding]]
 CHECKS: Final[dict[str, tuple[Room, Look]]] = {}
-_MODULES: Final = ("machine", "links", "station", "fleet", "plant")
+_MODULES: Final = ("machine", "links", "station", "fleet")
+_OF_ROOMS: Final[Hook[Look]] = Hook("doctor.checks")
+"""Checks of optional rooms, each registered with :func:`check`."""
 
 
 def check(name: str, room: Room) -> Callable[[Look], Look]:
@@ -77,6 +80,7 @@ def examine(system: System) -> Iterator[tuple[Room, Finding]]:
     """Run every check in turn; one that fails in an unforeseen way is itself a finding, and the next one runs."""
     for module in _MODULES:
         import_module(f"teds_provision.doctor.{module}")  # fills the registry
+    _OF_ROOMS.parts()  # as well
     for name, (room, look) in CHECKS.items():
         try:
             for finding in look(system):

@@ -37,7 +37,7 @@ from teds_provision.ncap.nodes.provisioning import AutoProvisioner, Provisioning
 from teds_provision.ncap.nodes.sheets import Sheets
 from teds_provision.ncap.nodes.updates import Updates
 from teds_provision.ncap.nodes.virtual import Virtuals
-from teds_provision.ncap.plant import PlantWatch
+from teds_provision.ncap.service_part import KINDS
 from teds_provision.ncap.settings import Detection, Settings, own_source
 from teds_provision.ncap.sinks import DaemonSinks
 from teds_provision.ncap.waits import USUAL, Waits
@@ -123,7 +123,9 @@ class Daemon:
             held=self.leases.held,
         )
         self.virtuals = Virtuals(station, self.live)
-        self.plant = PlantWatch(station, self.live, self._plant_changed)
+        kinds = KINDS.parts()
+        self.parts = {kind.name: kind.make(station, self.live, self._store_changed) for kind in kinds}
+        self._views = {kind.view: self.parts[kind.name].is_shown for kind in kinds}
         self.adopting = AutoProvisioner(
             station, self.directory, self.live, self.virtuals, lambda: self._adopts, signs=settings.yes
         )
@@ -159,8 +161,8 @@ class Daemon:
         self.measurements.start()
         if self.settings.unverified:
             self.measurements.unverified(rate=self.settings.rate)
-        if self.settings.registry:
-            self.plant.start()
+        for name in self.settings.parts:
+            self.parts[name].start()
         if self.settings.measure is not None:
             self.measurements.match(self.settings.measure, rate=self.settings.rate, frozen=self.settings.frozen)
         self.updates.start()
@@ -173,7 +175,8 @@ class Daemon:
         """Actuators safe first, then claims released and files closed, then links, then the virtual nodes."""
         self._stop.set()
         self.updates.stop()
-        self.plant.stop()
+        for part in self.parts.values():
+            part.stop()
         self.leases.end()
         self.measurements.stop()
         for watch in self.watches:
@@ -205,8 +208,8 @@ class Daemon:
             with contextlib.suppress(asyncio.CancelledError):
                 await fan
 
-    def _plant_changed(self) -> None:
-        """Pages, keys or a roster came: pins, bans and verdicts may be others."""
+    def _store_changed(self) -> None:
+        """Look at the store again: a part of an optional room changed pins, bans or keys."""
         self.directory.refresh()
         self.live.event("store", state="changed")
 
@@ -329,7 +332,7 @@ class Daemon:
             "foxglove": self.foxglove.url if self.foxglove is not None else None,
             "clock_error": self.measurements.clock_error(),
             "budget": self.measurements.budget(),
-            "plant": self.station.plant.joined is not None,
+            "plant": "plant" in self._views and self._views["plant"](),
             "vault": {"state": "open" if self._vault_problem is None else "locked", "problem": self._vault_problem},
         }
 

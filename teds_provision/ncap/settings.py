@@ -34,8 +34,8 @@ class Settings:
     recording of each measurement. ``actuators``: set points may come by topics of ROS. ``measure`` selects nodes to
     measure as they come, at ``rate`` in Hz at most; ``frozen``: only those selected at the start. ``dead_man`` in ms is
     for all actuators whose measurement has no other. ``require_firmware``: only nodes whose firmware their type
-    accepts. ``registry``: the registry that was joined is followed. ``trace`` is an open one: every frame of every link
-    is written.
+    accepts. ``parts`` names parts of optional rooms that run beside it. ``trace`` is an open one: every frame of every
+    link is written.
     """
 
     places: tuple[str, ...] = ()
@@ -60,7 +60,7 @@ class Settings:
     rate: float | None = None
     frozen: bool = False
     require_firmware: bool = False
-    registry: bool = False
+    parts: frozenset[str] = frozenset()
     metrics: bool = False
     clause_12: bool = False
     trace: Trace | None = None

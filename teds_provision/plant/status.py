@@ -146,23 +146,29 @@ def resolve(station: Station, text: str) -> bytes:
     try:
         return station.nodes.resolve(text)
     except NotFoundError:
-        roster = station.plant.roster
-        if roster is None:
+        found = find_named(station, text)
+        if found is None:
             raise
-        name = text.strip()
-        digits = name.lower().removeprefix("0x")
-        found = [
-            node["uuid"]
-            for node in nodes(station, roster, name)
-            if (len(digits) >= SHORTEST and node["uuid"].startswith(digits)) or node["name"] == name
-        ]
-        if not found:
-            raise
+        return found
+
+
+def find_named(station: Station, text: str) -> bytes | None:
+    """Return the UUID that ``text`` means to the plant's stations, None if no node fits; UsageError if several do."""
+    roster = station.plant.roster
+    if roster is None:
+        return None
+    name = text.strip()
+    digits = name.lower().removeprefix("0x")
+    found = [
+        node["uuid"]
+        for node in nodes(station, roster, name)
+        if (len(digits) >= SHORTEST and node["uuid"].startswith(digits)) or node["name"] == name
+    ]
     if len(found) > 1:
         raise UsageError(
             f"{text!r} matches {len(found)} nodes: {', '.join(found[:5])}.", hint="Give more digits of the UUID."
         )
-    return bytes.fromhex(found[0])
+    return bytes.fromhex(found[0]) if found else None
 
 
 def names(station: Station, roster: Roster, uuids: Sequence[bytes]) -> dict[bytes, str]:

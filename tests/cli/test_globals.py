@@ -22,7 +22,9 @@ from tests.terminal import on_terminal
 from .shell import Outcome, call, clean_environment, python, spawn
 
 ONE = "8d4d9da65281f7000000"
-PRESENT = [name for name, entry in COMMANDS.items() if importlib.util.find_spec(f"teds_provision.cli.{entry.module}")]
+PRESENT = [
+    name for name, entry in COMMANDS.items() if importlib.util.find_spec(f"teds_provision.{entry.room}.{entry.module}")
+]
 HEAVY = ("nfc", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11", "sqlite3")
 
 

@@ -6,6 +6,8 @@ import os
 
 import pytest
 
+from teds_provision.optional_rooms import rooms
+
 from .shell import python
 
 OURS = {
@@ -21,9 +23,11 @@ OURS = {
     "teds_provision.errors",
     "teds_provision.sanitize",
     "teds_provision.lazy",
+    "teds_provision.optional_rooms",
     "teds_provision.protocol",
     "teds_provision.station",
     "teds_provision.vault",
+    *(f"teds_provision.{name}" for room in rooms() for name in (room, f"{room}.room")),
 }
 NEEDLESS = {"bz2", "difflib", "ipaddress", "json", "lzma", "pathlib", "shlex", "shutil", "tomllib", "urllib.parse"}
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from teds_provision.demo.cluster import Cluster
+from teds_provision.plant.demo.cluster import Cluster
 from tests.plant.postgres import Database, own_cluster
 
 

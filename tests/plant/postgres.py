@@ -14,7 +14,7 @@ from typing import Any
 import psycopg
 import pytest
 
-from teds_provision.demo.cluster import Cluster, programs, running
+from teds_provision.plant.demo.cluster import Cluster, programs, running
 from teds_provision.plant.schema import member_sql, registry_sql, role_of
 from teds_provision.plant.scram import password, verifier
 from tests.places import free_tcp_port

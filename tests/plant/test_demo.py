@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.demo import cluster, plant
+from teds_provision.plant.demo import cluster, plant
 from teds_provision.provisioning.progress import SilentReporter
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.demo.cluster import Cluster
 from teds_provision.errors import RegistryError, TedsProvisionError
+from teds_provision.plant.demo.cluster import Cluster
 from teds_provision.plant.jobs import find_job, take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import answer_all

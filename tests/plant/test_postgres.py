@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from teds_provision.demo.cluster import Cluster
 from teds_provision.errors import ForkError, NotMemberError, PolicyError, RegistryError, StoreError, UsageError
+from teds_provision.plant.demo.cluster import Cluster
 from teds_provision.plant.postgres import Registry, parameters
 from teds_provision.plant.schema import close_sql
 from tests.pace import PATIENCE
@@ -186,7 +186,7 @@ def test_the_environment_takes_nothing_back(login: Login, monkeypatch: pytest.Mo
 
 
 def test_another_servers_certificate_is_refused(login: Login, tmp_path: Any) -> None:
-    from teds_provision.demo.cluster import _tls
+    from teds_provision.plant.demo.cluster import _tls
 
     stranger = tmp_path / "root.crt"
     stranger.write_bytes(_tls()[1])

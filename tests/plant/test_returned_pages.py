@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from teds_provision import plant as plant_room
-from teds_provision.demo.cluster import Cluster
 from teds_provision.errors import StoreError
+from teds_provision.plant.demo.cluster import Cluster
 from teds_provision.plant.returned import FORGED
 from teds_provision.plant.schema import close_sql, member_sql, mend_sql, registry_sql
 from teds_provision.plant.scram import verifier

@@ -12,7 +12,7 @@ import psycopg
 import pytest
 from psycopg import errors
 
-from teds_provision.demo.cluster import Cluster
+from teds_provision.plant.demo.cluster import Cluster
 from teds_provision.plant.schema import close_sql, member_sql, registry_sql
 from teds_provision.plant.scram import verifier
 from tests.pace import PATIENCE

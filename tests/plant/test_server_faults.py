@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from teds_provision import plant as plant_room
-from teds_provision.demo.cluster import Cluster
 from teds_provision.errors import RegistryError
+from teds_provision.plant.demo.cluster import Cluster
 from teds_provision.plant.postgres import PostgresTransport
 from teds_provision.plant.sync import sync
 from teds_provision.protocol.plant.roster import Share

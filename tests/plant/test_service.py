@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from teds_provision.demo.cluster import Cluster
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.plant import EVERY, PlantWatch
 from teds_provision.ncap.web.metrics import text
 from teds_provision.plant import connecting, membership
+from teds_provision.plant.demo.cluster import Cluster
 from teds_provision.plant.schema import member_sql
+from teds_provision.plant.service import EVERY, PlantWatch
 from teds_provision.plant.sync import sync
 from teds_provision.protocol.plant.document import open_request
 from teds_provision.station.station import Station
@@ -79,7 +79,7 @@ def test_what_another_station_pushes_arrives_without_waiting_for_the_minute(offi
         assert [station["name"] for station in status["stations"]] == ["north", "south"]
         assert (status["state"], status["unsent"]) == ("synced", 0)
         lines = text({"version": "1", "station": {"name": "south"}, "links": [], "measurements": [], "sinks": [],
-                      "budget": {"used": 0}, "clients": 0}, status)  # fmt: skip
+                      "budget": {"used": 0}, "clients": 0}, [watch])  # fmt: skip
         assert "teds_registry_alarms 0\n" in lines
         assert "teds_registry_age_seconds " in lines
     finally:

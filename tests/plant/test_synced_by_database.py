@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from teds_provision import plant as plant_room
-from teds_provision.demo.cluster import Cluster
 from teds_provision.errors import ForkError, NotAuthenticError, RegistryError
+from teds_provision.plant.demo.cluster import Cluster
 from teds_provision.plant.postgres import PostgresTransport, Registry, parameters
 from teds_provision.plant.schema import member_sql, mend_sql, registry_sql
 from teds_provision.plant.scram import verifier

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -9,11 +10,15 @@ import subprocess
 import sys
 import tarfile
 import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from teds_provision.optional_rooms import OPTIONAL
+from tests.bench import make_station
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -132,6 +137,35 @@ def test_two_builds_of_a_commit_are_equal_and_the_sdist_is_whole(tmp_path: Path)
     [source] = (tmp_path / "sdist").iterdir()
     subprocess.run(["make", "quick"], cwd=source, check=True)
     shutil.rmtree(source)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("asked", ["none", "check"])
+def test_a_wheel_without_optional_rooms_works(tmp_path: Path, asked: str) -> None:
+    subprocess.run(["git", "clone", "--quiet", str(ROOT), str(tmp_path / "copy")], check=True)
+    subprocess.run(["make", ".venv-release/.ready"], cwd=tmp_path / "copy", check=True, capture_output=True)
+    build = [".venv-release/bin/python", "-m", "build", "--no-isolation", "--outdir", str(tmp_path / "dist")]
+    chosen = os.environ | {"TEDS_PROVISION_WHEEL_ROOMS": asked}
+    subprocess.run(build, cwd=tmp_path / "copy", env=chosen, check=True, capture_output=True)
+    [wheel] = (tmp_path / "dist").glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path / "wheel")
+    package = tmp_path / "wheel" / "teds_provision"
+    assert {room for room in OPTIONAL if (package / room).exists()} == {asked} - {"none"}
+    program = [sys.executable, "-m", "teds_provision", "--home", str(tmp_path / "home"), "--json"]
+    make_station(tmp_path / "home").close()
+
+    def run(*words: str) -> subprocess.CompletedProcess[str]:
+        here = os.environ | {"PYTHONPATH": str(tmp_path / "wheel")}
+        return subprocess.run([*program, *words], cwd=tmp_path, env=here, capture_output=True, text=True, check=False)
+
+    assert "registry" not in run("--help").stdout
+    assert run("node", "check", "--help").returncode == (0 if asked == "check" else 2)
+    assert json.loads(run("nodes").stdout) == {"nodes": []}
+    done = run("doctor")
+    assert not any(line["result"] == "failed" and line["name"] == "store" for line in json.loads(done.stdout)["checks"])
+    shutil.rmtree(tmp_path / "copy")
 
 
 @pytest.mark.soak

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import plant, provisioning
+from teds_provision import provisioning
 from teds_provision import teds as teds_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
@@ -34,9 +34,7 @@ from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
     from teds_provision.cli import terminal_operator
-    from teds_provision.plant.sign_requests import OfficeOrder
     from teds_provision.provisioning.write import WriteResult
-    from teds_provision.station.station import Station
     from teds_provision.teds.certificate import CertificateReference
 else:  # loads the steps
     terminal_operator = late("teds_provision.cli.terminal_operator")
@@ -52,8 +50,9 @@ def order_options(function: Function) -> Function:
     def with_order(*args: Any, profile: Any, calibration: Any, no_calibration: bool, name: Any, **rest: Any) -> Any:
         accepted, retype = rest.pop("accept_calibration"), rest.pop("retype")
         item, trusted, due = rest.pop("item"), rest.pop("trust_dcc"), rest.pop("due")
-        elsewhere = rest.get("batch") is not None or rest.get("job") is not None  # where calibrations are named
-        if calibration is None and (item is not None or due is not None) and not elsewhere:
+        line = rest.get("line")
+        elsewhere = rest.get("batch") is not None or (line is not None and line.names_boards)
+        if calibration is None and (item is not None or due is not None) and not elsewhere:  # named there
             raise UsageError("--item and --due belong to a calibration.", hint="Add --calibration FILE.")
         channel, file = calibration or (None, None)
         order = provisioning.build.BuildOrder(
@@ -186,7 +185,6 @@ def read_file(path: Path) -> bytes:
 @command(
     "teds-provision sign 8d4d",
     "teds-provision sign angle.json --output signed.json",
-    "teds-provision sign 8d4d --by office --job 0b5f --output request.jws",
 )
 @click.argument("what", metavar="UUID|IMAGE")
 @click.option(
@@ -194,18 +192,7 @@ def read_file(path: Path) -> bytes:
     "-o",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="IMAGE",
-    help="Write the signed image to this file; with --by, the request.",
-)
-@click.option("--by", metavar="OFFICE", help="Have this station of the plant sign; the node must be reachable.")
-@click.option("--job", metavar="ID", help="With --by: the job that the board belongs to.")
-@click.option(
-    "--calibration", type=FileToRead(), metavar="FILE", help="With --by: the calibration that it was built with."
-)
-@click.option(
-    "--files",
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="DIR",
-    help="With --by: transfer folder to the office, instead of the registry.",
+    help="Write the signed image to this file.",
 )
 @click.option("--read-node", is_flag=True, help="Use the node's own epoch, sequence and TEDS instead of the store's.")
 @click.option(
@@ -219,10 +206,6 @@ def sign(
     app: App,
     what: str,
     output: Path | None,
-    by: str | None,
-    job: str | None,
-    calibration: Path | None,
-    files: Path | None,
     read_node: bool,
     accept_calibration: str | None,
     yes: bool,
@@ -235,9 +218,6 @@ def sign(
     """
     del yes  # a signature uses up a sequence number, nothing else
     station = app.station()
-    if by is not None:
-        _sign_by(app, station, plant.sign_requests.OfficeOrder(what, by, job, calibration, files, output), links)
-        return
     done = provisioning.commands.sign_at(
         station,
         links,
@@ -264,22 +244,6 @@ def sign(
     }
     again = " (existing signature reused)" if done.signed.reused else ""
     app.emit(result, f"{_changes(done.changes)}\nSigned {uuid.hex()}, sequence {done.signed.sequence}{again}.")
-
-
-def _sign_by(app: App, station: Station, order: OfficeOrder, links: LinkSettings) -> None:
-    """Have an office sign; with an output the request is written, and signed when its answer comes as a file."""
-    try:
-        signed = plant.sign_requests.sign_by_office(station, links, order, reporter_for(app))
-    except plant.sign_requests.OfficeSilentError as waits:
-        if order.output is None:
-            raise
-        app.emit({"request": str(order.output)}, f"Wrote the request to {order.output}. {waits.hint}")
-        return
-    uuid = signed.image.uuid.hex()
-    app.emit(
-        {"uuid": uuid, "sequence": signed.sequence, "signed_by": order.by, "reused": signed.reused},
-        f"{order.by} signed {uuid}, sequence {signed.sequence}. Write it: teds-provision write {uuid}",
-    )
 
 
 def _changes(changes: tuple[str, ...]) -> str:

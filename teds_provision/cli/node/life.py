@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import handover, plant, provisioning
+from teds_provision import handover, provisioning
 from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.node.node_names import resolve
 from teds_provision.cli.options import command, dry_run_option, link_options, links_given, yes_option
 from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import FrozenError, LinkError, PolicyError
@@ -37,7 +38,7 @@ def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run:
     if lift == (why is not None):
         raise click.UsageError("Use --why TEXT to revoke, or --lift alone to lift a ban.")
     station = app.station()
-    octets = plant.status.resolve(station, uuid)
+    octets = resolve(station, uuid)
     if lift:
         _lift(app, station, octets, yes=yes, dry_run=dry_run)
         return

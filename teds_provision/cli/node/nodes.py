@@ -5,15 +5,15 @@ from __future__ import annotations
 import csv
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import click
 
-from teds_provision import plant, provisioning, teds
+from teds_provision import provisioning, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import WholeNumber, command
 from teds_provision.cli.rendering import (
@@ -26,7 +26,8 @@ from teds_provision.cli.rendering import (
     shown,
 )
 from teds_provision.errors import BadDataError, NotFoundError, UsageError
-from teds_provision.provisioning.inventory import PAGE, STATES, inventory, search
+from teds_provision.optional_rooms import Hook
+from teds_provision.provisioning.inventory import STATES, inventory, search
 from teds_provision.sanitize import by_name
 from teds_provision.station.label import label_of, write_label
 
@@ -35,6 +36,18 @@ if TYPE_CHECKING:
 
     from teds_provision.station.station import Station
 
+
+class NodeView(Protocol):
+    """What an optional room knows about nodes."""
+
+    def named(self, station: Station, text: str) -> list[bytes]:
+        """Return the one node that the room knows by this name, empty if none; raises NotFoundError, UsageError."""
+
+    def described(self, station: Station, nodes: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+        """Yield each node with what the room adds to it."""
+
+
+NODE_VIEWS: Final[Hook[NodeView]] = Hook("cli.node.views")
 _FIRST = 200  # the rows that decide how wide each column is
 _NAME_COLUMNS = 24
 _GAP = "  "
@@ -56,9 +69,6 @@ _GAP = "  "
     "--fits", metavar="EXPR", help='Check datasheets: "angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz".'
 )
 @click.option("--format", "form", type=click.Choice(["table", "csv", "json"]), help="Default: table.")
-@click.option(
-    "--plant", "of_plant", is_flag=True, help="Show what the plant's stations report: holders, firmware, conflicts."
-)
 @pass_app
 def nodes(
     app: App,
@@ -70,7 +80,6 @@ def nodes(
     since: str | None,
     fits: str | None,
     form: str | None,
-    of_plant: bool,
 ) -> None:
     """List every node that this station has met, whitelisted or received, or show one in detail.
 
@@ -78,15 +87,12 @@ def nodes(
     are not contacted.
     """
     station = app.station()
-    if of_plant:
-        _show_plant(app, station, text, as_json=app.json or form == "json")
-        return
     day = (datetime.now(UTC) + timedelta(days=due)).strftime("%Y-%m-%d") if due is not None else None
     seen = moment(since) if since is not None else None
     try:
         found = search(station, text, state=state, profile=profile, group=group, due=day, since=seen)
     except NotFoundError:
-        found = _named_in_plant(station, text) if not any((state, profile, group, due, since)) else []
+        found = [] if text is None or any((state, profile, group, due, since)) else _named_elsewhere(station, text)
         if not found:
             raise
     if fits is not None:
@@ -95,7 +101,7 @@ def nodes(
     if not app.json and form in (None, "table"):  # what scripts read stays in the order of UUIDs
         names = {record.uuid: record.name for record in station.nodes.all()}
         found = sorted(found, key=lambda uuid: by_name(names.get(uuid), uuid.hex()))
-    described = _with_plant(station, inventory(station, found))
+    described = _with_views(station, inventory(station, found))
     if app.json or form == "json":
         print_json_list("nodes", described)
     elif form == "csv":
@@ -114,73 +120,16 @@ def nodes(
         _table(described)
 
 
-def _named_in_plant(station: Station, text: str | None) -> list[bytes]:
-    """Return the known node that only another station of the plant calls ``text``; empty if there is none."""
-    if text is None or station.plant.joined is None:
-        return []
-    uuid = plant.status.resolve(station, text)
-    if not station.overview.is_known(uuid):
-        raise NotFoundError(f"This station has not met node {uuid.hex()}.", hint=f"See: nodes --plant {uuid.hex()}")
-    return [uuid]
+def _named_elsewhere(station: Station, text: str) -> list[bytes]:
+    """Return the known node that only an optional room knows by this name; empty if there is none."""
+    return next(filter(None, (view.named(station, text) for view in NODE_VIEWS.parts())), [])
 
 
-def _with_plant(station: Station, described: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Add to each node its conflicts in the plant, and the plant's name if this station gave it none.
-
-    Leave the nodes unchanged if the station joined no registry.
-    """
-    roster = station.plant.roster
-    if roster is None:
-        yield from described
-        return
-    found: dict[str, list[dict[str, str]]] = {}
-    for uuid, name, why in station.plant.claims.conflicts():
-        found.setdefault(uuid.hex(), []).append({"name": name, "why": why})
-    rest = iter(described)
-    while page := list(islice(rest, PAGE)):
-        names = plant.status.names(station, roster, [bytes.fromhex(node["uuid"]) for node in page if not node["name"]])
-        for node in page:
-            named = node["name"] or names.get(bytes.fromhex(node["uuid"]))
-            yield {**node, "name": named, "conflicts": found.get(node["uuid"], [])}
-
-
-def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) -> None:
-    """Show the stations' claims about nodes, including those that this one never met."""
-    described = plant.status.nodes(station, plant.apply_pages.require_roster(station), text)
-    if as_json:
-        print_json_list("nodes", described)
-        return
-    for node in described:
-        says = node["says"]
-        holders = ", ".join(name for names in says["holders"].values() for name in names)
-        written = f", datasheet {says['sequence']} by {says['written_by']}" if says["written_by"] else ""
-        banned = f", revoked by {', '.join(says['revoked'])}" if says["revoked"] else ""
-        held = f"held by {holders} (epoch {says['epoch']})" if says["holders"] else "no holder"
-        sentence = f"{held}{written}, firmware {_reported(says['firmware'])}{banned}"
-        line = "  ".join(filter(None, (node["uuid"], shown(node["name"] or ""), sentence)))
-        app.lines([
-            line,
-            *(f"  {conflict['name']}: {shown(conflict['why'])}" for conflict in node["conflicts"]),
-            *(f"  also reported: firmware {_reported(seen)}" for seen in _others(says)),
-        ])  # fmt: skip
-
-
-def _reported(firmware: dict[str, Any] | None) -> str:
-    """Return the firmware that a station saw, by whom and when; None: no station reports any."""
-    if firmware is None:
-        return "not reported"
-    by = f"({firmware['by']}, {local_time(firmware['at'])})"
-    if firmware["version"] is None:
-        return shown(f"not reported {by}")
-    build = f"+{firmware['build']}" if firmware["build"] else ""
-    return shown(" ".join(filter(None, (firmware["text"], f"{firmware['version']}{build}", by))))
-
-
-def _others(says: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return earlier reports of other stations that differ from the newest."""
-    newest = says["firmware"] or {}
-    what = ("text", "version", "build", "image")
-    return [seen for seen in says["firmware_by"].values() if any(seen[name] != newest[name] for name in what)]
+def _with_views(station: Station, described: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Add to each node what optional rooms know about it."""
+    for view in NODE_VIEWS.parts():
+        described = view.described(station, described)
+    return described
 
 
 _FIELDS = (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import sys
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import click
 
-from teds_provision import firmware_image, plant, provisioning, station, teds
+from teds_provision import firmware_image, provisioning, station, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.node.build import calibration_json, order_options
 from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, options_given, yes_option
@@ -36,11 +35,22 @@ if TYPE_CHECKING:
     from teds_provision.provisioning.batch import BatchRun, ProvisionPlan, ProvisionRequest
     from teds_provision.provisioning.batch_sheet import BoardResult, SheetRow
     from teds_provision.provisioning.operator import Operator
-    from teds_provision.provisioning.provision import ProvisionResult
+    from teds_provision.provisioning.provision import ProductionLine, ProvisionResult
     from teds_provision.station.station import Station
     from teds_provision.station.summary import NodeSummary
 else:  # loads the steps
     terminal_operator = late("teds_provision.cli.terminal_operator")
+
+
+class LineChoice(Protocol):
+    """What an optional room makes of its options: what all boards of a run share."""
+
+    @property
+    def names_boards(self) -> bool:
+        """True if what each board gets, its calibration too, is named elsewhere than by options."""
+
+    def begin(self, app: App, base: Station, request: ProvisionRequest, links: LinkSettings) -> ProductionLine | None:
+        """Return the line that is asked for, or None; raises UsageError if options do not go together."""
 
 
 @command(
@@ -50,7 +60,6 @@ else:  # loads the steps
     "teds-provision provision --watch --yes --profile load-cell --name 'cell {n}'",
     "teds-provision provision --batch boards.csv --report boards.html",
     "teds-provision provision --all --via can --can socketcan:can0 --profile load-cell",
-    "teds-provision provision --job fifty.jws --watch --yes",
     "teds-provision provision --adopt --nfc usb",
 )
 @click.argument("uuid", required=False)
@@ -70,37 +79,6 @@ else:  # loads the steps
     help="Write a report of the batch, .csv or .html.",
 )
 @click.option("--all", "everything", is_flag=True, help="Provision every whitelisted node on the bus in parallel.")
-@click.option("--job", metavar="FILE|ID", help="Work on a job, which defines what may be built and how many.")
-@click.option(
-    "--calibrations",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="With --job: directory with a calibration per board: UUID.csv, .toml, .json or .xml.",
-)
-@click.option(
-    "--files",
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="DIR",
-    help="With --job: transfer folder to the office, instead of the registry.",
-)
-@click.option(
-    "--only", type=click.Choice(["verify"]), help="With --job: test boards that other stations built; writes nothing."
-)
-@click.option(
-    "--label-to",
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="DIR",
-    help="With --job or --evidence: write a label for each board that passed.",
-)
-@click.option(
-    "--label-format",
-    type=click.Choice(["svg", "png"]),
-    default="svg",
-    show_default=True,
-    help="Format of the labels.",
-)
-@click.option("--scan", is_flag=True, help="Read scanned labels from stdin: the next board must be the one scanned.")
-@click.option("--evidence", is_flag=True, help="Keep signed evidence of each board; see: evidence export.")
 @click.option("--firmware", type=FileToRead(), metavar="IMAGE", help="Install this firmware first; see: update.")
 @click.option(
     "--firmware-key", type=FileToRead(), metavar="PEM", help="Owner's key: check the image's signature first."
@@ -108,7 +86,7 @@ else:  # loads the steps
 @click.option(
     "--operator",
     metavar="NAME",
-    help="Name of the operator, for --job, --evidence or --report.",
+    help="Name of the operator, for --report.",
 )
 @yes_option
 @dry_run_option
@@ -123,20 +101,13 @@ def provision(
     batch: Path | None,
     report: Path | None,
     everything: bool,
-    job: str | None,
-    calibrations: Path | None,
-    files: Path | None,
-    only: str | None,
-    label_to: Path | None,
-    label_format: str,
-    scan: bool,
-    evidence: bool,
     firmware: Path | None,
     firmware_key: Path | None,
     operator: str | None,
     yes: bool,
     dry_run: bool,
     links: LinkSettings,
+    line: LineChoice | None = None,
 ) -> None:
     """Identify, whitelist, agree, build, sign, write and verify; continues where an earlier run stopped.
 
@@ -145,36 +116,17 @@ def provision(
     """
     adopt = adopt and bool(options_given("adopt"))  # a setting of that name is meant for ncap run
     order = replace(order, choose=app.chooses_item(), adopt=adopt)
-    if order.adopt and (batch is not None or job is not None):
-        raise UsageError("The sheet or job already defines what each board gets.", hint="Drop --adopt.")
+    if order.adopt and batch is not None:
+        raise UsageError("The sheet already defines what each board gets.", hint="Drop --adopt.")
     request = provisioning.batch.ProvisionRequest(uuid, order, watch, everything, batch, report, operator or "")
     several = everything or len(links.places) > 1
     reporter = BoardReporter(reporter_for(app, several=several))
     base = app.station()
-    line = None
-    if job is not None or evidence:
-        _check_line(request, job, only)
-        if label_to is not None:
-            station.label.require_label_packages(label_format)
-        found = plant.jobs.find_job(base, job) if job is not None else None
-        label = label_to / f"label.{label_format}" if label_to is not None else None
-        line = plant.line.LineRun(
-            base, found, order, calibrations, operator, only_verify=only is not None, label_to=label
-        )
-        if scan:
-            line.scans = plant.line.Scans(sys.stdin, app.note)
-            threading.Thread(target=line.scans.listen, name="scanner", daemon=True).start()
-        if found is not None and found.office not in (None, base.identity.fingerprint):
-            post = plant.sign_requests.transport_for(base, files)
-            line.office = office = plant.sign_requests.RemoteOffice(base, post, links.timeout)
-            app.closing(office.close)
-    elif any((calibrations, operator and report is None, files, only, label_to, scan)):
-        raise UsageError(
-            "--calibrations, --operator, --files, --only, --label-to and --scan require a job.",
-            hint="Add --job FILE, or --evidence.",
-        )
+    run = line.begin(app, base, request, links) if line is not None else None
+    if run is None and operator and report is None:
+        raise UsageError("--operator requires --report.", hint="Add --report FILE.")
     if firmware is not None or firmware_key is not None:
-        if firmware is None or dry_run or request.several or line is not None:
+        if firmware is None or dry_run or request.several or run is not None:
             raise UsageError(
                 "--firmware installs an image on one board; --firmware-key goes with it.",
                 hint="Many boards: whitelist add, agree, update --match EXPR IMAGE, provision. Plan: update --dry-run.",
@@ -182,7 +134,7 @@ def provision(
         image = firmware_image.load_firmware_image(firmware, firmware_key)
         links = replace(links, via_chosen=True)  # as what follows: the board is tapped, unless a bus is named
         request = replace(request, node=_with_firmware(app, base, links, uuid, image, reporter, yes=yes))
-    boards = provisioning.batch.BatchRun(base, links, request, reporter, line=line)
+    boards = provisioning.batch.BatchRun(base, links, request, reporter, line=run)
     for warning in boards.warnings:
         app.warn(warning)
     if dry_run and everything:
@@ -194,7 +146,7 @@ def provision(
         begun = None if several else reporter  # with several readers one board may be begun while another one ends
         with screen_for(app, boards, begun) as screen:
             person = terminal_operator.TerminalOperator(app, yes=yes, strangers=not everything, several=True)
-            _many(app, boards, person, screen, totals=everything or batch is not None or job is not None)
+            _many(app, boards, person, screen, totals=everything or batch is not None or boards.of_a_job)
     else:
         _one(app, boards, terminal_operator.TerminalOperator(app, yes=yes))
 
@@ -225,19 +177,6 @@ def _with_firmware(
             if done.error is not None:
                 raise done.error
     return uuid.hex()
-
-
-def _check_line(request: ProvisionRequest, job: str | None, only: str | None) -> None:
-    """Raise UsageError if a job is named beside an option that the job determines."""
-    order = request.order
-    if only is not None and job is None:
-        raise UsageError("--only verify requires --job.", hint="Add --job FILE.")
-    if request.sheet is not None:
-        raise UsageError("--batch cannot be combined with --job or --evidence.", hint="Drop --batch.")
-    if job is not None and not (order.names_nothing and order.accept_calibration is None and not order.retype):
-        raise UsageError(
-            "The job already defines what each board gets.", hint="Drop --profile, --calibration, --name and --retype."
-        )
 
 
 def _one(app: App, boards: BatchRun, operator: Operator) -> None:

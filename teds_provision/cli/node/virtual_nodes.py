@@ -20,7 +20,6 @@ from teds_provision import node as node_room
 from teds_provision import protocol, provisioning, teds
 from teds_provision import teds as teds_room
 from teds_provision.cli.context import SOCKET, App, pass_app
-from teds_provision.cli.node.check import check
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, Number, WholeNumber, command, examples
 from teds_provision.errors import KnownUuidError, StoreError, TedsProvisionError, UsageError
 from teds_provision.lazy import late
@@ -671,5 +670,5 @@ class ActuatorLines:
         )
 
 
-for subcommand in (check, create, run):
+for subcommand in (create, run):
     node.add_command(subcommand)

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import plant, provisioning
+from teds_provision import provisioning
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.node.build import write_file
+from teds_provision.cli.node.node_names import resolve
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, fingerprint_option, yes_option
 from teds_provision.cli.rendering import local_time, print_json_list, shown
 from teds_provision.errors import NotFoundError
@@ -77,7 +78,7 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
 def _meant(station: Station, uuid: str) -> bytes:
     """Return the UUID, or that of an EUI-64 if its first digits match no known node."""
     try:
-        return plant.status.resolve(station, uuid)
+        return resolve(station, uuid)
     except NotFoundError:
         by_rule = provisioning.whitelist.uuid_of_eui64(uuid)
         if by_rule == uuid:
@@ -97,7 +98,7 @@ def _meant(station: Station, uuid: str) -> bytes:
 def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     """Remove a node from the whitelist and forget its pinned key, so that a replaced board can be pinned again."""
     station = app.station()
-    octets = plant.status.resolve(station, uuid)
+    octets = resolve(station, uuid)
     entry = station.pins.entry(octets)
     sentence = f"{octets.hex()}{f' ({entry.name})' if entry and entry.name else ''}"
     pinned = entry.fingerprint if entry is not None else None

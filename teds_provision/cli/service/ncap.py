@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from teds_provision import client, plant
+from teds_provision import client
 from teds_provision import measure as measure_room
 from teds_provision.cli.config_file import brokers_of, config_path
 from teds_provision.cli.context import App, pass_app, to_json
@@ -46,11 +46,12 @@ if TYPE_CHECKING:
     from teds_provision.api.bodies import Mode
     from teds_provision.measure import matching
     from teds_provision.measure.matching import MatchSurvey
-    from teds_provision.ncap import service_run, settings
+    from teds_provision.ncap import service_part, service_run, settings
     from teds_provision.ncap.web import tokens
     from teds_provision.station.station import Station
 else:
     service_run, settings = late("teds_provision.ncap.service_run"), late("teds_provision.ncap.settings")
+    service_part = late("teds_provision.ncap.service_part")
     tokens = late("teds_provision.ncap.web.tokens")
     matching = late("teds_provision.measure.matching")
 
@@ -102,7 +103,6 @@ _FILE = FileToRead(exists=True)
 @file_units_option
 @click.option("--trust-dcc", type=_FILE, multiple=True, metavar="CERT.pem",
               help="Require calibration certificates signed by this one, or under this CA; repeatable.")  # fmt: skip
-@click.option("--registry", is_flag=True, help="Stay in sync with the registry that this station joined.")
 @click.option("--metrics", is_flag=True, help="Serve /metrics for Prometheus.")
 @click.option("--http-1451", "clause_12", is_flag=True, help="Serve the paths of IEEE 1451.0 clause 12, read-only.")
 @click.option("--nfc", multiple=True, metavar="PATH", help="Reader: auto, usb, udp:localhost:54321; repeatable.")
@@ -159,8 +159,9 @@ def run(
     settings.require_safe(wanted)
     settings.require_places(wanted)
     station = app.station()
-    if wanted.registry:
-        plant.apply_pages.require_roster(station)
+    for kind in service_part.KINDS.parts() if wanted.parts else ():
+        if kind.name in wanted.parts:
+            kind.require(station)
     if wanted.measure is not None:
         match = matching.NodeMatch.parse(wanted.measure)
         match.require_groups(station)

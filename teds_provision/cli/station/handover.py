@@ -5,16 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from io import BytesIO
 from itertools import chain, islice, zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, Protocol
 
 import click
 
 from teds_provision import handover as handover_room
-from teds_provision import plant, protocol
+from teds_provision import protocol
 from teds_provision.cli import options
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
@@ -51,10 +50,19 @@ _MEANS = {
 }
 
 
+class KeyCarrier(Protocol):
+    """Another way than a file on which an optional room sends bundles."""
+
+    def require(self, station: Station) -> None:
+        """Raise PolicyError if this station cannot send on this way."""
+
+    def send(self, station: Station, plans: Sequence[ExportPlan]) -> tuple[dict[str, Any], str]:
+        """Keep the bundles to be sent, durably; return the members of the result about them, and what they wait for."""
+
+
 @command(
     "teds-provision export-keys --to lab --all --output lab.jwe",
     "teds-provision export-keys --to lab 8d4d --mode move --output finger.jwe",
-    "teds-provision export-keys --to south 8d4d --mode move --send",
 )
 @click.argument("uuids", metavar="[UUID]…", nargs=-1)
 @click.option("--to", "receivers", multiple=True, required=True, metavar="STATION", help="Name, fingerprint or PEM.")
@@ -72,7 +80,6 @@ _MEANS = {
     metavar="FILE",
     help="Where to write the sealed bundle.",
 )
-@click.option("--send", is_flag=True, help="Send it through the registry at the next sync, instead of a file.")
 @click.option(
     "--expires",
     type=WholeNumber(1, 365),
@@ -92,11 +99,11 @@ def export_keys(
     everything: bool,
     mode: Literal["copy", "move"],
     output: Path | None,
-    send: bool,
     expires: int,
     ca: str | None,
     yes: bool,
     dry_run: bool,
+    carrier: KeyCarrier | None = None,
 ) -> None:
     """Hand node keys to other base stations in a bundle sealed to them and signed by this one.
 
@@ -106,13 +113,11 @@ def export_keys(
     """
     if everything == bool(uuids):
         raise click.UsageError("Name the nodes, or use --all.")
-    if send == (output is not None):
-        raise click.UsageError("Give one of --output FILE and --send.")
-    if send and len(receivers) != 1:
-        raise click.UsageError("A parcel is for one station: give --to once.")
+    if output is None and carrier is None:
+        raise click.UsageError("Give --output FILE.")
     station = app.station()
-    if send:
-        plant.apply_pages.require_roster(station)
+    if carrier is not None:
+        carrier.require(station)
     nodes = None if everything else tuple(station.nodes.resolve(uuid) for uuid in uuids)
     order = handover_room.outgoing.ExportOrder(receivers, nodes, mode, expires, ca)
     if not dry_run:
@@ -132,9 +137,9 @@ def export_keys(
         plans = shown if station.version() == state else handover_room.outgoing.plan_exports(station, order)
         require_same([plan.content for plan in plans] == [plan.content for plan in shown])
         result = _exported(plans, outputs, station)
-        if send:
-            names = [plant.parcels.send_export(station, plan, datetime.now(UTC)) for plan in plans]
-            app.emit({**result, "parcels": names}, f"{_count(plans)} will leave with the next registry sync.")
+        if carrier is not None:
+            more, when = carrier.send(station, plans)
+            app.emit({**result, **more}, f"{_count(plans)} will leave with {when}.")
             return
         done = handover_room.outgoing.export_all(station, plans, outputs)
     _print_export(app, plans, outputs, result, done)
@@ -218,10 +223,8 @@ _MOVED = "A move: each key is rotated at the first contact; until then, the send
 @command(
     "teds-provision import-keys lab.jwe --no-prove",
     "teds-provision import-keys lab.jwe --via can --can udp_multicast:239.74.163.2 --yes",
-    "teds-provision import-keys --received",
 )
-@click.argument("file", type=options.FileToRead(), required=False)
-@click.option("--received", is_flag=True, help="Import parcels from the registry that wait for confirmation.")
+@click.argument("file", type=options.FileToRead())
 @click.option(
     "--prove/--no-prove", default=None, help="Contact each node and open a session (default if a link is named)."
 )
@@ -237,8 +240,7 @@ _MOVED = "A move: each key is rotated at the first contact; until then, the send
 @click.pass_context
 def import_keys(
     ctx: click.Context,
-    file: Path | None,
-    received: bool,
+    file: Path,
     prove: bool | None,
     receipt: Path | None,
     yes: bool,
@@ -253,26 +255,21 @@ def import_keys(
     app = ctx.find_object(App)
     assert app is not None
     station = app.station()
-    if received == (file is not None):
-        raise click.UsageError("Give one of FILE and --received.")
-    if file is None:
-        _take_received(app, station, yes=yes, dry_run=dry_run)
-        return
     with _bundle_file(file) as bundle:
         receipt = receipt or file.with_name(file.name + ".receipt")
         station.unlock()
         state = station.version()  # before the plan: what changes while it is made is not overlooked either
         shown = handover_room.incoming.plan_import(station, bundle)
         if dry_run:
-            app.emit({**_import_plan(shown), "receipt": None, "plan": True}, _import_text(station, shown))
+            app.emit({**import_plan(shown), "receipt": None, "plan": True}, import_text(station, shown))
             return
         if not isinstance(shown, handover_room.incoming.ImportResult):
             require_new(receipt)
-            app.note(_import_text(station, shown))
+            app.note(import_text(station, shown))
             app.confirm(f"Import {count_of(len(shown.taken))}?", yes=yes)
         with station.lock("import-keys", app.note):
             plan = shown if station.version() == state else handover_room.incoming.plan_import(station, bundle)
-            _require_as_shown(plan, shown)
+            require_as_shown(plan, shown)
             if isinstance(plan, handover_room.incoming.ImportResult):  # before, or meanwhile by another command
                 done = plan
             else:
@@ -282,39 +279,9 @@ def import_keys(
     outcomes: list[dict[str, Any]] = []
     if links_given(ctx) if prove is None else prove:
         outcomes = _prove(app, station, done, links)
-    _print_import(app, station, done, receipt, _import_plan(shown), outcomes)
+    _print_import(app, station, done, receipt, import_plan(shown), outcomes)
     if prove and any(outcome["why"] for outcome in outcomes):
         raise click.exceptions.Exit(LinkError.exit_code)
-
-
-def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> None:
-    """Show each waiting parcel with its reason; take in those that the user confirms."""
-    plant.apply_pages.require_roster(station)
-    station.unlock()
-    parcels, results = station.plant.parcels, list[dict[str, Any]]()
-    for row in parcels.all("in", "waiting", "later"):
-        if row.kind != "bundle":
-            continue
-        octets = parcels.document(row.id, "in")
-        try:
-            shown = handover_room.incoming.plan_import(station, octets)
-        except TedsProvisionError as error:
-            app.warn(f"{row.id}: {error.message}")
-            continue
-        app.note(f"{_import_text(station, shown)}\nReason for waiting: {row.detail or 'it has just arrived'}")
-        one = {**_import_plan(shown), "parcel": row.id, "why": row.detail}
-        results.append(one)
-        if dry_run:
-            continue
-        app.confirm("Import this parcel?", yes=yes)
-        with station.lock("import-keys", app.note):
-            plan = handover_room.incoming.plan_import(station, octets)
-            _require_as_shown(plan, shown)
-            done = plant.parcels.import_parcel(station, row, plan)
-        one["fresh"] = done.fresh
-    count = f"{len(results)} parcel{'s' * (len(results) != 1)}"
-    text = f"{count}." if dry_run else f"{count} imported; the receipts leave with the next sync."
-    app.emit({"received": results, "plan": dry_run}, text if results else "Nothing waits.")
 
 
 @contextmanager
@@ -341,13 +308,13 @@ def _is_sealed(file: BinaryIO) -> bool:
     return _CIPHERTEXT in before
 
 
-def _require_as_shown(plan: ImportPlan | ImportResult, shown: ImportPlan | ImportResult) -> None:
+def require_as_shown(plan: ImportPlan | ImportResult, shown: ImportPlan | ImportResult) -> None:
     """Raise PolicyError if another command changed the outcome of a node; nodes imported meanwhile are fine."""
     if not isinstance(plan, handover_room.incoming.ImportResult):
         require_same(not isinstance(shown, handover_room.incoming.ImportResult) and plan.nodes == shown.nodes)
 
 
-def _import_plan(plan: ImportPlan | ImportResult) -> dict[str, Any]:
+def import_plan(plan: ImportPlan | ImportResult) -> dict[str, Any]:
     """Return the result as far as it is known before anything happens."""
     if isinstance(plan, handover_room.incoming.ImportResult):
         return _taken_before(plan)
@@ -367,7 +334,7 @@ def _taken_before(done: ImportResult) -> dict[str, Any]:
     return _import_result(done.row.peers[0], done.row.mode, done.row.id, nodes, [])
 
 
-def _import_text(station: Station, plan: ImportPlan | ImportResult) -> str:
+def import_text(station: Station, plan: ImportPlan | ImportResult) -> str:
     """Return the plan for people."""
     if isinstance(plan, handover_room.incoming.ImportResult):
         return f"This bundle was imported on {plan.row.created}; there is nothing to do."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain
 from typing import Any, Final
 
@@ -11,11 +11,11 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from teds_provision.ncap.daemon import Daemon
+from teds_provision.ncap.service_part import Line, ServicePart
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.guard import CALLER, Caller
 
 TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
-Line = tuple[str, dict[str, str], float]
 
 _HELP: Final = {
     "teds_info": ("gauge", "Version and name of the station."),
@@ -34,9 +34,6 @@ _HELP: Final = {
     "teds_sink_failed": ("gauge", "1 where a sink has ended with an error."),
     "teds_messages_per_second": ("gauge", "Messages to ROS and MQTT now."),
     "teds_live_clients": ("gauge", "Clients of the live channel."),
-    "teds_registry_age_seconds": ("gauge", "Since the last sync with the registry."),
-    "teds_registry_unsent": ("gauge", "Events that wait for a sync."),
-    "teds_registry_alarms": ("gauge", "Alarms that are not acknowledged yet."),
 }
 
 
@@ -46,21 +43,23 @@ def route(daemon: Daemon) -> Route:
     def metrics(request: Request) -> Response:
         caller: Caller = request.scope[CALLER]
         status = for_readers(daemon.status()) if caller.read_only else daemon.status()
-        return Response(text(status, daemon.plant.status()), media_type=TYPE)
+        return Response(text(status, daemon.parts.values()), media_type=TYPE)
 
     return Route("/metrics", metrics)
 
 
-def text(status: dict[str, Any], plant: dict[str, Any] | None = None) -> str:
-    """Return the status, and that of the plant if one was joined, in Prometheus's form."""
-    lines: dict[str, dict[str, float]] = {name: {} for name in _HELP}  # of equal labels one line: two end a scrape
-    for name, labels, value in chain(_lines(status), _registry(plant) if plant is not None else ()):
+def text(status: dict[str, Any], parts: Iterable[ServicePart] = ()) -> str:
+    """Return the status, and the metrics of parts that optional rooms bring, in Prometheus's form."""
+    parts = tuple(parts)
+    help_of = {**_HELP, **{name: told for part in parts for name, told in part.metric_help.items()}}
+    lines: dict[str, dict[str, float]] = {name: {} for name in help_of}  # of equal labels one line: two end a scrape
+    for name, labels, value in chain(_lines(status), *(part.metrics() for part in parts)):
         inner = ",".join(f'{key}="{_escaped(word)}"' for key, word in labels.items())
         lines[name].setdefault(f"{name}{{{inner}}}" if inner else name, value)
     out = []
     for name, found in lines.items():
         if found:
-            kind, words = _HELP[name]
+            kind, words = help_of[name]
             out += [f"# HELP {name} {words}", f"# TYPE {name} {kind}"]
             out += [f"{what} {_number(value)}" for what, value in found.items()]
     return "\n".join(out) + "\n"
@@ -93,13 +92,6 @@ def _lines(status: dict[str, Any]) -> Iterator[Line]:
         yield "teds_sink_failed", labels, sink["state"] == "failed"
     yield "teds_messages_per_second", {}, status["budget"]["used"]
     yield "teds_live_clients", {}, status["clients"]
-
-
-def _registry(plant: dict[str, Any]) -> Iterator[Line]:
-    if plant["age"] is not None:
-        yield "teds_registry_age_seconds", {}, plant["age"]
-    yield "teds_registry_unsent", {}, plant["unsent"]
-    yield "teds_registry_alarms", {}, sum(not alarm["seen"] for alarm in plant["alarms"])
 
 
 def _escaped(word: str) -> str:

@@ -58,10 +58,11 @@ class Resources:
         return [
             Route("/status", self.status),
             Route("/detection", self.detection, methods=["GET", "PUT"]),
-            Route("/plant", self.plant),
-            Route("/plant/nodes", self.plant_nodes),
-            Route("/jobs", self.jobs),
-            Route("/jobs/{id}", self.job),
+            *(
+                Route(path, _of_part(answer))
+                for part in self._daemon.parts.values()
+                for path, answer in part.resources().items()
+            ),
             Route("/discover", self.discover, methods=["POST"]),
             Route("/nodes", self.nodes),
             Route("/nodes/{uuid}", self.node),
@@ -108,30 +109,6 @@ class Resources:
             body = await body_of(request, bodies.Detection)
             await changing(self._daemon.set_detection, body.mode)
         return JSONResponse({"mode": await asyncio.to_thread(lambda: self._daemon.detection)})
-
-    async def plant(self, request: Request) -> Response:
-        """GET /plant."""
-        found = await asyncio.to_thread(self._daemon.plant.status)
-        if found is None:
-            raise NotFoundError(
-                "This station has joined no registry.", hint="Join one: teds-provision registry connect"
-            )
-        return _shown(request, found)
-
-    async def plant_nodes(self, request: Request) -> Response:
-        """GET /plant/nodes."""
-        text = request.query_params.get("text", "")
-        if len(text) > LONGEST_TEXT:
-            raise UsageError(f"text may have at most {LONGEST_TEXT} characters.")
-        return _shown(request, await reading(self._daemon.plant.nodes, text))
-
-    async def jobs(self, request: Request) -> Response:
-        """GET /jobs."""
-        return _shown(request, {"jobs": await asyncio.to_thread(self._daemon.plant.jobs)})
-
-    async def job(self, request: Request) -> Response:
-        """GET /jobs/{id}."""
-        return _shown(request, await reading(self._daemon.plant.job, request.path_params["id"]))
 
     async def discover(self, request: Request) -> Response:
         """POST /discover."""
@@ -476,6 +453,15 @@ class Resources:
             raise NotFoundError(f"{uuid} is not a virtual transducer of this station.")
         await changing(self._daemon.drop_virtual, uuid)
         return JSONResponse({"virtual": self._daemon.virtuals.all()})
+
+
+def _of_part(answer: Callable[[Request], Awaitable[dict[str, Any]]]) -> Handler:
+    """Return the handler of a resource that an optional room brings."""
+
+    async def handle(request: Request) -> Response:
+        return _shown(request, await answer(request))
+
+    return handle
 
 
 def _shown(request: Request, found: dict[str, Any]) -> JSONResponse:

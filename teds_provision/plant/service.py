@@ -5,15 +5,17 @@ A registry that fails stops nothing: the failure is reported once, and once its 
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import islice
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision import plant
+from teds_provision.api.operations import LONGEST_TEXT
 from teds_provision.errors import (
     LinkError,
     NotAuthenticError,
@@ -21,12 +23,18 @@ from teds_provision.errors import (
     NotMemberError,
     StoreLockedError,
     TedsProvisionError,
+    UsageError,
 )
 from teds_provision.ncap.live import Live
+from teds_provision.ncap.service_part import Line, PartKind
+from teds_provision.ncap.web.answers import reading
 from teds_provision.plant.postgres import PostgresTransport, Registry
 from teds_provision.plant.transport import Transport
 from teds_provision.protocol.plant.job import Job
 from teds_provision.station.station import Station
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
 
 EVERY: Final = 60.0
 """Seconds between two syncs without a notification."""
@@ -38,6 +46,11 @@ _BUSY: Final = 2.0
 _DATABASE_CHECK: Final = 3600.0
 """Seconds between two looks at what the database allows."""
 _EMPTY_PAGE: Final = 24 * 3600.0
+_HELP: Final = {
+    "teds_registry_age_seconds": ("gauge", "Since the last sync with the registry."),
+    "teds_registry_unsent": ("gauge", "Events that wait for a sync."),
+    "teds_registry_alarms": ("gauge", "Alarms that are not acknowledged yet."),
+}
 
 
 class PlantWatch:
@@ -68,6 +81,54 @@ class PlantWatch:
                 connection.interrupt()
         for thread in self._threads:
             thread.join(_SOON)
+
+    def is_shown(self) -> bool:
+        """Return True if this station joined a registry."""
+        return self._station.plant.joined is not None
+
+    def resources(self) -> Mapping[str, Callable[[Request], Awaitable[dict[str, Any]]]]:
+        """Return what answers a GET, by its path below /api/v1."""
+        return {
+            "/plant": self._get_plant,
+            "/plant/nodes": self._get_nodes,
+            "/jobs": self._get_jobs,
+            "/jobs/{id}": self._get_job,
+        }
+
+    async def _get_plant(self, _request: Request) -> dict[str, Any]:
+        found = await asyncio.to_thread(self.status)
+        if found is None:
+            raise NotFoundError(
+                "This station has joined no registry.", hint="Join one: teds-provision registry connect"
+            )
+        return found
+
+    async def _get_nodes(self, request: Request) -> dict[str, Any]:
+        text = request.query_params.get("text", "")
+        if len(text) > LONGEST_TEXT:
+            raise UsageError(f"text may have at most {LONGEST_TEXT} characters.")
+        return await reading(self.nodes, text)
+
+    async def _get_jobs(self, _request: Request) -> dict[str, Any]:
+        return {"jobs": await asyncio.to_thread(self.jobs)}
+
+    async def _get_job(self, request: Request) -> dict[str, Any]:
+        return await reading(self.job, request.path_params["id"])
+
+    @property
+    def metric_help(self) -> Mapping[str, tuple[str, str]]:
+        """Kind and help of each metric, by name."""
+        return _HELP
+
+    def metrics(self) -> Iterator[Line]:
+        """Yield the present values; none if this station joined no registry."""
+        found = self.status()
+        if found is None:
+            return
+        if found["age"] is not None:
+            yield "teds_registry_age_seconds", {}, found["age"]
+        yield "teds_registry_unsent", {}, found["unsent"]
+        yield "teds_registry_alarms", {}, sum(not alarm["seen"] for alarm in found["alarms"])
 
     def status(self) -> dict[str, Any] | None:
         """Return the body of `/plant` (api.md); None if this station joined no registry. Reads the store alone."""
@@ -240,3 +301,7 @@ class PlantWatch:
         if (state, why) != self._told:
             self._told = state, why
             self._live.event("registry", state=state, why=why)
+
+
+PART: Final = PartKind("registry", "plant", plant.apply_pages.require_roster, PlantWatch)
+"""What runs beside the service if ``ncap run --registry`` asks for it; its status is shown in any case."""

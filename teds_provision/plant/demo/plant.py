@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from teds_provision import plant, vault
-from teds_provision.demo import cluster
-from teds_provision.demo.story import PROFILE, Demo, _node, provision_over
+from teds_provision.demo.story import PROFILE, Demo, provision_over, virtual_node
 from teds_provision.errors import NotAuthenticError
 from teds_provision.handover import trust
 from teds_provision.links.ports import free_port
+from teds_provision.plant.demo import cluster
 from teds_provision.plant.transport import Transport
 from teds_provision.protocol.plant.document import open_request
 from teds_provision.protocol.plant.roster import Role, Roster, Share
@@ -92,7 +92,7 @@ class _Story:
         demo.say("Station north has the owner's CA key and creates the roster; west and south ask to join.")
         self._set_up()
         demo.say("West, on the line, provisions a board. Its key is shared with south, which has never seen the board.")
-        demo.uuid = demo.stack.enter_context(_node(demo, "board", PROFILE))
+        demo.uuid = demo.stack.enter_context(virtual_node(demo, "board", PROFILE))
         provision_over(demo, self["west"], "can", demo.uuid, BuildOrder(PROFILE, name="joint 1"))
         self._sync("west", "south", "west")
         before = self._verdict("verify")

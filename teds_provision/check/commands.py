@@ -158,3 +158,9 @@ def _table(console: Console, report: CheckReport) -> None:
             console.print(f"{name:<18} {value}", markup=False, highlight=False, soft_wrap=True)
     if explained["problem"]:
         console.print(explained["problem"], markup=False, highlight=False, soft_wrap=True)
+
+
+def extend(command: click.Command) -> None:
+    """Add ``check`` to the group ``node``."""
+    assert isinstance(command, click.Group)
+    command.add_command(check)

@@ -1,0 +1,161 @@
+"""The core without its optional rooms: a copy of the tree without their folders runs, and keeps what they wrote.
+
+Their own tests are left out with them: those in their folders, and every file that imports a room or its tests. A test
+that uses a command of a room is marked ``needs_room``.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from teds_provision.optional_rooms import OPTIONAL
+from tests.bench import PASSPHRASE
+from tests.cli.shell import clean_environment
+from tests.pace import PATIENCE
+from tests.plant.stations import Plant
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parent.parent
+_LEFT = ("__pycache__", "build", "dist", ".venv*", ".git", "*.egg-info", ".*_cache", ".hypothesis")
+_NAMES = "|".join(OPTIONAL)
+_OF_A_ROOM = re.compile(
+    rf"^\s*(?:from|import) (?:teds_provision|tests)\.(?:{_NAMES})\b"
+    rf"|^\s*from (?:teds_provision|tests) import [^\n]*\b(?:{_NAMES})\b",
+    re.M,
+)
+_GATE = (
+    "tests/test_architecture.py",
+    "tests/cli/test_backup.py::test_backup_and_restore_into_an_empty_home",
+    "tests/ncap/test_api.py::test_status_says_what_runs",
+    "tests/e2e/test_whole_runs.py::test_a_tapped_node_is_provisioned_and_a_second_run_finds_nothing_to_do[python-4]",
+)
+"""What the gate runs of the core's tests: the arrows, a command and its store, the service, a node to its verdict."""
+
+
+@pytest.fixture(scope="module")
+def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Copy of the tree without the optional rooms and their tests."""
+    folder = tmp_path_factory.mktemp("core") / "tree"
+    shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*_LEFT), symlinks=True)
+    for room in OPTIONAL:
+        shutil.rmtree(folder / "teds_provision" / room)
+        shutil.rmtree(folder / "tests" / room)
+    for path in (folder / "tests").rglob("*.py"):
+        if _OF_A_ROOM.search(path.read_text(encoding="utf-8")):
+            path.unlink()
+    return folder
+
+
+def run(core: Path, *words: object, given: str = "", patience: float = PATIENCE) -> subprocess.CompletedProcess[str]:
+    """Run Python over the copy."""
+    return subprocess.run(
+        [sys.executable, *map(str, words)],
+        cwd=core,
+        env=clean_environment(PYTHONPATH=str(core)),
+        input=given,
+        capture_output=True,
+        text=True,
+        timeout=patience,
+        check=False,
+    )
+
+
+def test_every_module_is_imported_without_the_rooms(core: Path) -> None:
+    code = """
+import importlib, pathlib, sys
+for path in sorted(pathlib.Path("teds_provision").rglob("*.py")):
+    name = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+    if not name.endswith("__main__"):
+        importlib.import_module(name)
+print(importlib.import_module("teds_provision").__file__)
+print(sorted(importlib.import_module("teds_provision.optional_rooms").rooms()))
+"""
+    done = run(core, "-c", code)
+    assert done.stdout.splitlines() == [str(core / "teds_provision" / "__init__.py"), "[]"], done.stderr[-2000:]
+
+
+def test_the_tests_of_the_core_pass(core: Path) -> None:
+    done = run(core, "-m", "pytest", "-q", "-p", "no:cacheprovider", *_GATE, patience=10 * PATIENCE)
+    assert done.returncode == 0, done.stdout[-4000:]
+
+
+def test_options_of_a_room_are_not_offered_and_its_commands_do_not_exist(core: Path, tmp_path: Path) -> None:
+    program = ("-m", "teds_provision", "--home", tmp_path / "home", "--json")
+    for words, said in (
+        (("registry", "status"), "No such command 'registry'."),
+        (("node", "check"), "No such command 'check'."),
+        (("provision", "--job", "fifty.jws"), "No such option '--job'."),
+        (("nodes", "--plant"), "No such option '--plant'."),
+        (("demo", "--line"), "No such option '--line'."),
+        (("export-keys", "--to", "lab", "--all"), "Give --output FILE."),
+    ):
+        done = run(core, *program, *words)
+        assert (done.returncode, json.loads(done.stdout)["error"]["code"]) == (2, "usage"), done.stderr
+        assert said in json.loads(done.stdout)["error"]["message"]
+    help_text = run(core, *program, "--help").stdout
+    assert "Create and run virtual nodes.\n" in help_text
+    assert "The plant" not in help_text
+
+
+def test_the_demo_tells_the_whole_story(core: Path) -> None:
+    done = run(core, "-m", "teds_provision", "--json", "demo", patience=10 * PATIENCE)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert json.loads(done.stdout.splitlines()[-1])["verdict"] == "authentic"
+
+
+def _rows(home: Path) -> dict[str, list[tuple[object, ...]]]:
+    """Every row of every table that a plant fills, as it is in the file."""
+    with closing(sqlite3.connect(f"file:{home / 'store.sqlite3'}?mode=ro", uri=True)) as file:
+        found = {table: file.execute(f"SELECT * FROM {table}").fetchall() for table in _TABLES}
+        found["plant"] = file.execute("SELECT registry, joined, synced, acknowledged, mac FROM plant").fetchall()
+        return {table: sorted(rows, key=repr) for table, rows in found.items()}
+
+
+def _must_look_first(home: Path) -> bool:
+    """Return True if a restored station must look for its own pages before it states anything in its plant."""
+    with closing(sqlite3.connect(f"file:{home / 'store.sqlite3'}?mode=ro", uri=True)) as file:
+        return bool(file.execute("SELECT restored IS NOT NULL AND restored_mac IS NOT NULL FROM plant").fetchone()[0])
+
+
+_TABLES = ("rosters", "chains", "pages", "heads", "claims", "digests", "parcels", "shared", "jobs", "alarms")
+
+
+def test_a_backup_with_the_rows_of_a_plant_comes_through_a_core_without_the_room(core: Path, tmp_path: Path) -> None:
+    plant = Plant(tmp_path)
+    plant.member("south", "base")
+    home = plant.north.home
+    plant.north.plant.record_event("agreed", bytes(10), fingerprint="ab" * 32, epoch=2, key_id="0123456789abcdef")
+    plant.round()
+    plant.close()
+    before = _rows(home)
+    assert all(before[table] for table in ("plant", "rosters", "pages", "claims"))
+    for step in (
+        ("--home", home, "backup", tmp_path / "north.backup"),
+        ("--home", tmp_path / "restored", "restore", tmp_path / "north.backup"),
+        ("--home", tmp_path / "restored", "backup", tmp_path / "again.backup"),
+        ("--home", tmp_path / "twice", "restore", tmp_path / "again.backup"),
+    ):
+        words = ("-m", "teds_provision", "--passphrase-fd", "0", *step)
+        done = run(core, *words, given=f"{PASSPHRASE}\n")
+        assert done.returncode == 0, done.stdout + done.stderr
+    assert _rows(tmp_path / "twice") == before
+    assert not _must_look_first(home)
+    assert _must_look_first(tmp_path / "twice"), "a rule of the plant that the core keeps without the room"
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+def test_the_whole_suite_of_the_core_passes(core: Path) -> None:
+    usual = "not soak and not machine and not rclpy and not realtime and not needs_room"
+    words = ("-m", "pytest", "-q", "-n", "2", "--dist", "worksteal", "-p", "no:cacheprovider", "-m", usual, "tests")
+    done = run(core, *words, "--hypothesis-profile", "gate", patience=3500)
+    assert done.returncode == 0, done.stdout[-8000:]
