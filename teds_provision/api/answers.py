@@ -11,20 +11,12 @@ from teds_provision.api.bodies import Mode
 from teds_provision.shapes.measurement import MeasurementSettings
 from teds_provision.shapes.metadata import Meta
 from teds_provision.shapes.problem import Problem
+from teds_provision.shapes.verdict import CheckMembers, OriginMember, VerdictMembers
 
 Uuid = Annotated[str, Meta(pattern="^[0-9a-f]{20}$", description="20 hex digits")]
 Time = Annotated[float, Meta(description="unix seconds")]
 _FirmwareOrigin = TypedDict("_FirmwareOrigin", {"from": Literal["session", "plain"]})
 _UpdateFrom = TypedDict("_UpdateFrom", {"from": Annotated[str, Meta(description="the version before")] | None})
-_Origin = TypedDict("_Origin", {"from": Literal["session", "kept", "plain"]})  # a keyword of Python
-
-
-class Check(TypedDict):
-    """One check of a verdict."""
-
-    name: str
-    result: Literal["passed", "failed", "skipped"]
-    why: str
 
 
 class Shown(TypedDict):
@@ -124,15 +116,6 @@ class Report(TypedDict):
     clock_error: NotRequired[Annotated[float, Meta(description="seconds")] | None]
 
 
-class Verdict(_Origin):
-    """Verdict on a datasheet, and how it is known."""
-
-    verdict: Literal["authentic", "unsigned", "unverified", "not authentic", "unproven"]
-    checks: list[Check]
-    at: str
-    by: str
-
-
 class Wrapped(TypedDict):
     """The sensor that a node wraps; its own proof ends at the wrapper."""
 
@@ -176,8 +159,8 @@ class Node(TypedDict):
     epoch: NotRequired[int]
     sequence: NotRequired[int]
     due: NotRequired[str | None]
-    verdict: Verdict | None
-    heard: Verdict | None
+    verdict: VerdictMembers | None
+    heard: VerdictMembers | None
     verified: NotRequired[str | None]
     retired: NotRequired[str | None]
     problem: Problem | None
@@ -355,7 +338,7 @@ class Curve(TypedDict):
     points: Annotated[list[list[float | None]], Meta(description="raw, value; null: an angle goes on at its other end")]
 
 
-class Sheet(_Origin):
+class Sheet(OriginMember):
     """A node's datasheet, decoded and checked."""
 
     uuid: Uuid
@@ -363,7 +346,7 @@ class Sheet(_Origin):
     verdict: str
     at: str
     by: str
-    checks: list[Check]
+    checks: list[CheckMembers]
     teds: list[dict[str, Any]]
     guard: list[Finding]
     curves: list[Curve]

@@ -54,17 +54,21 @@ _PLAIN: Final = {
 
 
 def schema_of(shape: Any, named: dict[str, Schema]) -> Schema:
-    """Return the schema of a type. Typed dictionaries become references; their own schemas are put into ``named``."""
+    """Return the schema of a type. Typed dictionaries become references; their own schemas are put into ``named``.
+
+    ``VerdictMembers``, the typed dictionary of a shape that is a class besides, is ``Verdict`` there.
+    """
     if is_typeddict(shape):
-        if shape.__name__ not in named:
-            named[shape.__name__] = {}  # here already, should it hold itself
+        name = shape.__name__.removesuffix("Members")
+        if name not in named:
+            named[name] = {}  # here already, should it hold itself
             hints = get_type_hints(shape, include_extras=True)
-            named[shape.__name__] = {
+            named[name] = {
                 "type": "object",
                 "properties": {name: schema_of(hint, named) for name, hint in hints.items()},
                 "required": [name for name, hint in hints.items() if get_origin(hint) is not NotRequired],
             }
-        return {"$ref": f"#/components/schemas/{shape.__name__}"}
+        return {"$ref": f"#/components/schemas/{name}"}
     if is_dataclass(shape):
         hints = get_type_hints(shape, include_extras=True)
         required = [

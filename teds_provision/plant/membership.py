@@ -15,7 +15,8 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant.chain import counting
 from teds_provision.protocol.plant.document import MemberRequest, hash_of, open_request
 from teds_provision.protocol.plant.roster import MOST_AHEAD, Roster, open_roster
-from teds_provision.provisioning.verify import Verification, snapshot_trust, verify_image
+from teds_provision.provisioning.verify import snapshot_trust, verify_image
+from teds_provision.shapes.verdict import Verification
 from teds_provision.station.plant.pages import Chain
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now

@@ -39,8 +39,9 @@ from teds_provision.provisioning.board_type import (
 from teds_provision.provisioning.calibration_guard import guard, is_calibrated, merged
 from teds_provision.provisioning.sign import known_image, known_node_keys, unsigned_security
 from teds_provision.provisioning.teds_read import NodeSnapshot
-from teds_provision.provisioning.verify import FreshnessFloor, Verification, verify_image
+from teds_provision.provisioning.verify import FreshnessFloor, verify_image
 from teds_provision.sanitize import printable
+from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store import Draft, NodeRecord
 from teds_provision.teds.certificate import CertificateChoice, CertificateReference, ChooseItem

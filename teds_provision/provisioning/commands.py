@@ -59,14 +59,10 @@ from teds_provision.provisioning.provision import add_to_whitelist, key_board
 from teds_provision.provisioning.readings import keep
 from teds_provision.provisioning.sign import SignResult, known_image, known_node_keys, require_not_measured, sign
 from teds_provision.provisioning.teds_read import read_identity, read_image, take_snapshot
-from teds_provision.provisioning.verify import (
-    Verification,
-    freshness_floor_of,
-    session_check,
-    unproven,
-)
+from teds_provision.provisioning.verify import freshness_floor_of, session_check, unproven
 from teds_provision.provisioning.verify_node import open_or_say_why, provenance_check, verify_at_node
 from teds_provision.provisioning.write import WriteResult, write
+from teds_provision.shapes.verdict import Verification
 from teds_provision.station.firmware import KnownFirmware, firmware_of
 from teds_provision.station.station import Station
 from teds_provision.station.store import DatasheetRecord, Draft

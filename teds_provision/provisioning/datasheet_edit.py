@@ -19,9 +19,10 @@ from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.progress import DONE, NOTHING, Reporter, StepResult, Steps
 from teds_provision.provisioning.sign import known_node_keys, require_not_measured, sign
 from teds_provision.provisioning.teds_read import NodeSnapshot, take_snapshot
-from teds_provision.provisioning.verify import Verification, require_authentic
+from teds_provision.provisioning.verify import require_authentic
 from teds_provision.provisioning.verify_node import verify_node
 from teds_provision.provisioning.write import write
+from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.diff import Change, diff_blocks

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Final
 from teds_provision.errors import BadDataError, NotFoundError, TedsProvisionError
 from teds_provision.files import read_limited
 from teds_provision.provisioning.calibration_guard import guard
-from teds_provision.provisioning.verify import Verification, require_authentic, verify_image
+from teds_provision.provisioning.verify import require_authentic, verify_image
+from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import Image

@@ -20,7 +20,7 @@ from teds_provision.station.station import Station
 
 if TYPE_CHECKING:
     from teds_provision.provisioning import readings
-    from teds_provision.provisioning.readings import NodeVerdict
+    from teds_provision.shapes.verdict import NodeVerdict
     from teds_provision.station import firmware
     from teds_provision.teds.fits import Fit, Requirement
 else:  # cryptography: a list of unverified nodes needs none
@@ -94,7 +94,7 @@ def _described(known: NodeOverview, judged: NodeVerdict | None) -> dict[str, Any
         "assurance": entry.get("assurance"),
         "verdict": judged.verified.verdict if judged is not None else None,
         "retired": node.get("retired"),
-        "reading": judged and {"from": judged.origin, "at": judged.at, "by": judged.by},
+        "reading": judged and judged.reading(),
         "last_seen": node.get("last_seen"),
         "due": node.get("due"),
         "charging": json.loads(node["charging"]) if node.get("charging") else None,

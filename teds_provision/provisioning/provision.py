@@ -43,9 +43,9 @@ from teds_provision.provisioning.operator import Operator
 from teds_provision.provisioning.progress import DONE, NOTHING, SKIPPED, Reporter, StepResult, Steps
 from teds_provision.provisioning.sign import SignResult, require_not_measured, sign
 from teds_provision.provisioning.teds_read import NodeSnapshot, take_snapshot
-from teds_provision.provisioning.verify import Verification
 from teds_provision.provisioning.verify_node import verify_at_node, verify_node
 from teds_provision.provisioning.write import WriteResult, write
+from teds_provision.shapes.verdict import Verification
 from teds_provision.station.firmware import FirmwareDemands, FirmwareReading
 from teds_provision.station.shown_units import shown_units, units_of
 from teds_provision.station.station import Station

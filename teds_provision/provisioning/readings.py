@@ -11,52 +11,27 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
 
 from teds_provision.errors import StoreChangedError
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.verify import (
     ABOUT_THE_REST,
-    MERELY_UNSIGNED,
-    Check,
     FreshnessFloor,
     Signers,
     TrustSource,
-    Verification,
     judge,
     session_check,
     snapshot_trust_of,
     static_checks,
 )
+from teds_provision.shapes.verdict import MERELY_UNSIGNED, Check, NodeVerdict, Origin, Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store import NodeReading, utc_now
 from teds_provision.teds.image import SECURITY, Image
 
-Origin = Literal["session", "plain", "kept"]
 _DIGEST = 35  # octets: channel u16, access code u8, SHA-256
 _IN_SESSION = "opened with the key held here"
-
-
-@dataclass(frozen=True)
-class NodeVerdict:
-    """The verdict on a node, and what it rests on.
-
-    ``origin``: every TEDS was read in a ``session_check`` since the node last started; or ``kept``: the Security TEDS
-    was, and the rest is as it was read before; or ``plain``: nothing was read in a session. ``at`` is when the TEDS
-    were read (ISO 8601), ``by`` the command that did.
-    """
-
-    verified: Verification
-    origin: Origin
-    at: str
-    by: str
-
-    def to_json(self) -> dict[str, Any]:
-        """api.md, ``verdict``."""
-        checks = [check.to_json() for check in self.verified.checks]
-        return {"verdict": self.verified.verdict, "checks": checks, "from": self.origin, "at": self.at, "by": self.by}
 
 
 def keep(

@@ -6,7 +6,7 @@ import hashlib
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from teds_provision.errors import BadDataError, BadDatasheetError, NotAuthenticError, TedsProvisionError, UnprovenError
 from teds_provision.protocol import datasheet
@@ -15,6 +15,7 @@ from teds_provision.protocol.keys import fingerprint, node_key_good
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.wire_agreement import other_key
 from teds_provision.provisioning.sign import known_image
+from teds_provision.shapes.verdict import FRESHNESS, PAGES, SESSION, Check, Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store import RevocationRecord, WhitelistEntry
 from teds_provision.teds.codec import security
@@ -153,57 +154,7 @@ def _counting(station: Station, cas: Mapping[bytes, bytes]) -> dict[bytes, bytes
     return {uuid: ca for uuid, ca in cas.items() if counts[ca]}
 
 
-Outcome = Literal["passed", "failed", "skipped"]
-Verdict = Literal["authentic", "unsigned", "not authentic", "unproven"]
-Scope = Literal["node", "image"]
-MERELY_UNSIGNED: Final = frozenset({"signed", "every TEDS is signed"})
-"""Checks that fail if the only fault is a missing signature."""
-_FRESHNESS = {"sequence", "key epoch"}
 _DIGEST_OCTETS: Final = 32  # a TEDS is longer
-_SESSION = "session"
-_PAGES = "pages"
-
-
-class Check(NamedTuple):  # a tuple: thirteen of them for each of ten thousand files
-    """One check of the datasheet; ``why`` is the finding.
-
-    ``kept``: the TEDS concerned were not read again since the node last started; those of the last reading are judged
-    in their place.
-    """
-
-    name: str
-    result: Outcome
-    why: str = ""
-    kept: bool = False
-
-    def to_json(self) -> dict[str, str]:
-        """As `verify --json` and the API have it."""
-        return {"name": self.name, "result": self.result, "why": self.why, **({"from": "kept"} if self.kept else {})}
-
-
-@dataclass(frozen=True)
-class Verification:
-    """All checks and the one verdict. ``scope``: a node, or an image file alone.
-
-    ``unsigned``: the only fault is that (part of) it has no signature. ``unproven``: a key of the node is held and no
-    session was opened, so that the answers may be a replay of recorded ones.
-    """
-
-    uuid: bytes
-    checks: tuple[Check, ...]
-    scope: Scope = "node"
-
-    @property
-    def verdict(self) -> Verdict:
-        """One word for all checks."""
-        failed = {check.name for check in self.checks if check.result == "failed"}
-        if _PAGES in failed and failed <= {_PAGES, _SESSION}:
-            return "unproven"
-        if _SESSION in failed:  # what came without a session proves nothing, except that it is too old
-            return "not authentic" if failed & _FRESHNESS else "unproven"
-        if failed - MERELY_UNSIGNED:
-            return "not authentic"
-        return "unsigned" if failed else "authentic"
 
 
 @dataclass(frozen=True)
@@ -358,8 +309,8 @@ def judge(
 
 _ORDER: Final = (
     "form", "canonical form", "algorithms", "node key", "key epoch", "sequence", "not revoked", "signed",
-    "signing station", _PAGES, "station certificate", "signature", "signed TEDS", "every TEDS is signed", "UUID",
-    "possession", _SESSION,
+    "signing station", PAGES, "station certificate", "signature", "signed TEDS", "every TEDS is signed", "UUID",
+    "possession", SESSION,
 )  # fmt: skip
 ABOUT_THE_REST: Final = frozenset({"form", "signed TEDS", "every TEDS is signed", "UUID"})
 """Checks of other TEDS than the Security TEDS."""
@@ -414,10 +365,10 @@ def session_check(opened: str, why: str) -> Check:
     Both empty: no key of the node is held here, and signatures alone count.
     """
     if opened:
-        return Check(_SESSION, "passed", opened)
+        return Check(SESSION, "passed", opened)
     if why:
-        return Check(_SESSION, "failed", why)
-    return Check(_SESSION, "skipped", "this station holds no key of this node")
+        return Check(SESSION, "failed", why)
+    return Check(SESSION, "skipped", "this station holds no key of this node")
 
 
 def unproven(uuid: bytes, why: str) -> UnprovenError:
@@ -440,14 +391,14 @@ def require_authentic(verified: Verification) -> None:
     if verified.verdict == "authentic":
         return
     failed = {check.name: check for check in reversed(verified.checks) if check.result == "failed"}
-    if verified.verdict == "unproven" and _PAGES in failed:
+    if verified.verdict == "unproven" and PAGES in failed:
         raise UnprovenError(
-            f"Nothing could be proven about the datasheet of node {verified.uuid.hex()}: {failed[_PAGES].why}.",
+            f"Nothing could be proven about the datasheet of node {verified.uuid.hex()}: {failed[PAGES].why}.",
             hint="To get the missing pages: registry sync, or registry sync --files DIR from a station that has them",
         )
     if verified.verdict == "unproven":
-        raise unproven(verified.uuid, failed[_SESSION].why)
-    reason = next((failed[name] for name in _FRESHNESS if name in failed), next(iter(reversed(failed.values()))))
+        raise unproven(verified.uuid, failed[SESSION].why)
+    reason = next((failed[name] for name in FRESHNESS if name in failed), next(iter(reversed(failed.values()))))
     raise BadDatasheetError(f"The datasheet is {verified.verdict}: {reason.why or reason.name}.")
 
 
@@ -554,7 +505,7 @@ def _signer(
         return (_station(station, signers, certifier),)
     name, digits = "signing station", fingerprint(key)[:16]
     if signer.result == "unproven":
-        return (Check(name, "skipped", digits), Check(_PAGES, "failed", signer.why))
+        return (Check(name, "skipped", digits), Check(PAGES, "failed", signer.why))
     why = f"{digits}, {signer.why}" if signer.why and signer.result == "passed" else signer.why or digits
     return (Check(name, signer.result, why),)
 

@@ -13,15 +13,9 @@ from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
 from teds_provision.portable import cores_to_share
 from teds_provision.provisioning.forked_workers import map_ranges
-from teds_provision.provisioning.verify import (
-    Check,
-    TrustSource,
-    Verification,
-    require_authentic,
-    snapshot_trust,
-    verify_images,
-)
+from teds_provision.provisioning.verify import TrustSource, require_authentic, snapshot_trust, verify_images
 from teds_provision.shapes.problem import Failure, failure_of
+from teds_provision.shapes.verdict import Check, Verification
 from teds_provision.station.station import Station
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
@@ -32,6 +26,7 @@ _FEW: Final = 50
 _CHUNK: Final = 64
 _TOGETHER: Final = 1 << 20
 """Octets of image files that are held at a time."""
+_UNREADABLE: Final[dict[str, object]] = {"uuid": None, "scope": "image", "verdict": None, "checks": []}
 
 
 @dataclass(frozen=True)
@@ -39,18 +34,20 @@ class FileVerdict:
     """Result of one file: its checks, or why it could not be read; ``exit_code`` of a command for it alone."""
 
     path: Path
-    uuid: str | None = None
-    verdict: str | None = None
-    checks: tuple[Check, ...] = ()
+    verified: Verification | None = None
     warnings: tuple[str, ...] = ()
     exit_code: int = 0
     error: Failure | None = None
 
+    @property
+    def word(self) -> str:
+        """The verdict, or that there is none."""
+        return self.verified.verdict if self.verified is not None else "unreadable"
+
     def to_json(self) -> dict[str, object]:
         """One line of the result."""
-        out: dict[str, object] = {"file": str(self.path), "uuid": self.uuid, "scope": "image", "verdict": self.verdict}
-        out["checks"] = [{"name": check.name, "result": check.result, "why": check.why} for check in self.checks]
-        out["warnings"] = list(self.warnings)
+        judged = _UNREADABLE if self.verified is None else self.verified.to_json()
+        out = {"file": str(self.path), **judged, "warnings": list(self.warnings)}
         if self.error is not None:
             out["error"] = self.error
         return out
@@ -67,7 +64,7 @@ class VerdictTotals:
     def add(self, verdict: FileVerdict) -> None:
         """Count one in."""
         self.files += 1
-        word = verdict.verdict or "unreadable"
+        word = verdict.word
         self.verdicts[word] = self.verdicts.get(word, 0) + 1
         if verdict.exit_code:
             self.exit_code = max(self.exit_code, verdict.exit_code, key=_WORST.index)
@@ -162,10 +159,9 @@ def _judged(judging: TrustSource, some: Sequence[_Read]) -> Iterator[FileVerdict
 
 def _verdict(path: Path, image: Image, checks: Sequence[Check]) -> FileVerdict:
     verified = Verification(image.uuid, tuple(checks), scope="image")
-    verdict = verified.verdict
-    result = FileVerdict(path, image.uuid.hex(), verdict, verified.checks)
+    result = FileVerdict(path, verified)
     try:
-        if verdict != "authentic":
+        if verified.verdict != "authentic":
             require_authentic(verified)
         return _with_warnings(result, image)
     except TedsProvisionError as error:
@@ -179,7 +175,7 @@ def _with_warnings(result: FileVerdict, image: Image) -> FileVerdict:
     findings = teds.guard.check_calibration(image.unsigned_blocks())
     texts = tuple(f"channel {finding.channel}: {finding.message}" for finding in findings)
     harmful = [text for text, finding in zip(texts, findings, strict=True) if finding.severity == "error"]
-    whole = FileVerdict(result.path, result.uuid, result.verdict, result.checks, texts)
+    whole = replace(result, warnings=texts)
     return _ended(whole, PolicyError(f"The calibration is refused: {harmful[0]}.")) if harmful else whole
 
 

@@ -12,16 +12,9 @@ from teds_provision.provisioning.agree import agreed_elsewhere, proof_of_reset, 
 from teds_provision.provisioning.conversation import HEARD, Conversation
 from teds_provision.provisioning.firmware import keep_firmware, read_firmware
 from teds_provision.provisioning.identify import IdentifiedNode, prove
-from teds_provision.provisioning.readings import NodeVerdict
 from teds_provision.provisioning.teds_read import read_block, read_identity, read_image
-from teds_provision.provisioning.verify import (
-    Check,
-    Verification,
-    freshness_floor_of,
-    possession_check,
-    session_check,
-    verify_image,
-)
+from teds_provision.provisioning.verify import freshness_floor_of, possession_check, session_check, verify_image
+from teds_provision.shapes.verdict import Check, NodeVerdict, Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now
 from teds_provision.teds.codec.model import AccessCode

@@ -6,5 +6,6 @@ module           what it holds
 ``metadata``     facts beside the type of a field: of its JSON schema, of its option on the command line
 ``measurement``  a measurement's settings: options, request and answer of the API, the store's columns
 ``problem``      an error as JSON: of --json, of the API, in its description, and read back by ``client``
+``verdict``      the checks of a datasheet, their one verdict, and how it is known
 ===============  =====================================================================================
 """

@@ -27,9 +27,10 @@ from teds_provision.provisioning.agree import agree, require_session
 from teds_provision.provisioning.build import BuildOrder, build
 from teds_provision.provisioning.commands import SignOrder, sign_image
 from teds_provision.provisioning.identify import identify
-from teds_provision.provisioning.verify import Verification, verify_image
+from teds_provision.provisioning.verify import verify_image
 from teds_provision.provisioning.verify_node import verify_at_node
 from teds_provision.provisioning.write import write
+from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station, initialise
 from teds_provision.station.store import WhitelistEntry
 from teds_provision.teds.codec import security

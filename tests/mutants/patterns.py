@@ -210,7 +210,7 @@ PATTERNS = (
     Pattern(
         "only good signatures are floors", "freshness_floor_of", "datasheet.signature_good(shown, octets, uuid)", "True"
     ),
-    Pattern("no session, no verdict", "Verification.verdict", "_SESSION in failed", "False"),
+    Pattern("no session, no verdict", "Verification.verdict", "SESSION in failed", "False"),
     Pattern(
         "write refuses another epoch",
         "_require_newer",

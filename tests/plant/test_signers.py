@@ -13,13 +13,8 @@ from teds_provision.provisioning.build import BuildOrder
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import provision
-from teds_provision.provisioning.verify import (
-    Verification,
-    require_authentic,
-    snapshot_trust,
-    verify_image,
-    verify_images,
-)
+from teds_provision.provisioning.verify import require_authentic, snapshot_trust, verify_image, verify_images
+from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
 from teds_provision.teds.image import Image
 from tests.bench import Board, talk

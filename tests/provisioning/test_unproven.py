@@ -22,8 +22,9 @@ from teds_provision.provisioning.commands import NodeVisit, ReadReport, read_at,
 from teds_provision.provisioning.conversation import Conversation, refused
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.meeting import drop_duplicate_uuids, refuse_duplicate_uuids
-from teds_provision.provisioning.verify import Verification, require_authentic
+from teds_provision.provisioning.verify import require_authentic
 from teds_provision.provisioning.verify_node import verify_at_node
+from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry
 from teds_provision.teds.image import SECURITY, Image

@@ -17,9 +17,10 @@ from teds_provision.provisioning.commands import SignOrder, sign_image
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.sign import known_node_keys, sign
 from teds_provision.provisioning.teds_read import read_image
-from teds_provision.provisioning.verify import FreshnessFloor, Verification, freshness_floor_of, verify_image
+from teds_provision.provisioning.verify import FreshnessFloor, freshness_floor_of, verify_image
 from teds_provision.provisioning.verify_node import verify_node
 from teds_provision.provisioning.write import write
+from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store import TrustRecord
 from teds_provision.teds.codec import security

@@ -21,8 +21,8 @@ from teds_provision.sanitize import printable
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from teds_provision.provisioning.verify import Verification
     from teds_provision.provisioning.verify_files import FileVerdict
+    from teds_provision.shapes.verdict import Verification
 
 
 @command(
@@ -72,13 +72,7 @@ def verify(
             node=node,
         )
     verified = done.verified
-    result: dict[str, Any] = {
-        "uuid": verified.uuid.hex(),
-        "scope": verified.scope,
-        "verdict": verified.verdict,
-        "checks": [check.to_json() for check in verified.checks],
-        "warnings": list(done.warnings),
-    }
+    result: dict[str, Any] = {**verified.to_json(), "warnings": list(done.warnings)}
     if verified.scope == "node":
         result["firmware"] = done.firmware and done.firmware.to_json()
     for warning in done.warnings:
@@ -137,7 +131,8 @@ def verify_many(app: App, what: Sequence[str]) -> None:
 
 def _line(found: FileVerdict) -> str:
     why = found.error["message"] if found.error is not None else "; ".join(found.warnings)
-    text = f"{found.verdict or 'unreadable':<13}  {found.uuid or '-':<20}  {found.path}"
+    uuid = found.verified.uuid.hex() if found.verified is not None else "-"
+    text = f"{found.word:<13}  {uuid:<20}  {found.path}"
     return printable(f"{text}: {why}" if why else text)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -75,16 +76,7 @@ def doctor(
     )
     found = list(doctor_room.checks.examine(system))
     findings = [finding for _, finding in found]
-    checks = [
-        {
-            "name": finding.name,
-            "result": finding.result,
-            "why": finding.why,
-            "fix": finding.fix,
-            "sampled": finding.sampled,
-        }
-        for finding in findings
-    ]
+    checks = [asdict(finding) for finding in findings]
     code = doctor_room.checks.exit_code(found)
     counts = {word: sum(finding.result == word for finding in findings) for word in _STYLES}
     if report is None:

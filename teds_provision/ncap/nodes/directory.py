@@ -21,9 +21,9 @@ from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.provisioning.inventory import with_verdicts
-from teds_provision.provisioning.readings import NodeVerdict
 from teds_provision.sanitize import by_name
 from teds_provision.shapes.problem import Problem
+from teds_provision.shapes.verdict import NodeVerdict
 from teds_provision.station.overview import Search
 from teds_provision.station.shown_units import shown_units, units_of_profile
 from teds_provision.station.station import Station

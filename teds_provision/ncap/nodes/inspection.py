@@ -17,10 +17,11 @@ from teds_provision.provisioning.agree import session_if_keyed
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.firmware import read_firmware
 from teds_provision.provisioning.identify import IdentifiedNode, identify
-from teds_provision.provisioning.readings import NodeVerdict, is_keyed, keep
+from teds_provision.provisioning.readings import is_keyed, keep
 from teds_provision.provisioning.teds_read import list_blocks, read_block, read_identity, read_image
-from teds_provision.provisioning.verify import Verification, freshness_floor_of, session_check, verify_image
+from teds_provision.provisioning.verify import freshness_floor_of, session_check, verify_image
 from teds_provision.provisioning.verify_node import verify_in_session
+from teds_provision.shapes.verdict import NodeVerdict, Verification
 from teds_provision.station.firmware import firmware_of
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now

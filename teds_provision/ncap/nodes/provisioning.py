@@ -43,8 +43,9 @@ from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter, StepResult
 from teds_provision.provisioning.provision import ProvisionResult, new_whitelist_entry, provision
 from teds_provision.provisioning.teds_read import list_blocks
-from teds_provision.provisioning.verify import Verification, require_authentic
+from teds_provision.provisioning.verify import require_authentic
 from teds_provision.shapes.problem import Problem, problem_of
+from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store.audit import ACTOR, acting_for
 

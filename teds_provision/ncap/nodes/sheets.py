@@ -16,9 +16,10 @@ from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.datasheet_edit import SheetPlan, plan_sheet, write_sheet
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.progress import SilentReporter
-from teds_provision.provisioning.readings import NodeVerdict, is_keyed, verdict_of
+from teds_provision.provisioning.readings import is_keyed, verdict_of
 from teds_provision.provisioning.teds_read import read_image
-from teds_provision.provisioning.verify import Verification, freshness_floor_of, session_check, verify_image
+from teds_provision.provisioning.verify import freshness_floor_of, session_check, verify_image
+from teds_provision.shapes.verdict import NodeVerdict, Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now
 from teds_provision.teds import curve as curves_of_guard

@@ -1,0 +1,118 @@
+"""The checks of a datasheet, their one verdict, and how it is known.
+
+``verify``, the API, its description and ``client`` take them from here. One more member is a field, its value in
+``to_json`` and its type in the typed dictionary below, which type checkers hold against ``to_json``. What is checked:
+step 7, ``provisioning/verify.py``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final, Literal, NamedTuple, TypedDict
+
+CheckResult = Literal["passed", "failed", "skipped"]
+VerdictWord = Literal["authentic", "unsigned", "unverified", "not authentic", "unproven"]
+"""``unverified`` is in the published description alone: no version has given it."""
+Scope = Literal["node", "image"]
+Origin = Literal["session", "kept", "plain"]
+
+SESSION: Final = "session"
+"""The check that the TEDS came from the node."""
+PAGES: Final = "pages"
+"""The check that this station has every page of the plant that says who signed."""
+FRESHNESS: Final = frozenset({"sequence", "key epoch"})
+MERELY_UNSIGNED: Final = frozenset({"signed", "every TEDS is signed"})
+"""Checks that fail if the only fault is a missing signature."""
+
+
+class Check(NamedTuple):  # a tuple: thirteen of them for each of ten thousand files
+    """One check of the datasheet; ``why`` is the finding.
+
+    ``kept``: the TEDS concerned were not read again since the node last started; those of the last reading are judged
+    in their place.
+    """
+
+    name: str
+    result: CheckResult
+    why: str = ""
+    kept: bool = False
+
+    def to_json(self) -> CheckMembers:
+        """As `verify --json` and the API have it; a kept one has ``from: kept`` besides."""
+        found = CheckMembers(name=self.name, result=self.result, why=self.why)
+        return found | {"from": "kept"} if self.kept else found  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Verification:
+    """All checks and the one verdict. ``scope``: a node, or an image file alone.
+
+    ``unsigned``: the only fault is that (part of) it has no signature. ``unproven``: a key of the node is held and no
+    session was opened, so that the answers may be a replay of recorded ones.
+    """
+
+    uuid: bytes
+    checks: tuple[Check, ...]
+    scope: Scope = "node"
+
+    @cached_property  # asked for several times of each of ten thousand files
+    def verdict(self) -> VerdictWord:
+        """One word for all checks."""
+        failed = {check.name for check in self.checks if check.result == "failed"}
+        if PAGES in failed and failed <= {PAGES, SESSION}:
+            return "unproven"
+        if SESSION in failed:  # what came without a session proves nothing, except that it is too old
+            return "not authentic" if failed & FRESHNESS else "unproven"
+        if failed - MERELY_UNSIGNED:
+            return "not authentic"
+        return "unsigned" if failed else "authentic"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the members that `verify --json` begins with, of a node as of a file."""
+        checks = [check.to_json() for check in self.checks]
+        return {"uuid": self.uuid.hex(), "scope": self.scope, "verdict": self.verdict, "checks": checks}
+
+
+@dataclass(frozen=True)
+class NodeVerdict:
+    """The verdict on a node, and what it rests on.
+
+    ``origin``: every TEDS was read in a ``session`` since the node last started; or ``kept``: the Security TEDS was,
+    and the rest is as it was read before; or ``plain``: nothing was read in a session. ``at`` is when the TEDS were
+    read (ISO 8601), ``by`` the command that did.
+    """
+
+    verified: Verification
+    origin: Origin
+    at: str
+    by: str
+
+    def to_json(self) -> VerdictMembers:
+        """api.md, ``verdict``."""
+        checks = [check.to_json() for check in self.verified.checks]
+        return {"verdict": self.verified.verdict, "checks": checks, "from": self.origin, "at": self.at, "by": self.by}
+
+    def reading(self) -> dict[str, str]:
+        """Return how the verdict is known, as ``reading`` of `nodes --json`."""
+        return {"from": self.origin, "at": self.at, "by": self.by}
+
+
+class CheckMembers(TypedDict):
+    """One check of a verdict."""
+
+    name: str
+    result: CheckResult
+    why: str
+
+
+OriginMember = TypedDict("OriginMember", {"from": Origin})  # a keyword of Python
+
+
+class VerdictMembers(OriginMember):
+    """Verdict on a datasheet, and how it is known."""
+
+    verdict: VerdictWord
+    checks: list[CheckMembers]
+    at: str
+    by: str
