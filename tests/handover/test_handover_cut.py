@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import signal
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,10 +15,9 @@ from teds_provision.handover.pending import close
 from teds_provision.station.station import Station
 from teds_provision.vault import forget_vaults
 from tests.bench import Board
+from tests.e2e.desk import Running
 from tests.handover.desk import Pair, everything, held, session
 from tests.handover.victim import counted, export, open_station, take
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 class Killed(BaseException):
@@ -134,8 +132,12 @@ def test_an_import_cut_at_every_write(prepared: Prepared) -> None:
 
 
 def kill(home: Path, act: str, step: int, bundle: Path) -> int:
-    command = [sys.executable, "-m", "tests.handover.victim", str(home), act, str(step), str(bundle)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, timeout=60, check=False).returncode
+    program = (sys.executable, "-m", "tests.handover.victim")
+    running = Running(home, act, step, bundle, program=program)
+    try:
+        return running.end().code
+    finally:
+        running.close()
 
 
 @pytest.mark.parametrize("step", [1, 6, 9, 10, 11, 12])

@@ -283,7 +283,15 @@ def test_an_actuator_is_safe_when_the_daemon_ends(desk: Desk) -> None:
     assert (entries[-1]["outcome"], entries[-1]["detail"]["safe"]) == ("done", True)
 
 
-@pytest.mark.parametrize("moment", [0.0, 0.05, 0.2, 0.5])
+_OTHER_MOMENTS = pytest.mark.nightly(
+    "tests/ncap/test_survives.py::test_no_virtual_node_outlives_a_daemon_that_was_killed[0.0],"
+    " tests/ncap/test_survives.py::test_no_virtual_node_outlives_a_daemon_that_was_killed[0.2]: as it starts, and after"
+)
+
+
+@pytest.mark.parametrize(
+    "moment", [0.0, pytest.param(0.05, marks=_OTHER_MOMENTS), 0.2, pytest.param(0.5, marks=_OTHER_MOMENTS)]
+)
 def test_no_virtual_node_outlives_a_daemon_that_was_killed(desk: Desk, moment: float) -> None:
     """Also one that was just being started: a browser's page would show a node that nobody looks after."""
     service = Service(desk, desk.station()).start()

@@ -310,7 +310,7 @@ def test_the_measurement_of_a_board_pauses_and_that_of_another_one_does_not(benc
     one, two = bench.boards
     with measured(bench) as report:
         before = {node.uuid: len(told(bench, node)) for node in bench.boards}
-        image = bench.image("1.8.0", octets=20_000)
+        image = bench.image("1.8.0", octets=8_000)
         assert rows(bench.update(image, one, dry_run=True))[one.uuid]["interrupts"]
         assert rows(bench.done(image, one))[one.uuid]["result"] == "updated"
         until(lambda: report(one)["state"] == "running")
@@ -323,7 +323,7 @@ def test_the_measurement_of_a_board_pauses_and_that_of_another_one_does_not(benc
 def test_no_value_of_a_measured_board_is_lost_beside_an_update(bench: Bench) -> None:
     one, two = bench.boards
     with measured(bench) as report:
-        before, image = report(two), bench.image(f"4.0.{time.monotonic_ns() // 10**9 % 10_000}", octets=20_000)
+        before, image = report(two), bench.image(f"4.0.{time.monotonic_ns() // 10**9 % 10_000}", octets=8_000)
         assert rows(bench.done(image, one))[one.uuid]["result"] == "updated"
         after = report(two)
         assert after["samples"] > before["samples"]
@@ -355,7 +355,7 @@ def test_a_board_whose_actuator_is_in_use_is_refused(bench: Bench) -> None:
 def test_the_same_update_goes_on_after_the_service_was_cut(bench: Bench, how: str) -> None:
     version = {"kill -9": "2.0.0", "restart, measured": "2.1.0"}[how]
     with measured(bench) if "measured" in how else nullcontext() as report:
-        begun = bench.update(bench.image(version, octets=100_000), *bench.boards)
+        begun = bench.update(bench.image(version, octets=12_000), *bench.boards)
         if how == "kill -9":
 
             def under_way() -> bool:

@@ -31,7 +31,19 @@ def offered(page: Page, words: str) -> float:
     return float(found[1]) * (1000 if found[2] == "kHz" else 1)
 
 
-@pytest.mark.parametrize("width", [360, 1600])
+@pytest.mark.parametrize(
+    "width",
+    [
+        360,
+        pytest.param(
+            1600,
+            marks=pytest.mark.nightly(
+                "tests/page/test_rates.py::test_a_rate_that_can_be_carried_is_a_preset_and_a_lower_one_after_losses[360]"
+                ": the same ways on a narrow screen; tests/page/test_access.py looks at the views at both widths"
+            ),
+        ),
+    ],
+)
 def test_a_rate_that_can_be_carried_is_a_preset_and_a_lower_one_after_losses(
     browser: Browser, fresh: Lab, width: int
 ) -> None:

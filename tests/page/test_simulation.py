@@ -25,7 +25,19 @@ def opening(station: client.Client, uuid: str) -> Any:
     return None if last is None or last["value"] is None else round(1000 * last["value"], 1)
 
 
-@pytest.mark.parametrize("width", [360, 1600])
+@pytest.mark.parametrize(
+    "width",
+    [
+        360,
+        pytest.param(
+            1600,
+            marks=pytest.mark.nightly(
+                "tests/page/test_simulation.py::test_values_are_set_by_keyboard_and_one_page_has_the_place[360]"
+                ": the same ways on a narrow screen; tests/page/test_access.py looks at the views at both widths"
+            ),
+        ),
+    ],
+)
 def test_values_are_set_by_keyboard_and_one_page_has_the_place(browser: Browser, lab: Lab, width: int) -> None:
     with lab.visited(), opened(browser, lab, width=width, route="virtual") as page:
         page.get_by_label("Transducer type").select_option("gripper")

@@ -328,6 +328,7 @@ def test_actuators_dead_man_set_and_drive(floor: Floor) -> None:
     end = time.monotonic() + 10.5
     while time.monotonic() < end:
         station.clock()
+        station.wire.turn(0.25)
     assert station.states()[1][hand] == (ACTUATOR | SAFE | STOPPED, 0)
     refused(2, lambda: station.do(hand, 3, 2, bytes(4) + b"\1\0"))
     # Drive: values without a reply, each good once, in its time.

@@ -75,8 +75,15 @@ class Master:
 
     def published(self) -> set[str]:
         """Topics that somebody publishes, by the master."""
+        return self._topics(0)
+
+    def heard(self) -> set[str]:
+        """Topics that somebody subscribes to, by the master."""
+        return self._topics(1)
+
+    def _topics(self, which: int) -> set[str]:
         state: Any = xmlrpc.client.ServerProxy(self.uri).getSystemState("/test")
-        return {topic for topic, _ in state[2][0]}
+        return {topic for topic, _ in state[2][which]}
 
     def tool(self, *words: str) -> str:
         command = ["/usr/bin/python3", f"/usr/bin/{words[0]}", *words[1:]]
