@@ -67,10 +67,24 @@ def scripts() -> dict[str, frozenset[str]]:
 
 
 def c_sources() -> dict[str, frozenset[str]]:
-    """Return, for each source of the C library, the sources whose headers it includes: one header per source."""
-    sources = {path.stem: path for path in (PACKAGE.parent / "firmware" / "src").glob("*.c")}
-    included = {name: re.findall(r'^#include "(\w+)\.h"$', path.read_text(), re.M) for name, path in sources.items()}
-    return {name: frozenset(sources.keys() & set(headers) - {name}) for name, headers in included.items()}
+    """Return, for each source of the C library, the sources whose headers it includes or whose functions it calls.
+
+    The functions of teds/node.h are the boards' interface: a source that calls one needs no header of ours, and still
+    depends on the source that defines it.
+    """
+    texts = {path.stem: path.read_text() for path in (PACKAGE.parent / "firmware" / "src").glob("*.c")}
+    codes = {name: re.sub(r"/\*.*?\*/", "", text, flags=re.S) for name, text in texts.items()}
+    home = {
+        function: name
+        for name, code in codes.items()
+        for function in re.findall(r"^(?!static )\w[^=;{}]*?\b(teds_\w+)\([^;{}]*\)\n\{", code, re.M)
+    }
+    headers = {path.stem: path.read_text() for path in (PACKAGE.parent / "firmware" / "src").glob("*.h")}
+    included = {
+        name: re.findall(r'^#include "(\w+)\.h"$', text + headers.get(name, ""), re.M) for name, text in texts.items()
+    }
+    called = {name: {home.get(word, "") for word in re.findall(r"\bteds_\w+", code)} for name, code in codes.items()}
+    return {name: frozenset(texts.keys() & ({*included[name]} | called[name]) - {name}) for name in texts}
 
 
 def c_shared_names() -> list[str]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import re
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -94,16 +95,29 @@ def test_scripts_of_the_page_import_each_other_one_way(house: ModuleType) -> Non
     assert house.circles(found) == []
 
 
-def test_the_c_library_has_a_header_for_each_source_and_no_more_circles(house: ModuleType) -> None:
-    """Eleven sources still include each other in one circle; the lower ones must stay out of it."""
+def test_no_sources_of_the_c_library_include_or_call_each_other_in_a_circle(house: ModuleType) -> None:
     found = house.c_sources()
+    assert {"slots", "session", "stream", "commands", "can"} <= found.keys(), "the sources are not read"
+    assert {"replies", "links", "isotp"} <= found["can"], "includes are not read"
+    assert "ble" in found["tnep"], "a call of teds/node.h is not read"
+    assert house.circles(found) == []
+    lowest = {"octets", "clock", "ndef", "isotp", "security_teds", "crypto", "area"}
+    assert {name: found[name] for name in lowest if found[name] - lowest} == {}, "the lowest ones know no upper one"
+
+
+def test_the_readme_lists_the_sources_of_the_c_library_from_the_bottom_up(house: ModuleType) -> None:
+    text = (ROOT / "firmware" / "README.md").read_text(encoding="utf-8").partition("uses only what stands above")[2]
+    rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
+    order = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    found = house.c_sources()
+    assert sorted(order) == sorted(found)
+    assert {name: found[name] - set(order[: order.index(name)]) for name in order} == dict.fromkeys(order, set())
+
+
+def test_each_source_of_the_c_library_has_a_header_and_names_of_its_own(house: ModuleType) -> None:
     headers = {path.stem for path in (ROOT / "firmware" / "src").glob("*.h")}
-    assert found.keys() - headers == {"t4t"}, "its interface is the boards' alone, in teds/node.h"
-    ring = {name for group in house.circles(found) for name in group}
-    assert len(ring) <= 11
-    assert not ring & {"octets", "clock", "ndef", "isotp", "security_teds", "t4t"}
-    low = {"octets", "clock", "ndef", "isotp", "security_teds", "about", "manage"}
-    assert {name: found[name] - low for name in low if found[name] - low} == {}, "the lower ones know no upper one"
+    assert house.c_sources().keys() - headers == {"node", "t4t"}, "their interface is the boards' alone, in teds/node.h"
+    assert headers - house.c_sources().keys() == {"inside"}, "a header without a source"
     assert house.c_shared_names() == [], "a backtrace tells which file it was"
 
 

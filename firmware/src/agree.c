@@ -1,154 +1,24 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Key agreement (security-teds.md, 3): Request, Confirm, and the hashes, keys and signatures under them.
- *
- * NIST SP 800-56A ECC CDH over two one-time keys and the station's static one, HKDF of RFC 5869. The node's identity
- * key only signs. Z, OKM and both one-time keys are wiped after use.
- */
+/* Key agreement (security-teds.md, 3): Request, which a station signs and the node answers, and Confirm, which makes the
+ * new key count. Z, OKM and both one-time keys are wiped after use. */
 #include "agree.h"
 #include "clock.h"
+#include "crypto.h"
+#include "datasheet.h"
 #include "operation.h"
-#include "teds_store.h"
+#include "slots.h"
 #include "inside.h"
 
 #define PENDING_NS (60u * TEDS_SECOND)
 #define REQUEST_OCTETS 259u
-#define LABEL(text) {(const uint8_t *)(text), sizeof(text)}          /* ends in 00 */
-#define MAC_LABEL(text) {(const uint8_t *)(text), sizeof(text) - 1u} /* does not */
-
-void teds_sha256_parts(const teds_node *node, const teds_part *parts, size_t count, uint8_t out[32])
-{
-    const teds_port *port = node->port;
-    teds_sha256 state;
-    port->sha256_start(port->user, &state);
-    for (size_t i = 0; i < count; i++) {
-        port->sha256_update(port->user, &state, parts[i].octets, parts[i].length);
-    }
-    port->sha256_finish(port->user, &state, out);
-}
-
-int teds_hkdf_expand(const teds_node *node, const uint8_t prk[32], const teds_part *info, size_t count, uint8_t *out,
-                     size_t length)
-{
-    uint8_t block[32];
-    teds_part parts[8];
-    uint8_t number = 1;
-    int failed = 0;
-    for (size_t i = 0; i < count; i++) {
-        parts[1 + i] = info[i];
-    }
-    parts[0] = (teds_part){block, 0}; /* the block before, from the second on */
-    parts[1 + count] = (teds_part){&number, 1};
-    for (size_t at = 0; at < length && !failed; at += 32) {
-        failed = node->port->hmac(node->port->user, prk, 32, parts, count + 2, block);
-        memcpy(out + at, block, length - at < 32 ? length - at : 32);
-        parts[0].length = 32;
-        number++;
-    }
-    teds_wipe(block, sizeof block);
-    return failed;
-}
-
-int teds_hkdf(const teds_node *node, const uint8_t salt[16], const teds_part *parts, size_t count, uint8_t *out,
-              size_t length)
-{
-    uint8_t prk[32];
-    int failed = node->port->hmac(node->port->user, salt, 16, parts, 1, prk);
-    if (!failed) {
-        failed = teds_hkdf_expand(node, prk, parts + 1, count - 1, out, length);
-    }
-    teds_wipe(prk, sizeof prk);
-    return failed;
-}
-
-/* Group order of P-256 and its half, SP 800-186. */
-static const uint8_t ORDER[32] = {0xFF, 0xFF, 0xFF, 0xFF, 0,    0,    0,    0,    0xFF, 0xFF, 0xFF,
-                                  0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xBC, 0xE6, 0xFA, 0xAD, 0xA7, 0x17,
-                                  0x9E, 0x84, 0xF3, 0xB9, 0xCA, 0xC2, 0xFC, 0x63, 0x25, 0x51};
-static const uint8_t HALF_ORDER[32] = {0x7F, 0xFF, 0xFF, 0xFF, 0x80, 0,    0,    0,    0x7F, 0xFF, 0xFF,
-                                       0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xDE, 0x73, 0x7D, 0x56, 0xD3, 0x8B,
-                                       0xCF, 0x42, 0x79, 0xDC, 0xE5, 0x61, 0x7E, 0x31, 0x92, 0xA8};
-
-bool teds_point_good(const teds_node *node, const uint8_t point[65])
-{
-    return point[0] == 4 && memcmp(point, node->identity.point, 65) != 0 && node->port->p256_good(node->port->user, point);
-}
-
-static bool is_zero(const uint8_t number[32])
-{
-    uint8_t any = 0;
-    for (size_t i = 0; i < 32; i++) {
-        any |= number[i];
-    }
-    return any == 0;
-}
-
-bool teds_verify(const teds_node *node, const uint8_t point[65], const teds_part *parts, size_t count,
-                 const uint8_t signature[64])
-{
-    uint8_t hash[32];
-    if (is_zero(signature) || is_zero(signature + 32) ||
-        memcmp(signature, ORDER, 32) >= 0 || memcmp(signature + 32, HALF_ORDER, 32) > 0) {
-        return false;
-    }
-    teds_sha256_parts(node, parts, count, hash);
-    return node->port->p256_verify(node->port->user, point, hash, signature);
-}
-
-int teds_sign(const teds_node *node, const teds_part *parts, size_t count, uint8_t out[64])
-{
-    uint32_t borrow = 0;
-    uint8_t hash[32];
-    teds_sha256_parts(node, parts, count, hash);
-    if (node->port->p256_sign(node->port->user, &node->identity.key, hash, out) != 0) {
-        return -TEDS_FAILURE;
-    }
-    if (memcmp(out + 32, HALF_ORDER, 32) > 0) { /* s becomes n - s */
-        for (size_t i = 32; i-- > 0;) {
-            uint32_t value = (uint32_t)ORDER[i] - out[32 + i] - borrow;
-            out[32 + i] = (uint8_t)value;
-            borrow = value >> 31;
-        }
-    }
-    return 0;
-}
-
-int teds_mac(const teds_node *node, const uint8_t *key, size_t key_length, const teds_part *parts, size_t count,
-             uint8_t out[16])
-{
-    uint8_t mac[32];
-    int failed = node->port->hmac(node->port->user, key, key_length, parts, count, mac);
-    if (!failed) {
-        memcpy(out, mac, 16);
-    }
-    teds_wipe(mac, sizeof mac);
-    return failed;
-}
-
-int teds_one_time_make(teds_node *node)
-{
-    teds_one_time *own = &node->one_time;
-    if (!own->ready) {
-        own->ready = node->port->p256_make(node->port->user, TEDS_KEY_AGREES, &own->key, own->point) == 0;
-    }
-    return own->ready ? 0 : -TEDS_FAILURE;
-}
-
-void teds_one_time_drop(teds_node *node)
-{
-    teds_one_time *own = &node->one_time;
-    if (own->ready && node->port->p256_drop != NULL) {
-        node->port->p256_drop(node->port->user, &own->key);
-    }
-    teds_wipe(own, sizeof *own);
-}
 
 void teds_pending_forget(teds_node *node)
 {
     teds_wipe(&node->pending, sizeof node->pending);
 }
 
-int teds_agree(teds_node *node, const uint8_t *payload, const uint8_t nonce[16], const uint8_t script[32],
-               uint8_t node_tag[16])
+int teds_agree_keys(teds_node *node, const uint8_t *payload, const uint8_t nonce[16], const uint8_t script[32],
+                    uint8_t node_tag[16])
 {
     const teds_port *port = node->port;
     const teds_one_time *own = &node->one_time;
@@ -170,7 +40,7 @@ int teds_agree(teds_node *node, const uint8_t *payload, const uint8_t nonce[16],
     return failed;
 }
 
-int teds_transcript(teds_node *node, const uint8_t *request, const uint8_t *reply_head, uint8_t out[32])
+int teds_hash_transcript(teds_node *node, const uint8_t *request, const uint8_t *reply_head, uint8_t out[32])
 {
     teds_source source;
     uint8_t teds[32];
@@ -184,13 +54,6 @@ int teds_transcript(teds_node *node, const uint8_t *request, const uint8_t *repl
     return 0;
 }
 
-bool teds_certified(const teds_node *node, const uint8_t station[65], const uint8_t ca[65],
-                    const uint8_t signature[64])
-{
-    const teds_part certified[] = {LABEL("TEDS1 station key"), {station, 65}};
-    return teds_verify(node, ca, certified, 2, signature);
-}
-
 static int check_request(const teds_node *node, const uint8_t *payload)
 {
     const uint8_t *station = payload, *signature = payload + 65, *ca = payload + 129, *one_time = payload + 194;
@@ -201,14 +64,14 @@ static int check_request(const teds_node *node, const uint8_t *payload)
     if (!teds_in_factory(node) && memcmp(ca, node->state.agreed.ca, 65) != 0) {
         return -TEDS_UNTRUSTED;
     }
-    if (!teds_certified(node, station, ca, signature)) {
+    if (!teds_station_certified(node, station, ca, signature)) {
         return -TEDS_BAD_SIGNATURE;
     }
     return node->state.epoch == UINT32_MAX ? -TEDS_WRONG_EPOCH : 0;
 }
 
 /* What a checked Request makes: the reply's 165 octets, and what pends. */
-static int answer(teds_node *node, const uint8_t *payload, uint8_t *out)
+static int answer_request(teds_node *node, const uint8_t *payload, uint8_t *out)
 {
     const teds_port *port = node->port;
     uint8_t script[32];
@@ -216,8 +79,8 @@ static int answer(teds_node *node, const uint8_t *payload, uint8_t *out)
     if (!failed) {
         teds_put32(out + 16, node->state.epoch + 1);
         memcpy(out + 20, node->one_time.point, 65);
-        failed = teds_transcript(node, payload, out, script) != 0 ||
-                 teds_agree(node, payload, out, script, out + 85) != 0;
+        failed = teds_hash_transcript(node, payload, out, script) != 0 ||
+                 teds_agree_keys(node, payload, out, script, out + 85) != 0;
     }
     if (!failed) {
         const teds_part agreed[] = {LABEL("TEDS1 agree"), {script, 32}};
@@ -238,7 +101,7 @@ int teds_request(teds_node *node, const teds_command *command, teds_origin *orig
         return length;
     }
     teds_pending_forget(node);
-    length = answer(node, payload, out);
+    length = answer_request(node, payload, out);
     teds_one_time_drop(node);
     if (length < 0) {
         teds_pending_forget(node);
@@ -276,9 +139,9 @@ int teds_confirm(teds_node *node, const teds_command *command, teds_origin *orig
     state.epoch = pending->epoch;
     state.agreed = pending->agreed; /* its CA is the kept one, outside factory state: Request has seen to that */
 #if TEDS_OPERATION
-    teds_everything_safe(node);
+    teds_make_all_safe(node);
 #endif
-    failed = teds_store_write(node, &state, NULL);
+    failed = teds_slots_write(node, &state, NULL);
     teds_wipe(&state, sizeof state);
     if (failed) {
         return failed;

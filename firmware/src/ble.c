@@ -1,10 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* BLE (wire.md): commands and replies as frames `transaction 2, total 2, offset 2, piece` over two characteristics. The
- * GATT server, its connections and advertising are the chip's stack; when to advertise and whom to drop is said here. */
+ * GATT server, its connections and advertising are the chip's stack; when to advertise and which
+ * connection to drop is decided here. */
 #include "ble.h"
 #include "clock.h"
 #include "drive.h"
-#include "node.h"
+#include "links.h"
+#include "replies.h"
 #include "session.h"
 #include "stream.h"
 #include "inside.h"
@@ -14,7 +16,6 @@
 #define HEAD 6u
 #define LEAST_MTU 23u
 #define MOST_VALUE 512u
-#define DATA_HEAD 4u /* ATT's three octets, and the stream */
 #define STRANGER_NS (10u * TEDS_SECOND)
 #define TAPPED_NS (60u * TEDS_SECOND)
 
@@ -134,17 +135,6 @@ size_t teds_ble_notify(teds_node *node, uint8_t connection, uint8_t out[MOST_VAL
 }
 
 #if TEDS_OPERATION
-uint16_t teds_ble_longest(const teds_node *node, teds_link link)
-{
-    const size_t connection = link - (size_t)TEDS_LINK_BLE;
-    const teds_ble_line *line;
-    if (connection >= TEDS_BLE_CONNECTIONS) {
-        return 0;
-    }
-    line = &node->ble.lines[connection];
-    return line->used && line->hears ? (uint16_t)(line->mtu - DATA_HEAD) : 0;
-}
-
 void teds_ble_hears(teds_node *node, uint8_t connection, bool hears)
 {
     teds_ble_line *line = find_connection(node, connection);
@@ -200,26 +190,6 @@ bool teds_ble_drops(teds_node *node, uint8_t connection)
         line->silent_since = teds_now(node);
     }
     return teds_now(node) >= line->silent_since + STRANGER_NS;
-}
-
-/* The place of a stored reply is read in pieces, and may not be taken by another link meanwhile. */
-bool teds_ble_sends(const teds_node *node, const teds_stored_reply *reply)
-{
-    for (size_t i = 0; i < TEDS_BLE_CONNECTIONS; i++) {
-        if (node->ble.lines[i].used && node->ble.lines[i].sends && node->ble.lines[i].reply == reply) {
-            return true;
-        }
-    }
-    return false;
-}
-
-void teds_ble_forget(teds_node *node, const teds_stored_reply *reply)
-{
-    for (size_t i = 0; i < TEDS_BLE_CONNECTIONS; i++) {
-        if (node->ble.lines[i].reply == reply) {
-            node->ble.lines[i].sends = false;
-        }
-    }
 }
 
 #else

@@ -4,12 +4,15 @@
 #include "can.h"
 #include "clock.h"
 #include "drive.h"
+#include "identity.h"
 #include "isotp.h"
+#include "links.h"
 #include "manage.h"
-#include "node.h"
 #include "operation.h"
+#include "replies.h"
 #include "session.h"
 #include "stream.h"
+#include "trigger.h"
 #include "inside.h"
 
 #define PHYSICAL 0x18DA0000u
@@ -17,8 +20,6 @@
 #define ANNOUNCE 0x1CFF0000u
 #define TRIGGER 0x18FF0000u
 #define DRIVE 0x18EF0000u
-#define FIRST_STATION 0xF1u
-#define LAST_STATION 0xF7u
 #define CR_NS TEDS_SECOND
 #define REQUEST_NS (5u * TEDS_SECOND)
 #define MILLISECOND UINT64_C(1000000)
@@ -38,48 +39,27 @@
 #define QUIET_NS (600u * TEDS_SECOND) /* without a conflict: moves are immediate again */
 #define LONGEST_STAY UINT64_C(60)     /* s */
 
-static uint32_t crc_of(const teds_node *node)
-{
-    return teds_crc32(0, node->identity.uuid, sizeof node->identity.uuid);
-}
-
-uint8_t teds_default_address(const teds_node *node)
-{
-    return (uint8_t)(1 + crc_of(node) % TEDS_LAST_ADDRESS);
-}
-
 static bool is_sending(const teds_line *line)
 {
     return line->out_state != TEDS_OUT_IDLE;
 }
 
-/* An answer to everyone counts for nothing here: any stranger can keep one waiting. */
-bool teds_can_sending(const teds_node *node)
-{
-    for (const teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
-        if (is_sending(line) && line->out_reply != NULL) {
-            return true;
-        }
-    }
-    return false;
-}
-
 /* A random wait of up to `most` ns. While the chip has no randomness it follows from the UUID: nodes that start together
  * must not speak together. */
-static uint32_t spread(const teds_node *node, uint32_t most)
+static uint32_t draw_wait(const teds_node *node, uint32_t most)
 {
     uint8_t octets[2];
     if (node->port->random(node->port->user, octets, sizeof octets) != 0) {
-        const uint32_t crc = crc_of(node);
+        const uint32_t crc = teds_uuid_crc(node);
         teds_put16(octets, (uint16_t)(crc ^ crc >> 16));
     }
     return (most >> 16) * teds_get16(octets);
 }
 
-/* -- lines ------------------------------------------------------------------------------------------------------------ */
+/* -- lines --------------------------------------------------------------------------------------------------------- */
 
 /* A message has left, or was given up. */
-static void left(teds_node *node, teds_line *line)
+static void finish_message(teds_node *node, teds_line *line)
 {
     line->out_state = TEDS_OUT_IDLE;
     if (line->out_reply == NULL) {
@@ -90,7 +70,7 @@ static void left(teds_node *node, teds_line *line)
     teds_node_reply_left(node, line->source);
 }
 
-/* An answer to everyone that nobody takes up gives way to whatever else is asked. */
+/* An answer to everyone whose flow control has not come gives way to whatever else is asked. */
 static bool gives_way(const teds_line *line)
 {
     return line->out_reply == NULL && line->out_state == TEDS_OUT_WAITS;
@@ -100,7 +80,7 @@ static bool gives_way(const teds_line *line)
  * a pair with a session needs; nor is that of the long request that is coming in. */
 enum { AT_REST, OF_EVERYONE, OF_A_REPLY, NOT_TO_BE_HAD };
 
-static unsigned holds_on(teds_node *node, const teds_line *line, uint64_t now)
+static unsigned rank_line(teds_node *node, const teds_line *line, uint64_t now)
 {
     if (line->source == 0) {
         return AT_REST;
@@ -120,7 +100,7 @@ static unsigned holds_on(teds_node *node, const teds_line *line, uint64_t now)
 
 /* A station's line; the most readily left one, and of these the one not used for longest. `most`: what may be taken.
  * NULL: none is to be had, or the node has moved by giving a reply up. */
-static teds_line *line_of(teds_node *node, uint8_t source, unsigned most, uint64_t now)
+static teds_line *find_line(teds_node *node, uint8_t source, unsigned most, uint64_t now)
 {
     const uint8_t own = node->can.address;
     unsigned best = NOT_TO_BE_HAD;
@@ -132,14 +112,14 @@ static teds_line *line_of(teds_node *node, uint8_t source, unsigned most, uint64
             each->touched = node->can.touches;
             return each;
         }
-        held = holds_on(node, each, now);
+        held = rank_line(node, each, now);
         if (held <= most && (held < best || (held == best && each->touched < found->touched))) { /* 0: not used */
             found = each;
             best = held;
         }
     }
     if (found != NULL && best == OF_A_REPLY) {
-        left(node, found);
+        finish_message(node, found);
         found = own == node->can.address ? found : NULL;
     }
     if (found != NULL) {
@@ -151,20 +131,11 @@ static teds_line *line_of(teds_node *node, uint8_t source, unsigned most, uint64
     return found;
 }
 
-static void lose_all(teds_node *node)
-{
-    for (uint8_t source = FIRST_STATION; source <= LAST_STATION; source++) {
-        teds_link_forget(node, source);
-    }
-    memset(node->lines, 0, sizeof node->lines);
-    node->can.rx_line = NULL;
-}
-
 /* Two nodes under one address drive each other off the bus: a second of silence, doubling to half a minute. */
-static void be_silent(teds_can *can, uint64_t now)
+static void keep_silent(teds_can *can, uint64_t now)
 {
     if (now < can->back_at) {
-        return; /* told twice */
+        return; /* reported twice */
     }
     if (now >= can->back_at + 2 * LONGEST_SILENCE * TEDS_SECOND) {
         can->bus_offs = 0;
@@ -175,35 +146,23 @@ static void be_silent(teds_can *can, uint64_t now)
 
 void teds_node_bus_off(teds_node *node)
 {
-    lose_all(node);
-    be_silent(&node->can, teds_now(node));
+    teds_can_links_forget(node);
+    keep_silent(&node->can, teds_now(node));
     node->can.announces = node->can.pressed = false;
     if (node->can.moves_to != 0) { /* no reply leaves any more */
-        teds_can_move(node, node->can.moves_to);
+        teds_address_move(node, node->can.moves_to);
     }
 #if TEDS_MANAGED
-    if (node->managed.restart_link >= FIRST_STATION) {
+    if (node->managed.restart_link >= TEDS_FIRST_STATION) {
         teds_restart_after(node, node->managed.restart_link);
     }
 #endif
 }
 
-/* Every link is a pair of addresses: with a new own one all begin anew. */
-void teds_can_move(teds_node *node, uint8_t address)
-{
-    if (address != node->can.address) {
-        node->can.address = address;
-        node->can.gives_up = false; /* the address that was claimed is left */
-        node->can.turned_away = 0;
-        lose_all(node);
-    }
-    node->can.moves_to = 0;
-}
-
-/* -- requests ----------------------------------------------------------------------------------------------------------- */
+/* -- requests ------------------------------------------------------------------------------------------------------ */
 
 /* A refusal in place of a flow control or of a reply, as one frame; the stored reply stays. */
-static void refuse(teds_line *line, uint8_t transaction, uint8_t reason, bool fd)
+static void refuse_request(teds_line *line, uint8_t transaction, uint8_t reason, bool fd)
 {
     line->refuses = reason;
     line->refused = transaction;
@@ -213,14 +172,14 @@ static void refuse(teds_line *line, uint8_t transaction, uint8_t reason, bool fd
 }
 
 /* When a request that begins now has to be whole: 5 s, and what our own STmin takes. */
-static uint64_t ends_at(size_t length, size_t octets_of_frame, uint64_t now)
+static uint64_t find_end(size_t length, size_t octets_of_frame, uint64_t now)
 {
     return now + REQUEST_NS + (uint64_t)(length / (octets_of_frame - 1)) * teds_isotp_gap(TEDS_CAN_STMIN);
 }
 
-/* Who else is in the way of a long request of this line; 0: it is taken. A pair with a session goes before a stranger, and
- * whoever holds the place begins no other request in it while another pair waits. */
-static uint8_t in_the_way(teds_node *node, const teds_line *line, uint64_t now)
+/* The reason to refuse a long request of this line because another one is coming in; 0: it is taken. A pair with a
+ * session goes before a stranger, and the pair that holds the place begins no other request in it while another waits. */
+static uint8_t check_reception(teds_node *node, const teds_line *line, uint64_t now)
 {
     teds_can *can = &node->can;
     teds_line *holder = can->rx_line;
@@ -236,27 +195,27 @@ static uint8_t in_the_way(teds_node *node, const teds_line *line, uint64_t now)
     }
     if (teds_session_on(node, line->source) != NULL && teds_session_on(node, holder->source) == NULL) {
         holder->flow = 0;
-        refuse(holder, node->rx[0], TEDS_BUSY, can->rx_frame > 8);
+        refuse_request(holder, node->rx[0], TEDS_BUSY, can->rx_frame > 8);
         return 0;
     }
     can->rx_wanted = true;
     return TEDS_BUSY;
 }
 
-static void request(teds_node *node, teds_line *line, const uint8_t *body, size_t length, bool fd, uint64_t tick)
+static void run_can_request(teds_node *node, teds_line *line, const uint8_t *body, size_t length, bool fd, uint64_t tick)
 {
     const teds_arrival arrival = {TEDS_CAN, !teds_has_nfc(node) && teds_in_factory(node), fd, tick};
     const uint8_t own = line->own;
     teds_stored_reply *reply;
-    if (is_sending(line)) { /* whoever asks again has not taken that answer up */
-        left(node, line);
+    if (is_sending(line)) { /* a station that asks again has not taken that answer up */
+        finish_message(node, line);
         if (line->source == 0 || line->own != own) {
-            return; /* the node has moved: nobody answers at the old address */
+            return; /* the node has moved: the old address does not answer */
         }
     }
     reply = teds_answer(node, line->source, &arrival, body, 1, body + 1, length - 1);
     if (TEDS_PLACES_MAY_LACK && reply == NULL) {
-        refuse(line, body[0], TEDS_BUSY, fd);
+        refuse_request(line, body[0], TEDS_BUSY, fd);
         return;
     }
     reply->octets[0] = body[0];
@@ -264,7 +223,7 @@ static void request(teds_node *node, teds_line *line, const uint8_t *body, size_
     teds_isotp_begin(line, reply->octets, reply->length, fd);
 }
 
-static void first_frame(teds_node *node, teds_line *line, const teds_can_frame *frame, uint64_t now)
+static void take_first_frame(teds_node *node, teds_line *line, const teds_can_frame *frame, uint64_t now)
 {
     teds_can *can = &node->can;
     size_t length = (size_t)(frame->data[0] & 15u) << 8 | frame->data[1], head = 2;
@@ -287,10 +246,10 @@ static void first_frame(teds_node *node, teds_line *line, const teds_can_frame *
     if (length > sizeof node->rx) { /* always so of a length in 32 bits; what is taken is longer than its first frame */
         reason = TEDS_TOO_LARGE;
     } else {
-        reason = in_the_way(node, line, now);
+        reason = check_reception(node, line, now);
     }
     if (reason != 0) {
-        refuse(line, frame->data[head], reason, frame->fd);
+        refuse_request(line, frame->data[head], reason, frame->fd);
         return;
     }
     can->rx_line = line;
@@ -301,7 +260,7 @@ static void first_frame(teds_node *node, teds_line *line, const teds_can_frame *
     can->rx_block = TEDS_CAN_BLOCK;
     can->rx_wanted = false;
     can->rx_until = now + CR_NS;
-    can->rx_ends = ends_at(length, frame->length, now);
+    can->rx_ends = find_end(length, frame->length, now);
     memcpy(node->rx, frame->data + 2, can->rx_at);
     line->flow = 0x30;
     if (TEDS_CAN_FD && !is_sending(line)) {
@@ -309,7 +268,7 @@ static void first_frame(teds_node *node, teds_line *line, const teds_can_frame *
     }
 }
 
-static void consecutive_frame(teds_node *node, teds_line *line, const teds_can_frame *frame, uint64_t now)
+static void take_consecutive_frame(teds_node *node, teds_line *line, const teds_can_frame *frame, uint64_t now)
 {
     teds_can *can = &node->can;
     uint8_t number = frame->data[0] & 15;
@@ -335,7 +294,7 @@ static void consecutive_frame(teds_node *node, teds_line *line, const teds_can_f
     can->rx_until = now + CR_NS < can->rx_ends ? now + CR_NS : can->rx_ends;
     if (can->rx_at == can->rx_length) {
         line->flow = 0;
-        request(node, line, node->rx, can->rx_length, frame->fd, now);
+        run_can_request(node, line, node->rx, can->rx_length, frame->fd, now);
         can->rx_line = NULL;
     } else if (TEDS_CAN_BLOCK != 0 && --can->rx_block == 0) {
         can->rx_block = TEDS_CAN_BLOCK;
@@ -344,7 +303,7 @@ static void consecutive_frame(teds_node *node, teds_line *line, const teds_can_f
 }
 
 /* A station for which there is no line: what it asks gets 17, which needs none. */
-static void turn_away(teds_node *node, const teds_can_frame *frame, uint8_t source)
+static void turn_station_away(teds_node *node, const teds_can_frame *frame, uint8_t source)
 {
     const uint8_t *body = frame->data + 2;
     size_t octets;
@@ -355,7 +314,7 @@ static void turn_away(teds_node *node, const teds_can_frame *frame, uint8_t sour
     }
 }
 
-static void physical(teds_node *node, const teds_can_frame *frame, uint64_t tick)
+static void take_physical(teds_node *node, const teds_can_frame *frame, uint64_t tick)
 {
     const uint8_t own = (uint8_t)(frame->identifier >> 8), source = (uint8_t)frame->identifier;
     const uint8_t *body;
@@ -364,9 +323,9 @@ static void physical(teds_node *node, const teds_can_frame *frame, uint64_t tick
     if (own != node->can.address || frame->length < 2) {
         return;
     }
-    line = line_of(node, source, OF_A_REPLY, tick);
+    line = find_line(node, source, OF_A_REPLY, tick);
     if (line == NULL) {
-        turn_away(node, frame, source);
+        turn_station_away(node, frame, source);
         return;
     }
     switch (frame->data[0] >> 4) {
@@ -375,19 +334,19 @@ static void physical(teds_node *node, const teds_can_frame *frame, uint64_t tick
             if (node->can.rx_line == line) {
                 node->can.rx_line = NULL; /* a new message of the same station ends the one before */
             }
-            request(node, line, body, octets, frame->fd, tick);
+            run_can_request(node, line, body, octets, frame->fd, tick);
         }
         break;
-    case 1: first_frame(node, line, frame, tick); break;
-    case 2: consecutive_frame(node, line, frame, tick); break;
+    case 1: take_first_frame(node, line, frame, tick); break;
+    case 2: take_consecutive_frame(node, line, frame, tick); break;
     case 3: teds_isotp_flow(line, frame->data, frame->length, tick); break;
     default: break;
     }
 }
 
-/* -- everyone ------------------------------------------------------------------------------------------------------------- */
+/* -- everyone ------------------------------------------------------------------------------------------------------ */
 
-static void functional(teds_node *node, const teds_can_frame *frame, uint64_t now)
+static void take_functional(teds_node *node, const teds_can_frame *frame, uint64_t now)
 {
     static const uint8_t identify[6] = {0, 0, TEDS_CLASS_SECURITY, TEDS_IDENTIFY, 0, 0};
     const uint8_t *body;
@@ -397,12 +356,12 @@ static void functional(teds_node *node, const teds_can_frame *frame, uint64_t no
         memcmp(body + 1, identify, 6) != 0) {
         return; /* nothing else that is asked of everyone is answered */
     }
-    line = line_of(node, (uint8_t)frame->identifier, OF_EVERYONE, now);
+    line = find_line(node, (uint8_t)frame->identifier, OF_EVERYONE, now);
     if (line != NULL) { /* a newer one of the same station takes its place */
         line->asked = true;
         line->asked_transaction = body[0];
         line->asked_fd = TEDS_CAN_FD && frame->fd;
-        line->asked_due = now + spread(node, EVERYONE_NS);
+        line->asked_due = now + draw_wait(node, EVERYONE_NS);
     }
 }
 
@@ -413,7 +372,7 @@ static bool may_answer_everyone(const teds_line *line)
 }
 
 /* It leaves the stored reply alone. The octets are those of every line: the transaction leaves with the first frame, now,
- * and what is under way ends when the rest changes (teds_can_identity_changed). */
+ * and what is under way ends when the rest changes (end_old_answers). */
 static void answer_everyone(teds_node *node, teds_line *line)
 {
     uint8_t *octets = node->can.everyone;
@@ -426,8 +385,13 @@ static void answer_everyone(teds_node *node, teds_line *line)
     teds_isotp_begin(line, octets, sizeof node->can.everyone, TEDS_CAN_FD && line->asked_fd);
 }
 
-void teds_can_identity_changed(teds_node *node)
+/* What Identify says has changed since: answers to everyone that are under way end. */
+static void end_old_answers(teds_node *node)
 {
+    if (!node->identity_changed) {
+        return;
+    }
+    node->identity_changed = false;
     for (teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
         if (line->out_reply == NULL) {
             line->out_state = TEDS_OUT_IDLE;
@@ -435,21 +399,21 @@ void teds_can_identity_changed(teds_node *node)
     }
 }
 
-/* -- Announce and Claim ------------------------------------------------------------------------------------------------------ */
+/* -- Announce and Claim -------------------------------------------------------------------------------------------- */
 
-static void announce_soon(teds_node *node, uint64_t now, uint32_t most)
+static void plan_announce(teds_node *node, uint64_t now, uint32_t most)
 {
     node->can.announces = true;
-    node->can.announce_due = now + spread(node, most);
+    node->can.announce_due = now + draw_wait(node, most);
 }
 
 void teds_can_start(teds_node *node, uint64_t now)
 {
-    announce_soon(node, now > node->can.back_at ? now : node->can.back_at, START_NS);
+    plan_announce(node, now > node->can.back_at ? now : node->can.back_at, START_NS);
 }
 
-/* The next address that nobody was heard at; this one where every other is taken. */
-static uint8_t next_free(const teds_node *node)
+/* The next address at which no node was heard; this one if every other is taken. */
+static uint8_t find_free_address(const teds_node *node)
 {
     const uint8_t own = node->can.address;
     uint8_t address = own;
@@ -460,7 +424,7 @@ static uint8_t next_free(const teds_node *node)
 }
 
 /* With an actuator claimed a node keeps its address and goes on announcing. */
-static bool stays(const teds_node *node)
+static bool keeps_address(const teds_node *node)
 {
 #if TEDS_OPERATION
     return teds_actuator_claimed(node);
@@ -474,14 +438,14 @@ static bool stays(const teds_node *node)
 static void give_up_address(teds_node *node, uint64_t now)
 {
     node->can.gives_up = false;
-    if (!stays(node)) {
+    if (!keeps_address(node)) {
         node->can.moves = (uint8_t)(node->can.moves < UINT8_MAX ? node->can.moves + 1 : UINT8_MAX);
-        teds_can_move(node, next_free(node));
+        teds_address_move(node, find_free_address(node));
     }
-    announce_soon(node, now, EVERYONE_NS);
+    plan_announce(node, now, EVERYONE_NS);
 }
 
-static void announced(teds_node *node, const teds_can_frame *frame, uint64_t now)
+static void take_announce(teds_node *node, const teds_can_frame *frame, uint64_t now)
 {
     teds_can *can = &node->can;
     uint8_t address = (uint8_t)frame->identifier;
@@ -491,7 +455,7 @@ static void announced(teds_node *node, const teds_can_frame *frame, uint64_t now
         return;
     }
     crc = teds_get32(frame->data + 2);
-    own = crc_of(node);
+    own = teds_uuid_crc(node);
     if (crc == own) {
         return; /* a conflict for a person, or our own frame given back */
     }
@@ -499,8 +463,8 @@ static void announced(teds_node *node, const teds_can_frame *frame, uint64_t now
         can->moves = 0;
     }
     can->conflict_at = now;
-    if (crc > own || stays(node)) {
-        announce_soon(node, now, EVERYONE_NS);
+    if (crc > own || keeps_address(node)) {
+        plan_announce(node, now, EVERYONE_NS);
     } else if (can->moves < MOVES_AT_ONCE) {
         give_up_address(node, now);
     } else if (!can->gives_up) { /* an Announce proves nothing, and each move ends the sessions here */
@@ -537,7 +501,7 @@ void teds_can_pressed(teds_node *node, uint64_t now)
     can->pressed_paid = paid + PRESS_UNITS + 1;
 }
 
-static void announce(const teds_node *node, teds_can_frame *frame)
+static void put_announce(const teds_node *node, teds_can_frame *frame)
 {
     frame->identifier = ANNOUNCE | node->can.address;
     frame->fd = false;
@@ -545,14 +509,15 @@ static void announce(const teds_node *node, teds_can_frame *frame)
     memset(frame->data, 0, 8);
     frame->data[0] = 1;
     frame->data[1] = teds_state_octet(node);
-    teds_put32(frame->data + 2, crc_of(node));
+    teds_put32(frame->data + 2, teds_uuid_crc(node));
 }
 
-/* -- in and out ---------------------------------------------------------------------------------------------------------------- */
+/* -- in and out ---------------------------------------------------------------------------------------------------- */
 
 void teds_can_rx(teds_node *node, const teds_can_frame *frame, uint64_t tick)
 {
     uint8_t source = (uint8_t)frame->identifier;
+    end_old_answers(node);
     if (tick < node->can.back_at) {
         return;
     }
@@ -563,16 +528,16 @@ void teds_can_rx(teds_node *node, const teds_can_frame *frame, uint64_t tick)
         node->can.heard[source >> 3] |= (uint8_t)(1u << (source & 7));
     }
     if ((frame->identifier & 0x1FFFFF00u) == ANNOUNCE) {
-        announced(node, frame, tick);
+        take_announce(node, frame, tick);
         return;
     }
-    if (source < FIRST_STATION || source > LAST_STATION) {
+    if (source < TEDS_FIRST_STATION || source > TEDS_LAST_STATION) {
         return;
     }
     if ((frame->identifier & 0x1FFFFF00u) == FUNCTIONAL) {
-        functional(node, frame, tick);
+        take_functional(node, frame, tick);
     } else if ((frame->identifier & 0x1FFF0000u) == PHYSICAL) {
-        physical(node, frame, tick);
+        take_physical(node, frame, tick);
     }
 #if TEDS_OPERATION
     else if ((frame->identifier & 0x1FFFFF00u) == (TRIGGER) && frame->length == 8) {
@@ -583,7 +548,7 @@ void teds_can_rx(teds_node *node, const teds_can_frame *frame, uint64_t tick)
 #endif
 }
 
-static void flow_control(teds_line *line, teds_can_frame *frame)
+static void put_flow_control(teds_line *line, teds_can_frame *frame)
 {
     frame->fd = TEDS_CAN_FD && line->fd;
     frame->data[0] = line->flow;
@@ -593,7 +558,7 @@ static void flow_control(teds_line *line, teds_can_frame *frame)
     line->flow = 0;
 }
 
-static void refusal(teds_can_frame *frame, uint8_t transaction, uint8_t reason, bool fd)
+static void put_refusal(teds_can_frame *frame, uint8_t transaction, uint8_t reason, bool fd)
 {
     frame->fd = TEDS_CAN_FD && fd;
     frame->data[0] = 5;
@@ -605,16 +570,16 @@ static void refusal(teds_can_frame *frame, uint8_t transaction, uint8_t reason, 
     teds_can_pad(frame, 6);
 }
 
-/* What a line has to say now, flow controls first: somebody waits for them. */
-static bool line_next(teds_node *node, teds_line *line, teds_can_frame *frame, uint64_t now)
+/* What a line has to send now, flow controls first: a station waits for them. */
+static bool next_line_frame(teds_node *node, teds_line *line, teds_can_frame *frame, uint64_t now)
 {
     frame->identifier = PHYSICAL | (uint32_t)line->source << 8 | line->own;
     if (line->flow != 0) {
-        flow_control(line, frame);
+        put_flow_control(line, frame);
         return true;
     }
     if (line->refuses != 0) {
-        refusal(frame, line->refused, line->refuses, line->fd);
+        put_refusal(frame, line->refused, line->refuses, line->fd);
         line->refuses = 0;
         return true;
     }
@@ -625,37 +590,38 @@ static bool line_next(teds_node *node, teds_line *line, teds_can_frame *frame, u
         return false;
     }
     if (line->out_state == TEDS_OUT_IDLE) {
-        left(node, line);
+        finish_message(node, line);
     }
     return true;
 }
 
 bool teds_can_tx(teds_node *node, teds_can_frame *frame, uint64_t now)
 {
+    end_old_answers(node);
     if (now < node->can.back_at) {
         return false;
     }
     for (teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
-        if (line->source != 0 && line_next(node, line, frame, now)) {
+        if (line->source != 0 && next_line_frame(node, line, frame, now)) {
             return true;
         }
     }
     if (node->can.turned_away != 0) {
         frame->identifier = PHYSICAL | (uint32_t)node->can.turned_away << 8 | node->can.address;
-        refusal(frame, node->can.turned_away_transaction, TEDS_BUSY, node->can.turned_away_fd);
+        put_refusal(frame, node->can.turned_away_transaction, TEDS_BUSY, node->can.turned_away_fd);
         node->can.turned_away = 0;
         return true;
     }
     if (node->can.pressed) {
         node->can.pressed = false;
-        announce(node, frame);
+        put_announce(node, frame);
         frame->data[6] = 1;
         return true;
     }
     if (node->can.announces && now >= node->can.announce_due) {
         node->can.announces = false;
         if (may_announce(node, now)) {
-            announce(node, frame);
+            put_announce(node, frame);
             return true;
         }
     }
@@ -670,6 +636,7 @@ uint64_t teds_can_poll(teds_node *node, uint64_t now)
 {
     teds_can *can = &node->can;
     uint64_t due;
+    end_old_answers(node);
     if (can->gives_up && now >= can->move_at) {
         give_up_address(node, now);
     }
@@ -689,7 +656,7 @@ uint64_t teds_can_poll(teds_node *node, uint64_t now)
     }
     for (teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
         if (line->out_state == TEDS_OUT_WAITS && now >= line->out_due) {
-            left(node, line); /* its flow control failed to come */
+            finish_message(node, line); /* its flow control failed to come */
         }
         if (is_sending(line)) {
             teds_sooner(&due, line->out_due);

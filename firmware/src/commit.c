@@ -1,30 +1,16 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The commit of a datasheet (security-teds.md, 5): every check in its order, then one transaction; and the other changes
- * of the durable state. */
+/* The commit of a datasheet (security-teds.md, 5): every check in its order, then one transaction; and the way back to
+ * factory state. */
 #include "commit.h"
-#include "agree.h"
+#include "crypto.h"
+#include "datasheet.h"
 #include "security_teds.h"
-#include "teds_store.h"
+#include "slots.h"
+#include "staging.h"
+#include "teds_source.h"
 #include "inside.h"
 
 #define SEQUENCE_WINDOW 65536u
-
-/* A listed block: channel 2, access code 1, digest 32, behind the head of its tuple. */
-static const uint8_t *block_of(const teds_signed *teds, size_t place)
-{
-    return teds->blocks + 37 * place + 2;
-}
-
-bool teds_lists(const teds_signed *teds, uint16_t id)
-{
-    for (size_t i = 0; i < teds->block_count; i++) {
-        const uint8_t *block = block_of(teds, i);
-        if (block[0] == 0 && block[1] == id >> 8 && block[2] == (id & 0xFF)) {
-            return true;
-        }
-    }
-    return false;
-}
 
 int teds_to_factory(teds_node *node)
 {
@@ -32,7 +18,7 @@ int teds_to_factory(teds_node *node)
     state.address = node->state.address;
     state.epoch = node->state.epoch;
     state.sequence = node->state.sequence;
-    return teds_store_write(node, &state, NULL);
+    return teds_slots_write(node, &state, NULL);
 }
 
 /* 5: 101 and 102 are the node's own, 103 a point, 104 verifies under the kept CA, 100 under 103. */
@@ -45,7 +31,7 @@ static bool signatures_good(const teds_node *node, const teds_signed *teds, cons
                              {block, teds->signature_at},
                              {block + behind, length - behind}};
     return !teds->others && station[0] == 4 && node->port->p256_good(node->port->user, station) &&
-           teds_certified(node, station, node->state.agreed.ca, teds->decoded[TEDS_STATION_SIGNATURE]) &&
+           teds_station_certified(node, station, node->state.agreed.ca, teds->decoded[TEDS_STATION_SIGNATURE]) &&
            teds_verify(node, station, tbs, 4, teds->decoded[TEDS_SIGNATURE]);
 }
 
@@ -55,14 +41,14 @@ static bool blocks_good(const teds_node *node, const teds_signed *teds)
     teds_source source;
     uint8_t hash[32];
     for (size_t i = 0; i < teds->block_count; i++) {
-        const uint8_t *block = block_of(teds, i);
+        const uint8_t *block = teds_listed_block(teds, i);
         if (block[0] != 0 || !teds_find_new(node, teds_get16(block + 1), &source) ||
             teds_source_hash(node, &source, hash) != 0 || memcmp(hash, block + 3, 32) != 0) {
             return false;
         }
     }
     for (int32_t id = -1; (id = teds_next_id(node, id, TEDS_STAGED)) < TEDS_NO_ID;) {
-        if (id != (int32_t)TEDS_SECURITY_ID && !teds_lists(teds, (uint16_t)id)) {
+        if (id != (int32_t)TEDS_SECURITY_ID && !teds_is_listed(teds, (uint16_t)id)) {
             return false;
         }
     }
@@ -97,7 +83,7 @@ static bool meta_names_node(const teds_node *node, uint16_t id)
 static bool metas_good(const teds_node *node, const teds_signed *teds)
 {
     for (size_t i = 0; i < teds->block_count; i++) {
-        const uint8_t *block = block_of(teds, i);
+        const uint8_t *block = teds_listed_block(teds, i);
         if (block[2] == 1 && !meta_names_node(node, teds_get16(block + 1))) {
             return false;
         }
@@ -105,7 +91,7 @@ static bool metas_good(const teds_node *node, const teds_signed *teds)
     return true;
 }
 
-static int check(const teds_node *node, teds_signed *teds, const uint8_t *image, size_t length)
+static int check_datasheet(const teds_node *node, teds_signed *teds, const uint8_t *image, size_t length)
 {
     const uint32_t sequence = teds->numbers[0];
     if (!signatures_good(node, teds, image + 4, length - 6)) {
@@ -129,7 +115,7 @@ int teds_commit_state(teds_node *node, const teds_signed *teds)
     int failed;
     state.sequence = teds->numbers[0];
     state.flags |= TEDS_PROVISIONED;
-    failed = teds_store_write(node, &state, teds);
+    failed = teds_slots_write(node, &state, teds);
     teds_wipe(&state, sizeof state);
     return failed;
 }
@@ -150,7 +136,7 @@ int teds_commit(teds_node *node)
     if (image == NULL || !teds_security_parse(node, image + 4, length - 6, &teds)) {
         return -TEDS_BAD_FORM;
     }
-    failed = check(node, &teds, image, length);
+    failed = check_datasheet(node, &teds, image, length);
     if (failed) {
         return failed;
     }

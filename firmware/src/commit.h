@@ -1,15 +1,18 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The checks of a commit, and its last step. */
+/* The commit of a datasheet, and the way back to factory state. int: 0, or a reason negated. */
 #ifndef TEDS_SRC_COMMIT_H
 #define TEDS_SRC_COMMIT_H
 
 #include "security_teds.h"
 #include "inside.h"
 
+/* Check what is staged, and store it in one transaction. A refused commit changes nothing. */
 int teds_commit(teds_node *node);
-/* Its last step; apart, so that the new state is not on the stack beside a verification. */
+
+/* Its last step. A function of its own, so that the new state is not on the stack beside a verification. */
 int teds_commit_state(teds_node *node, const teds_signed *teds);
+
+/* Forget key, station and CA, and the signed datasheet. Epoch, sequence, address and other TEDS stay. */
 int teds_to_factory(teds_node *node);
-bool teds_lists(const teds_signed *teds, uint16_t id);
 
 #endif

@@ -6,6 +6,7 @@
 #include "isotp.h"
 #include "operation.h"
 #include "session.h"
+#include "transducers.h"
 #include "inside.h"
 
 #if TEDS_OPERATION
@@ -13,7 +14,7 @@
 #define HEAD 16u /* counter, until, tag */
 #define MICRO 1000u
 
-static uint32_t length_of(const teds_session *session)
+static uint32_t drive_octets(const teds_session *session)
 {
     return HEAD + session->drive.octets;
 }
@@ -60,21 +61,12 @@ int teds_drive(teds_node *node, const teds_command *command, teds_origin *origin
     memcpy(session->drive.key, key, sizeof key);
     teds_wipe(key, sizeof key);
     teds_put16(out, session->run);
-    teds_put16(out + 2, (uint16_t)length_of(session));
+    teds_put16(out + 2, (uint16_t)drive_octets(session));
     return 4;
 }
 
-void teds_drive_end(teds_session *own, uint32_t places)
-{
-    for (size_t i = 0; own->drive.used && i < own->drive.count; i++) {
-        if ((places >> own->drive.places[i] & 1) != 0) {
-            teds_wipe(&own->drive, sizeof own->drive);
-        }
-    }
-}
-
 /* Neither past (which shows as far ahead, mod 2^32) nor further ahead than the shortest dead-man. */
-static bool in_time(const teds_node *node, const teds_session *session, uint32_t until)
+static bool is_in_time(const teds_node *node, const teds_session *session, uint32_t until)
 {
     uint32_t ahead = until - (uint32_t)(teds_now(node) / MICRO);
     for (size_t i = 0; i < session->drive.count; i++) {
@@ -85,7 +77,7 @@ static bool in_time(const teds_node *node, const teds_session *session, uint32_t
     return true;
 }
 
-static void message(teds_node *node, teds_session *session)
+static void take_drive_message(teds_node *node, teds_session *session)
 {
     uint8_t plain[4 + TEDS_DRIVE_OCTETS], pairs[16 + TEDS_DRIVE_OCTETS], nonce[13] = {0};
     uint32_t counter = teds_get32(session->drive.message);
@@ -107,13 +99,13 @@ static void message(teds_node *node, teds_session *session)
         length += 1u + own->octets;
         at += own->octets;
     }
-    if (in_time(node, session, teds_get32(plain))) {
-        (void)teds_apply(node, pairs, length);
+    if (is_in_time(node, session, teds_get32(plain))) {
+        (void)teds_set_actuators(node, pairs, length);
     }
 }
 
 /* The length of a CAN FD frame that holds so many octets. */
-static size_t fd_length(size_t octets)
+static size_t round_to_fd(size_t octets)
 {
     teds_can_frame frame = {0};
     if (octets <= 8) {
@@ -130,9 +122,9 @@ void teds_drive_message(teds_node *node, teds_link link, const uint8_t *octets, 
         return;
     }
     (void)teds_operation_poll(node, teds_now(node)); /* a dead-man that ran out before this message is over */
-    if (session->drive.used && length == length_of(session)) {
+    if (session->drive.used && length == drive_octets(session)) {
         memcpy(session->drive.message, octets, length);
-        message(node, session);
+        take_drive_message(node, session);
     }
 }
 
@@ -155,17 +147,17 @@ void teds_drive_frame(teds_node *node, teds_link link, const uint8_t *octets, si
         return;
     }
     room = session->drive.fd ? 63 : 7;
-    due = length_of(session) - session->drive.at < room ? length_of(session) - session->drive.at : room;
-    if (length - 1 != (session->drive.fd ? fd_length(due + 1) - 1 : due)) {
+    due = drive_octets(session) - session->drive.at < room ? drive_octets(session) - session->drive.at : room;
+    if (length - 1 != (session->drive.fd ? round_to_fd(due + 1) - 1 : due)) {
         session->drive.begun = false;
         return;
     }
     memcpy(session->drive.message + session->drive.at, octets + 1, due);
     session->drive.at = (uint8_t)(session->drive.at + due);
     session->drive.segment = (uint8_t)(octets[0] % 7 + 1);
-    if (session->drive.at == length_of(session)) {
+    if (session->drive.at == drive_octets(session)) {
         session->drive.begun = false;
-        message(node, session);
+        take_drive_message(node, session);
     }
 }
 

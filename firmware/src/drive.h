@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Drive: set points in frames without a reply. */
+/* Drive: set points in messages without a reply. */
 #ifndef TEDS_SRC_DRIVE_H
 #define TEDS_SRC_DRIVE_H
 
@@ -7,9 +7,12 @@
 
 #if TEDS_OPERATION
 teds_handler teds_drive;
+
+/* A frame of a Drive message on CAN. */
 void teds_drive_frame(teds_node *node, teds_link link, const uint8_t *octets, size_t length);
+
+/* A whole Drive message, over BLE. */
 void teds_drive_message(teds_node *node, teds_link link, const uint8_t *octets, size_t length);
-void teds_drive_end(teds_session *session, uint32_t places);
 #endif
 
 #endif

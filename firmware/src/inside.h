@@ -1,5 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Words that all files of src/ share: reasons, commands, where a command came from. Not for boards. */
+/* The words that all of src/ shares: reasons, commands, where a command came from. Not for boards.
+ *
+ * Handlers have the names of their commands (teds_request, teds_sample); other shared functions begin with what they are
+ * about (teds_session_end, teds_slots_write). Includes point one way; README.md lists the sources from the bottom up. */
 #ifndef TEDS_INSIDE_H
 #define TEDS_INSIDE_H
 
@@ -81,7 +84,7 @@ typedef struct teds_command {
     uint8_t command_class, function;
     const uint8_t *payload;
     size_t length;
-    const struct known *known; /* in the table of node.c; NULL: Sealed */
+    const struct known *known; /* in the table of commands.c; NULL: Sealed */
 } teds_command;
 
 /* What is to end when the reply is made. */

@@ -34,9 +34,9 @@ void teds_isotp_begin(teds_line *line, const uint8_t *octets, size_t length, boo
     line->fd = fd && TEDS_CAN_FD;
 }
 
-static void first(teds_line *line, teds_can_frame *frame, uint64_t now)
+static void put_first_frame(teds_line *line, teds_can_frame *frame, uint64_t now)
 {
-    const bool fd = TEDS_CAN_FD && line->fd; /* known to the compiler where only classic frames are built */
+    const bool fd = TEDS_CAN_FD && line->fd; /* known to the compiler if only classic frames are built */
     const size_t room = fd ? 64 : 8, most_single = fd ? 62 : 7;
     size_t at;
     if (line->out_length <= most_single) {
@@ -59,7 +59,7 @@ static void first(teds_line *line, teds_can_frame *frame, uint64_t now)
     line->out_due = now + TEDS_N_BS;
 }
 
-static void consecutive(teds_line *line, teds_can_frame *frame, uint64_t now)
+static void put_consecutive_frame(teds_line *line, teds_can_frame *frame, uint64_t now)
 {
     const size_t room = TEDS_CAN_FD && line->fd ? 63 : 7;
     size_t left = (size_t)(line->out_length - line->out_at);
@@ -82,11 +82,11 @@ bool teds_isotp_next(teds_line *line, teds_can_frame *frame, uint64_t now)
 {
     frame->fd = TEDS_CAN_FD && line->fd;
     if (line->out_state == TEDS_OUT_FIRST) {
-        first(line, frame, now);
+        put_first_frame(line, frame, now);
         return true;
     }
     if (line->out_state == TEDS_OUT_RUNS && now >= line->out_due) {
-        consecutive(line, frame, now);
+        put_consecutive_frame(line, frame, now);
         return true;
     }
     return false;

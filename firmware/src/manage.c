@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* Manage (profile.md, "Firmware"): one SMP packet in, one out. The port's manager sees a packet only if it is one of a short
- * list, with a body that cannot mean two things, at a moment that harms nobody: two packets in one, erasing of storage, an
+ * list, with a body that cannot mean two things, at a moment that harms no one: two packets in one, erasing of storage, an
  * image that is permanent before it ran and recovery modes never pass. Whether an image may run is the boot loader's
  * decision. */
 #include "manage.h"
@@ -21,7 +21,7 @@
 #define DEPTH 8u /* of maps and arrays in each other */
 #define AN_ANSWER 1u /* in the first octet */
 
-/* -- CBOR (RFC 8949), as far as a filter needs it --------------------------------------------------------------------- */
+/* -- CBOR (RFC 8949), as far as a filter needs it ------------------------------------------------------------------ */
 
 enum { UNSIGNED = 0, OCTETS = 2, TEXT = 3, ARRAY = 4, MAP = 5, TAG = 6, SIMPLE = 7 };
 #define OPEN_END 31u /* of an array or map without a length; as a simple value it closes one */
@@ -39,7 +39,7 @@ typedef struct item {
 
 /* Read an item's head, and a string's octets; false if it is cut or of a kind that never passes (tags, floating numbers,
  * strings in pieces). */
-static bool next_item(reading *in, item *out)
+static bool read_item(reading *in, item *out)
 {
     uint8_t additional;
     if (in->at == in->end) {
@@ -79,7 +79,7 @@ static bool next_item(reading *in, item *out)
     return true;
 }
 
-/* What an upload's packet or the answer to one says. */
+/* Members of an upload's packet, or of the answer to one. */
 typedef struct said {
     bool off_there, length_there, sha_there, refuses, complete;
     uint32_t off, length;
@@ -89,7 +89,7 @@ typedef struct said {
 
 enum { OF_NO_CONCERN, OFF, LENGTH, SHA, REFUSAL, MATCH };
 
-static unsigned key_of(const item *key)
+static unsigned find_key(const item *key)
 {
     static const struct {
         const char *name;
@@ -150,7 +150,7 @@ static bool read_map(const uint8_t *octets, size_t length, bool plain, said *out
     do {
         level *in_it = depth > 0 ? &levels[depth - 1] : NULL;
         item it;
-        if (!next_item(&in, &it) || (in_it == NULL && it.major != MAP)) {
+        if (!read_item(&in, &it) || (in_it == NULL && it.major != MAP)) {
             return false;
         }
         if (it.major == SIMPLE && it.open) {
@@ -167,7 +167,7 @@ static bool read_map(const uint8_t *octets, size_t length, bool plain, said *out
                 if (out != NULL && in_it->odd && !note_value(out, key, &it)) {
                     return false;
                 }
-                key = !in_it->odd && it.major == TEXT ? key_of(&it) : OF_NO_CONCERN;
+                key = !in_it->odd && it.major == TEXT ? find_key(&it) : OF_NO_CONCERN;
             }
             if (in_it != NULL) {
                 in_it->odd = in_it->map && !in_it->odd;
@@ -191,7 +191,7 @@ static bool read_map(const uint8_t *octets, size_t length, bool plain, said *out
     return in.at == in.end;
 }
 
-/* -- the list ----------------------------------------------------------------------------------------------------------- */
+/* -- the list ------------------------------------------------------------------------------------------------------ */
 
 typedef enum request { READS, ECHO, RESTART, CONFIRM, TRY, UPLOAD, NOT_LISTED, BAD_BODY } request;
 
@@ -204,7 +204,7 @@ static bool is_body(const uint8_t *body, size_t length, const uint8_t *is, size_
 }
 
 /* Of 1/0: the three bodies that there are, octet for octet. None makes an image permanent that has not run. */
-static request state_of(const uint8_t *body, size_t length)
+static request classify_state(const uint8_t *body, size_t length)
 {
     static const uint8_t confirm[] = {0xA1, 0x67, 'c', 'o', 'n', 'f', 'i', 'r', 'm', 0xF5};
     static const uint8_t hash[] = {0xA1, 0x64, 'h', 'a', 's', 'h', 0x58, 0x20};
@@ -223,7 +223,7 @@ static request state_of(const uint8_t *body, size_t length)
     return BAD_BODY;
 }
 
-static request listed(const uint8_t *packet)
+static request classify_packet(const uint8_t *packet)
 {
     static const struct {
         uint8_t operation, group, id, request;
@@ -239,15 +239,15 @@ static request listed(const uint8_t *packet)
     return NOT_LISTED;
 }
 
-/* Which request a packet is. `out`: what an upload says. */
-static request request_of(const uint8_t *packet, size_t length, said *out)
+/* Which request a packet is. `out`: the members of an upload. */
+static request classify_request(const uint8_t *packet, size_t length, said *out)
 {
     const uint8_t *body = packet + HEADER_OCTETS;
     const size_t octets = length - HEADER_OCTETS;
-    request asked = listed(packet);
+    request asked = classify_packet(packet);
     switch (asked) {
     case RESTART: return octets == 1 && body[0] == 0xA0 ? RESTART : BAD_BODY;
-    case TRY: return state_of(body, octets);
+    case TRY: return classify_state(body, octets);
     case UPLOAD: return read_map(body, octets, true, out) && out->off_there ? UPLOAD : BAD_BODY;
     case READS:
     case ECHO: return read_map(body, octets, false, NULL) ? asked : BAD_BODY;
@@ -255,9 +255,9 @@ static request request_of(const uint8_t *packet, size_t length, said *out)
     }
 }
 
-/* -- when ---------------------------------------------------------------------------------------------------------------- */
+/* -- when ---------------------------------------------------------------------------------------------------------- */
 
-static bool upload_lives(teds_node *node)
+static bool is_upload_alive(teds_node *node)
 {
     if (node->managed.upload_of != NULL && teds_now(node) >= node->managed.upload_until) {
         node->managed.upload_of = NULL;
@@ -265,7 +265,7 @@ static bool upload_lives(teds_node *node)
     return node->managed.upload_of != NULL;
 }
 
-static bool any_claim(const teds_node *node)
+static bool has_any_claim(const teds_node *node)
 {
 #if TEDS_OPERATION
     for (const teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
@@ -280,14 +280,14 @@ static bool any_claim(const teds_node *node)
 }
 
 /* Another image is to be uploaded right after the last one began. */
-static bool too_soon(const teds_node *node, const said *upload)
+static bool is_too_soon(const teds_node *node, const said *upload)
 {
     const teds_managed *own = &node->managed;
     return upload->off == 0 && own->begun && teds_now(node) < own->sha_until &&
            (upload->sha_length != own->sha_length || (own->sha_length > 0 && memcmp(upload->sha, own->sha, own->sha_length) != 0));
 }
 
-static int not_now(teds_node *node, request asked, const said *upload, const teds_session *session)
+static int check_moment(teds_node *node, request asked, const said *upload, const teds_session *session)
 {
     if (asked == CONFIRM) {
         return teds_on_trial(node) ? 0 : -TEDS_WRONG_STATE;
@@ -295,14 +295,14 @@ static int not_now(teds_node *node, request asked, const said *upload, const ted
     if (asked == READS || asked == ECHO) {
         return 0;
     }
-    if (any_claim(node) || (node->staging_of != NULL && node->staging_of != session) ||
-        (upload_lives(node) && node->managed.upload_of != session)) {
+    if (has_any_claim(node) || (node->staging_of != NULL && node->staging_of != session) ||
+        (is_upload_alive(node) && node->managed.upload_of != session)) {
         return -TEDS_BUSY;
     }
     if (asked != RESTART && (node->firmware & (TEDS_FIRMWARE_ON_TRIAL | TEDS_FIRMWARE_PENDING)) != 0) {
         return -TEDS_BUSY; /* the second slot holds the way back */
     }
-    return asked == UPLOAD && too_soon(node, upload) ? -TEDS_BUSY : 0;
+    return asked == UPLOAD && is_too_soon(node, upload) ? -TEDS_BUSY : 0;
 }
 
 /* What the running trial keeps as it is, and what an upload does not bear beside it. */
@@ -318,15 +318,15 @@ int teds_demand_no_image(teds_node *node, const teds_command *command)
         return -TEDS_BUSY;
     }
     if (((common && function == TEDS_WRITE) || (command->command_class == TEDS_CLASS_EITHER && function == 1)) &&
-        upload_lives(node)) {
+        is_upload_alive(node)) {
         return -TEDS_BUSY;
     }
     return 0;
 }
 
-/* -- the packet ------------------------------------------------------------------------------------------------------------ */
+/* -- the packet ---------------------------------------------------------------------------------------------------- */
 
-static int restart_after(teds_node *node, const uint8_t *packet, teds_link link, uint8_t *out)
+static int plan_restart(teds_node *node, const uint8_t *packet, teds_link link, uint8_t *out)
 {
     memmove(out, packet, SHORTEST);
     out[0] = OP_WRITE | AN_ANSWER;
@@ -335,7 +335,7 @@ static int restart_after(teds_node *node, const uint8_t *packet, teds_link link,
     return (int)SHORTEST;
 }
 
-static void upload_begins(teds_managed *own, const said *upload, uint64_t now)
+static void begin_upload(teds_managed *own, const said *upload, uint64_t now)
 {
     own->begun = true;
     own->sha_until = now + ANOTHER_NS;
@@ -346,7 +346,7 @@ static void upload_begins(teds_managed *own, const said *upload, uint64_t now)
     }
 }
 
-static void upload_goes_on(teds_node *node, teds_session *session, const said *answer)
+static void continue_upload(teds_node *node, teds_session *session, const said *answer)
 {
     teds_managed *own = &node->managed;
     if (answer->refuses) {
@@ -357,7 +357,7 @@ static void upload_goes_on(teds_node *node, teds_session *session, const said *a
 }
 
 /* The images have changed; what a trial left to be erased goes when it is confirmed. */
-static void images_changed(teds_node *node)
+static void note_images(teds_node *node)
 {
     const bool was = teds_on_trial(node);
     teds_firmware own;
@@ -368,7 +368,7 @@ static void images_changed(teds_node *node)
     }
 }
 
-static bool answers(const uint8_t head[HEADER_OCTETS], const uint8_t *out, size_t length)
+static bool is_answer(const uint8_t head[HEADER_OCTETS], const uint8_t *out, size_t length)
 {
     return length >= SHORTEST && out[0] == (head[0] | AN_ANSWER) && out[1] == 0 &&
            teds_get16(out + 2) == length - HEADER_OCTETS && memcmp(out + 4, head + 4, 4) == 0;
@@ -394,36 +394,36 @@ int teds_manage(teds_node *node, const teds_command *command, teds_origin *origi
         teds_get16(packet + 2) != length - HEADER_OCTETS) {
         return -TEDS_BAD_FORM;
     }
-    asked = request_of(packet, length, &upload);
+    asked = classify_request(packet, length, &upload);
     if (asked == NOT_LISTED || asked == BAD_BODY) {
         return asked == NOT_LISTED ? -TEDS_NOT_PERMITTED : -TEDS_BAD_FORM;
     }
-    failed = not_now(node, asked, &upload, origin->session);
+    failed = check_moment(node, asked, &upload, origin->session);
     if (failed) {
         return failed;
     }
     if (asked == RESTART) {
-        return restart_after(node, packet, origin->link, out);
+        return plan_restart(node, packet, origin->link, out);
     }
     if (asked == UPLOAD && upload.off == 0) {
-        upload_begins(&node->managed, &upload, teds_now(node));
+        begin_upload(&node->managed, &upload, teds_now(node));
     }
     memcpy(head, packet, sizeof head); /* the answer takes its place */
     length = port->manage(port->user, packet, length, out, most);
     if (asked == CONFIRM || asked == TRY) {
-        images_changed(node);
+        note_images(node);
     }
-    if (length > most || !answers(head, out, length) ||
+    if (length > most || !is_answer(head, out, length) ||
         !read_map(out + HEADER_OCTETS, length - HEADER_OCTETS, false, asked == UPLOAD ? &answer : NULL)) {
         return -TEDS_FAILURE;
     }
     if (asked == UPLOAD) {
-        upload_goes_on(node, origin->session, &answer);
+        continue_upload(node, origin->session, &answer);
     }
     return (int)length;
 }
 
-/* -- beside commands --------------------------------------------------------------------------------------------------------- */
+/* -- beside commands ----------------------------------------------------------------------------------------------- */
 
 void teds_upload_end(teds_node *node, const teds_session *session)
 {

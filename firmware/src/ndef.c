@@ -62,7 +62,7 @@ static bool is_type(const record *each, uint8_t tnf, const char *name, size_t le
 }
 
 /* A whole record, chunks put together: what of it the profile looks at. False: a selection that does not add up. */
-static bool note(const record *each, teds_ndef *out)
+static bool note_record(const record *each, teds_ndef *out)
 {
     if (!out->any) {
         out->any = true;
@@ -105,7 +105,7 @@ bool teds_ndef_read(uint8_t *message, size_t length, teds_ndef *out)
         }
         open = (each.flags & CHUNKED) != 0;
         if (!open) {
-            adds_up = note(&whole, out) && adds_up;
+            adds_up = note_record(&whole, out) && adds_up;
         }
     } while ((each.flags & ENDS) == 0);
     return !open && at == length && adds_up;

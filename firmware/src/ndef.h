@@ -8,15 +8,19 @@
 #if TEDS_NFC
 #define TEDS_TIM_TYPE "teds-provision:tim"
 enum { TEDS_NDEF_WELL_KNOWN = 1, TEDS_NDEF_MIME = 2, TEDS_NDEF_EXTERNAL = 4, TEDS_NDEF_BEGINS = 0x80, TEDS_NDEF_ENDS = 0x40 };
+
 /* What of a message the profile looks at; NULL: no such record. */
 typedef struct teds_ndef {
-    bool any, charges; /* the first record says how the reader charges */
+    bool any, charges; /* the first record is about how the reader charges */
     bool chunked;      /* a record came in chunks, which are put together: behind them the message is no message any more */
     const uint8_t *selection, *payload;
     size_t selection_length, payload_length;
 } teds_ndef;
+
+/* Read a message; false if its records do not fit it. Records in chunks are put together in place. */
 bool teds_ndef_read(uint8_t *message, size_t length, teds_ndef *out);
-/* A record up to its payload; gives its octets. */
+
+/* Write a record up to its payload; return how many octets that is. */
 size_t teds_ndef_head(uint8_t *at, uint8_t marks, uint8_t tnf, const char *type, size_t type_length, size_t payload);
 #endif
 

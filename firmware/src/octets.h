@@ -8,6 +8,7 @@
 #include <stdint.h>
 #include <string.h>
 
+/* Most significant octet first, as everything on the wire and in flash. */
 void teds_put16(uint8_t *at, uint16_t value);
 void teds_put32(uint8_t *at, uint32_t value);
 void teds_put64(uint8_t *at, uint64_t value);
@@ -15,10 +16,10 @@ uint16_t teds_get16(const uint8_t *at);
 uint32_t teds_get32(const uint8_t *at);
 uint64_t teds_get64(const uint8_t *at);
 
-/* In a time that does not depend on where they differ. */
+/* Compare in a time that does not depend on the octet in which they differ: for tags and keys. */
 bool teds_equal(const uint8_t *a, const uint8_t *b, size_t length);
 
-/* Not left out by a compiler that sees no later use. */
+/* Overwrite a secret; a compiler that sees no later use does not leave it out. */
 void teds_wipe(void *octets, size_t length);
 
 /* CRC-32 of IEEE 802.3, continued: begin with 0. By nibbles: no table of 1 KiB, and quick enough for 8 KiB at a start. */

@@ -1,11 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Measurement operation inside a session (operation.md, 1, 2, 5): claims, leases, dead-men, single values. Streams,
- * clock and trigger are stream.c. Checks run in the order in which operation.md writes them. */
+/* Measurement operation inside a session (operation.md, 1, 2, 5): claims, leases, dead-men, single values. Checks run in
+ * the order in which operation.md writes them. */
 #include "operation.h"
 #include "clock.h"
-#include "drive.h"
+#include "datasheet.h"
 #include "stream.h"
-#include "teds_store.h"
+#include "teds_source.h"
+#include "transducers.h"
 #include "inside.h"
 
 #if TEDS_OPERATION
@@ -13,163 +14,19 @@
 #define MOST_SAMPLE 64u
 #define MILLI UINT64_C(1000000)
 
-/* -- the board --------------------------------------------------------------------------------------------------------- */
-
-static const teds_channel *facts(const teds_node *node, int place)
-{
-    return &node->port->channels[place];
-}
-
-static bool is_actuator(const teds_node *node, int place)
-{
-    return facts(node, place)->kind == TEDS_ACTUATOR;
-}
-
-int teds_place_of(const teds_node *node, uint8_t channel)
-{
-    for (size_t i = 0; i < node->port->channel_count; i++) {
-        if (node->port->channels[i].number == channel) {
-            return (int)i;
-        }
-    }
-    return -1;
-}
-
-static bool has_fault(const teds_node *node, int place)
-{
-    return node->port->fault != NULL && node->port->fault(node->port->user, facts(node, place)->number);
-}
-
-static bool is_testing(const teds_node *node, int place)
-{
-    return node->port->testing != NULL && node->port->testing(node->port->user, facts(node, place)->number);
-}
-
-static teds_power power_of(const teds_node *node)
-{
-    teds_power power = {0, 0xFF, 0xFFFF, 0x7FFF, 0x7F};
-    if (node->port->power != NULL) {
-        node->port->power(node->port->user, &power);
-    }
-    return power;
-}
-
-bool teds_value(const teds_node *node, int place, uint64_t tick, uint8_t *out)
-{
-    const teds_port *port = node->port;
-    uint8_t number = facts(node, place)->number;
-    memset(out, 0, facts(node, place)->octets);
-    if (is_actuator(node, place)) {
-        if (port->set_point != NULL) {
-            port->set_point(port->user, number, out);
-        }
-        return true;
-    }
-    return port->sample != NULL && port->sample(port->user, number, tick, out) && !is_testing(node, place) &&
-           !has_fault(node, place);
-}
-
-static void go_safe(teds_node *node, int place)
-{
-    const teds_port *port = node->port;
-    if (port->arm != NULL) {
-        port->arm(port->user, facts(node, place)->number, 0);
-    }
-    if (port->safe != NULL) {
-        port->safe(port->user, facts(node, place)->number);
-    }
-    node->safe |= UINT32_C(1) << place;
-}
-
-/* Whether the board's table is one that this build can serve. */
-bool teds_channels_good(const teds_port *port)
-{
-    size_t events = 0;
-    if (port->channel_count > TEDS_CHANNELS) {
-        return false;
-    }
-    for (size_t i = 0; i < port->channel_count; i++) {
-        const teds_channel *own = &port->channels[i];
-        if (own->number == 0 || (i > 0 && own->number <= own[-1].number) || own->octets == 0 ||
-            own->kind > TEDS_EVENT_SENSOR) {
-            return false;
-        }
-        events += own->kind == TEDS_EVENT_SENSOR ? 1 : 0;
-        if (own->kind == TEDS_EVENT_SENSOR && own->octets > TEDS_EVENT_OCTETS) {
-            return false;
-        }
-    }
-    return events <= TEDS_EVENT_CHANNELS;
-}
+/* -- claims -------------------------------------------------------------------------------------------------------- */
 
 void teds_operation_start(teds_node *node)
 {
     for (size_t i = 0; i < node->port->channel_count; i++) {
         node->actuator_of[i] = NULL;
-        if (is_actuator(node, (int)i)) {
-            go_safe(node, (int)i);
+        if (teds_is_actuator(node, (int)i)) {
+            teds_go_safe(node, (int)i);
         }
     }
 }
 
-/* -- what the stored Channel TEDS says ----------------------------------------------------------------------------------- */
-
-/* Float32 seconds as ns, less 1 ppm; 0 where it is not positive or no number. */
-static uint64_t period_of(uint32_t bits)
-{
-    uint32_t exponent = bits >> 23 & 255;
-    uint64_t ns = (uint64_t)((bits & 0x7FFFFF) | 0x800000) * TEDS_SECOND;
-    if (bits >> 31 != 0 || exponent == 0 || (exponent == 255 && (bits & 0x7FFFFF) != 0)) {
-        return 0;
-    }
-    if (exponent >= 127 + 20) { /* a million seconds stands for every longer one */
-        return 1000000 * TEDS_SECOND;
-    }
-    ns = exponent >= 150 ? ns << (exponent - 150) : 150 - exponent < 64 ? ns >> (150 - exponent) : 0;
-    return ns - (ns + 999999) / 1000000;
-}
-
-/* Whether the stored TEDS says of a channel what the firmware is; its SPeriod in ns (0: none). */
-int teds_channel_fits(const teds_node *node, int place, uint64_t *period)
-{
-    const teds_channel *own = facts(node, place);
-    teds_walk in = {.node = node, .at = 10, .width = 1};
-    uint32_t value, length, kind = UINT32_MAX, model = UINT32_MAX, octets = UINT32_MAX, halt = UINT32_MAX;
-    uint8_t type;
-    *period = 0;
-    if (!teds_find(node, (uint16_t)(own->number << 8 | 3), &in.source) || in.source.length < 12) {
-        return 0;
-    }
-    in.end = in.source.length - 2;
-    in.at = teds_number_at(&in, 5, 1) == 5 ? 11 : 10;
-    in.width = teds_number_at(&in, in.at - 1, 1);
-    in.width = in.width >= 1 && in.width <= 4 ? in.width : 1;
-    while (teds_next_tuple(&in, &type, &value, &length)) {
-        if (type == 11) {
-            kind = teds_number_at(&in, value, length);
-        } else if (type == 36) {
-            halt = teds_number_at(&in, value, length);
-        } else if (type == 23 && length == 4) {
-            *period = period_of(teds_number_at(&in, value, 4));
-        } else if (type == 18) {
-            teds_walk within = in;
-            within.at = value;
-            within.end = value + length;
-            while (teds_next_tuple(&within, &type, &value, &length)) {
-                model = type == 40 ? teds_number_at(&in, value, length) : model;
-                octets = type == 41 ? teds_number_at(&in, value, length) : octets;
-            }
-        }
-    }
-    if (own->kind == TEDS_ACTUATOR && halt != UINT32_MAX && halt != own->halt) {
-        return 0;
-    }
-    return kind == own->kind && model == own->model && octets == own->octets;
-}
-
-/* -- claims ---------------------------------------------------------------------------------------------------------------- */
-
-static uint32_t all_claims(const teds_node *node)
+static uint32_t list_claims(const teds_node *node)
 {
     uint32_t claims = 0;
     for (const teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
@@ -181,11 +38,20 @@ static uint32_t all_claims(const teds_node *node)
 bool teds_actuator_claimed(const teds_node *node)
 {
     for (size_t i = 0; i < node->port->channel_count; i++) {
-        if (is_actuator(node, (int)i) && node->actuator_of[i] != NULL) {
+        if (teds_is_actuator(node, (int)i) && node->actuator_of[i] != NULL) {
             return true;
         }
     }
     return false;
+}
+
+static void end_drive(teds_session *own, uint32_t places)
+{
+    for (size_t i = 0; own->drive.used && i < own->drive.count; i++) {
+        if ((places >> own->drive.places[i] & 1) != 0) {
+            teds_wipe(&own->drive, sizeof own->drive);
+        }
+    }
 }
 
 void teds_claims_end(teds_node *node, teds_session *session, uint32_t places, bool stopped)
@@ -195,33 +61,33 @@ void teds_claims_end(teds_node *node, teds_session *session, uint32_t places, bo
         return;
     }
     for (int i = 0; i < (int)node->port->channel_count; i++) {
-        if ((going >> i & 1) != 0 && is_actuator(node, i)) {
+        if ((going >> i & 1) != 0 && teds_is_actuator(node, i)) {
             node->actuator_of[i] = NULL;
-            go_safe(node, i);
+            teds_go_safe(node, i);
             node->stopped |= stopped ? UINT32_C(1) << i : 0;
         }
     }
     session->claims &= ~going;
     teds_streams_end(node, session, going);
-    teds_drive_end(session, going);
+    end_drive(session, going);
     if (session->claims == 0) {
         memset(session->arms, 0, sizeof session->arms);
     }
 }
 
-static void release_all(teds_node *node)
+static void release_claims(teds_node *node)
 {
     for (teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
         teds_claims_end(node, each, UINT32_MAX, false);
     }
 }
 
-void teds_everything_safe(teds_node *node)
+void teds_make_all_safe(teds_node *node)
 {
-    release_all(node);
+    release_claims(node);
     for (int i = 0; i < (int)node->port->channel_count; i++) {
-        if (is_actuator(node, i) && (node->safe >> i & 1) == 0) {
-            go_safe(node, i);
+        if (teds_is_actuator(node, i) && (node->safe >> i & 1) == 0) {
+            teds_go_safe(node, i);
         }
     }
 }
@@ -235,14 +101,14 @@ void teds_yield_sensors(teds_node *node, teds_session *session)
     }
 }
 
-/* 1.3, 1.4, 128.10: 2 in a session that claims, 17 where another does. */
+/* 1.3, 1.4, 128.10: 2 in a session that claims, 17 if another does. */
 int teds_demand_configuration(teds_node *node, const teds_origin *origin, bool writes)
 {
     (void)teds_operation_poll(node, teds_now(node));
     if (origin->session != NULL && origin->session->claims != 0) {
         return -TEDS_WRONG_STATE;
     }
-    if (all_claims(node) == 0 || (writes && origin->arrival->kind == TEDS_AT_NFC && !teds_actuator_claimed(node))) {
+    if (list_claims(node) == 0 || (writes && origin->arrival->kind == TEDS_AT_NFC && !teds_actuator_claimed(node))) {
         return 0;
     }
     return -TEDS_BUSY;
@@ -251,11 +117,11 @@ int teds_demand_configuration(teds_node *node, const teds_origin *origin, bool w
 uint64_t teds_operation_poll(teds_node *node, uint64_t now)
 {
     uint64_t due = TEDS_NEVER, at;
-    if (all_claims(node) != 0 && (power_of(node).flags & TEDS_POWER_TOO_LOW) != 0) {
-        release_all(node);
+    if (list_claims(node) != 0 && (teds_power_now(node).flags & TEDS_POWER_TOO_LOW) != 0) {
+        release_claims(node);
     }
     for (int i = 0; i < (int)node->port->channel_count; i++) {
-        if (is_actuator(node, i) && node->actuator_of[i] != NULL) {
+        if (teds_is_actuator(node, i) && node->actuator_of[i] != NULL) {
             if (now >= node->deadline[i]) {
                 teds_claims_end(node, node->actuator_of[i], UINT32_C(1) << i, true);
             } else if (node->deadline[i] < due) {
@@ -278,12 +144,12 @@ uint64_t teds_operation_poll(teds_node *node, uint64_t now)
     return at < due ? at : due;
 }
 
-static uint32_t sensors_to_claim(const teds_node *node)
+static uint32_t choose_sensors(const teds_node *node)
 {
     uint32_t wanted = 0;
     uint64_t period;
     for (int i = 0; i < (int)node->port->channel_count; i++) {
-        if (!is_actuator(node, i) && !has_fault(node, i) && teds_channel_fits(node, i, &period)) {
+        if (!teds_is_actuator(node, i) && !teds_has_fault(node, i) && teds_channel_fits(node, i, &period)) {
             wanted |= UINT32_C(1) << i;
         }
     }
@@ -293,7 +159,7 @@ static uint32_t sensors_to_claim(const teds_node *node)
 static bool has_sensors(const teds_node *node)
 {
     for (int i = 0; i < (int)node->port->channel_count; i++) {
-        if (!is_actuator(node, i)) {
+        if (!teds_is_actuator(node, i)) {
             return true;
         }
     }
@@ -303,7 +169,7 @@ static bool has_sensors(const teds_node *node)
 int teds_operate(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     int place = command->channel >= 1 && command->channel <= 255 ? teds_place_of(node, (uint8_t)command->channel) : -1;
-    bool acting = place >= 0 && is_actuator(node, place);
+    bool acting = place >= 0 && teds_is_actuator(node, place);
     teds_session *session = origin->session;
     teds_source security;
     uint8_t digest[32], lease;
@@ -323,7 +189,7 @@ int teds_operate(teds_node *node, const teds_command *command, teds_origin *orig
     if (memcmp(digest, command->payload, 16) != 0) {
         return -TEDS_DIGEST_MISMATCH;
     }
-    wanted = place < 0 ? sensors_to_claim(node)
+    wanted = place < 0 ? choose_sensors(node)
                        : teds_channel_fits(node, place, &period) ? UINT32_C(1) << place : 0;
     if (wanted == 0) {
         return -TEDS_DIGEST_MISMATCH;
@@ -336,19 +202,19 @@ int teds_operate(teds_node *node, const teds_command *command, teds_origin *orig
     if (acting && node->actuator_of[place] != NULL) {
         return node->actuator_of[place] == origin->session ? -TEDS_WRONG_STATE : -TEDS_BUSY;
     }
-    if ((power_of(node).flags & TEDS_POWER_TOO_LOW) != 0 || (place >= 0 && has_fault(node, place))) {
+    if ((teds_power_now(node).flags & TEDS_POWER_TOO_LOW) != 0 || (place >= 0 && teds_has_fault(node, place))) {
         return -TEDS_FAULT_REASON;
     }
     session->claims |= wanted;
     session->lease = lease * TEDS_SECOND;
     if (acting) {
-        go_safe(node, place);
+        teds_go_safe(node, place);
         node->stopped &= ~(UINT32_C(1) << place);
         node->actuator_of[place] = origin->session;
         node->dead_man[place] = dead_man;
         node->deadline[place] = teds_now(node) + dead_man * MILLI;
         if (node->port->arm != NULL) {
-            node->port->arm(node->port->user, facts(node, place)->number, dead_man);
+            node->port->arm(node->port->user, teds_channel_at(node, place)->number, dead_man);
         }
     }
     return 0;
@@ -372,9 +238,9 @@ int teds_operation_state(teds_node *node, const teds_command *command, teds_orig
 {
     int length = 1;
     (void)command;
-    out[0] = all_claims(node) != 0;
+    out[0] = list_claims(node) != 0;
     for (int i = 0; i < (int)node->port->channel_count; i++) {
-        uint32_t state = is_actuator(node, i) ? 1 : facts(node, i)->kind == TEDS_EVENT_SENSOR ? 8 : 0;
+        uint32_t state = teds_is_actuator(node, i) ? 1 : teds_channel_at(node, i)->kind == TEDS_EVENT_SENSOR ? 8 : 0;
         uint8_t claimant = 0;
         for (size_t s = 0; s < TEDS_SESSIONS; s++) {
             if ((node->sessions[s].claims >> i & 1) != 0) {
@@ -382,9 +248,9 @@ int teds_operation_state(teds_node *node, const teds_command *command, teds_orig
                 claimant = node->sessions[s].link > claimant ? node->sessions[s].link : claimant;
             }
         }
-        state |= is_actuator(node, i) ? (node->safe >> i & 1) << 4 | (node->stopped >> i & 1) << 5 : 0;
-        state |= (is_testing(node, i) ? 64u : 0) | (has_fault(node, i) ? 128u : 0);
-        out[length] = facts(node, i)->number;
+        state |= teds_is_actuator(node, i) ? (node->safe >> i & 1) << 4 | (node->stopped >> i & 1) << 5 : 0;
+        state |= (teds_is_testing(node, i) ? 64u : 0) | (teds_has_fault(node, i) ? 128u : 0);
+        out[length] = teds_channel_at(node, i)->number;
         out[length + 1] = (uint8_t)state;
         out[length + 2] = claimant;
         length += 3;
@@ -392,21 +258,7 @@ int teds_operation_state(teds_node *node, const teds_command *command, teds_orig
     return length;
 }
 
-/* -- one value at a time ------------------------------------------------------------------------------------------------------ */
-
-/* Whether these are 1 to `most` channels, none 0 and none twice; 0 or a reason negated. */
-int teds_channel_list(const uint8_t *octets, size_t length, size_t most)
-{
-    if (length < 1 || length > most) {
-        return -TEDS_BAD_FORM;
-    }
-    for (size_t i = 0; i < length; i++) {
-        if (octets[i] == 0 || memchr(octets, octets[i], i) != NULL) {
-            return -TEDS_BAD_FORM;
-        }
-    }
-    return 0;
-}
+/* -- one value at a time ------------------------------------------------------------------------------------------- */
 
 bool teds_is_claimed(const teds_origin *origin, int place)
 {
@@ -428,12 +280,12 @@ int teds_read_data_set(teds_node *node, const teds_command *command, teds_origin
     if (teds_get32(command->payload) != 0) {
         return -TEDS_OUT_OF_RANGE;
     }
-    if (has_fault(node, place)) {
+    if (teds_has_fault(node, place)) {
         return -TEDS_FAULT_REASON;
     }
     teds_put32(out, 0);
-    (void)teds_value(node, place, teds_now(node), out + 4);
-    return 4 + facts(node, place)->octets;
+    (void)teds_read_channel(node, place, teds_now(node), out + 4);
+    return 4 + teds_channel_at(node, place)->octets;
 }
 
 int teds_sample(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
@@ -452,13 +304,13 @@ int teds_sample(teds_node *node, const teds_command *command, teds_origin *origi
         if (!teds_is_claimed(origin, place)) {
             return -TEDS_WRONG_STATE;
         }
-        length += facts(node, place)->octets;
+        length += teds_channel_at(node, place)->octets;
     }
     if (length > TEDS_ROOM - 4) {
         return -TEDS_TOO_LARGE;
     }
     for (size_t i = 0; i < count; i++) {
-        if (has_fault(node, teds_place_of(node, channels[i]))) {
+        if (teds_has_fault(node, teds_place_of(node, channels[i]))) {
             return -TEDS_FAULT_REASON;
         }
     }
@@ -468,35 +320,35 @@ int teds_sample(teds_node *node, const teds_command *command, teds_origin *origi
     length = 9;
     for (size_t i = 0; i < count; i++) {
         int place = teds_place_of(node, channels[i]);
-        out[8] |= teds_value(node, place, tick, out + length) ? 0 : 1;
-        length += facts(node, place)->octets;
+        out[8] |= teds_read_channel(node, place, tick, out + length) ? 0 : 1;
+        length += teds_channel_at(node, place)->octets;
     }
     return (int)length;
 }
 
 /* Give actuators their values: `pairs` of channel and data set, checked to be claimed here. */
-int teds_apply(teds_node *node, const uint8_t *pairs, size_t length)
+int teds_set_actuators(teds_node *node, const uint8_t *pairs, size_t length)
 {
     const teds_port *port = node->port;
     uint64_t now = teds_now(node);
-    for (size_t at = 0; at < length; at += 1u + facts(node, teds_place_of(node, pairs[at]))->octets) {
+    for (size_t at = 0; at < length; at += 1u + teds_channel_at(node, teds_place_of(node, pairs[at]))->octets) {
         if (port->bears == NULL || port->set == NULL || !port->bears(port->user, pairs[at], pairs + at + 1)) {
             return -TEDS_OUT_OF_RANGE;
         }
     }
-    for (size_t at = 0; at < length; at += 1u + facts(node, teds_place_of(node, pairs[at]))->octets) {
-        if (has_fault(node, teds_place_of(node, pairs[at]))) {
+    for (size_t at = 0; at < length; at += 1u + teds_channel_at(node, teds_place_of(node, pairs[at]))->octets) {
+        if (teds_has_fault(node, teds_place_of(node, pairs[at]))) {
             return -TEDS_FAULT_REASON;
         }
     }
-    for (size_t at = 0; at < length; at += 1u + facts(node, teds_place_of(node, pairs[at]))->octets) {
+    for (size_t at = 0; at < length; at += 1u + teds_channel_at(node, teds_place_of(node, pairs[at]))->octets) {
         int place = teds_place_of(node, pairs[at]);
         port->set(port->user, pairs[at], pairs + at + 1);
         if (port->kick != NULL) {
             port->kick(port->user, pairs[at]);
         }
         node->deadline[place] = now + node->dead_man[place] * MILLI;
-        node->safe &= ~(UINT32_C(1) << place); /* NOLINT: whoever calls has looked each channel up, so none is -1 */
+        node->safe &= ~(UINT32_C(1) << place); /* NOLINT: the caller has looked each channel up, so none is -1 */
     }
     return 0;
 }
@@ -509,13 +361,13 @@ int teds_write_data_set(teds_node *node, const teds_command *command, teds_origi
     if (place < 0) {
         return -TEDS_UNKNOWN_COMMAND;
     }
-    if (command->length != 4u + facts(node, place)->octets) {
+    if (command->length != 4u + teds_channel_at(node, place)->octets) {
         return -TEDS_BAD_FORM;
     }
     if (!teds_is_claimed(origin, place)) {
         return -TEDS_WRONG_STATE;
     }
-    if (!is_actuator(node, place)) {
+    if (!teds_is_actuator(node, place)) {
         return -TEDS_NOT_PERMITTED;
     }
     if (teds_get32(command->payload) != 0) {
@@ -523,7 +375,7 @@ int teds_write_data_set(teds_node *node, const teds_command *command, teds_origi
     }
     pair[0] = (uint8_t)command->channel;
     memcpy(pair + 1, command->payload + 4, command->length - 4);
-    return teds_apply(node, pair, command->length - 3);
+    return teds_set_actuators(node, pair, command->length - 3);
 }
 
 int teds_set(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
@@ -544,21 +396,21 @@ int teds_set(teds_node *node, const teds_command *command, teds_origin *origin, 
         if (place < 0) { /* it has no width, so nothing after it can be read */
             return -TEDS_WRONG_STATE;
         }
-        if ((seen >> place & 1) != 0 || at + 1 + facts(node, place)->octets > command->length) {
+        if ((seen >> place & 1) != 0 || at + 1 + teds_channel_at(node, place)->octets > command->length) {
             return -TEDS_BAD_FORM;
         }
         seen |= UINT32_C(1) << place;
-        at += 1u + facts(node, place)->octets;
+        at += 1u + teds_channel_at(node, place)->octets;
     }
     if ((seen & ~origin->session->claims) != 0) {
         return -TEDS_WRONG_STATE;
     }
     for (place = 0; place < (int)node->port->channel_count; place++) {
-        if ((seen >> place & 1) != 0 && !is_actuator(node, place)) {
+        if ((seen >> place & 1) != 0 && !teds_is_actuator(node, place)) {
             return -TEDS_NOT_PERMITTED;
         }
     }
-    return teds_apply(node, pairs, command->length);
+    return teds_set_actuators(node, pairs, command->length);
 }
 
 int teds_self_test(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
@@ -582,7 +434,7 @@ int teds_self_test(teds_node *node, const teds_command *command, teds_origin *or
     }
     for (int i = 0; i < (int)node->port->channel_count; i++) {
         if ((wanted >> i & 1) != 0 && node->port->self_test != NULL) {
-            node->port->self_test(node->port->user, facts(node, i)->number);
+            node->port->self_test(node->port->user, teds_channel_at(node, i)->number);
         }
     }
     return 0;
@@ -590,7 +442,7 @@ int teds_self_test(teds_node *node, const teds_command *command, teds_origin *or
 
 int teds_power_state(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    const teds_power now = power_of(node);
+    const teds_power now = teds_power_now(node);
     (void)command;
     (void)origin;
     out[0] = now.flags;

@@ -1,29 +1,41 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Claims and leases, single values, dead-man. */
+/* Measurement operation: claims with their leases and dead-men, single values. A session claims channels; an actuator is
+ * claimed by one session at most, and goes safe when its claim ends. */
 #ifndef TEDS_SRC_OPERATION_H
 #define TEDS_SRC_OPERATION_H
 
 #include "inside.h"
 
 #if TEDS_OPERATION
-bool teds_channels_good(const teds_port *port);
-void teds_operation_start(teds_node *node);
 teds_handler teds_operate, teds_idle, teds_read_data_set, teds_write_data_set, teds_self_test, teds_sample, teds_set,
     teds_clock, teds_power_state, teds_operation_state;
-int teds_demand_configuration(teds_node *node, const teds_origin *origin, bool writes);
-void teds_yield_sensors(teds_node *node, teds_session *session);
-void teds_claims_end(teds_node *node, teds_session *session, uint32_t places, bool stopped);
-void teds_everything_safe(teds_node *node);
-uint64_t teds_operation_poll(teds_node *node, uint64_t now);
-bool teds_actuator_claimed(const teds_node *node);
-int teds_place_of(const teds_node *node, uint8_t channel);
-bool teds_value(const teds_node *node, int place, uint64_t tick, uint8_t *out);
-int teds_channel_fits(const teds_node *node, int place, uint64_t *period);
-int teds_channel_list(const uint8_t *octets, size_t length, size_t most);
 
-int teds_apply(teds_node *node, const uint8_t *pairs, size_t length);
+/* Bring all actuators to their safe state, at a start. */
+void teds_operation_start(teds_node *node);
+
+/* End what is over: leases, dead-men, claims of a board whose power is too low. Take the samples that are due. Return when
+ * the next thing is. */
+uint64_t teds_operation_poll(teds_node *node, uint64_t now);
+
+/* End a session's claims on these places. `stopped`: Operation state reports those of actuators as stopped. */
+void teds_claims_end(teds_node *node, teds_session *session, uint32_t places, bool stopped);
+
+/* End the sensors' claims of all other sessions: a Write over NFC goes first. */
+void teds_yield_sensors(teds_node *node, teds_session *session);
+
+/* End every claim, and bring each actuator to its safe state that is not in it. */
+void teds_make_all_safe(teds_node *node);
+
+/* 0 if Write (`writes`), Update or a new CAN address may be now; or a reason negated: this session or another claims. */
+int teds_demand_configuration(teds_node *node, const teds_origin *origin, bool writes);
+
+bool teds_actuator_claimed(const teds_node *node);
+
+/* True if the command's session claims this place. */
 bool teds_is_claimed(const teds_origin *origin, int place);
-int teds_run_key(const teds_node *node, const teds_session *session, const char *label, size_t length, uint8_t out[16]);
+
+/* Give actuators their values: `pairs` of channel and data set, all claimed. 0, or a reason negated: then none was set. */
+int teds_set_actuators(teds_node *node, const uint8_t *pairs, size_t length);
 #endif
 
 #endif

@@ -27,7 +27,7 @@ bool teds_own_check(uint8_t code, const uint8_t *teds, size_t length)
 
 static const char SIXTY_FOUR[64] = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
 
-static void base64(const uint8_t *octets, size_t length, uint8_t *out)
+static void put_base64(const uint8_t *octets, size_t length, uint8_t *out)
 {
     for (size_t at = 0; at < length; at += 3) {
         uint32_t three = (uint32_t)octets[at] << 16;
@@ -40,20 +40,20 @@ static void base64(const uint8_t *octets, size_t length, uint8_t *out)
     }
 }
 
-static int six_bits(uint8_t letter)
+static int decode_six_bits(uint8_t letter)
 {
     const char *at = memchr(SIXTY_FOUR, letter, sizeof SIXTY_FOUR);
     return at != NULL ? (int)(at - SIXTY_FOUR) : -1;
 }
 
 /* 88 letters of canonical base64 to `length` octets, 64 or 65: padded, spare bits zero. `out` has room for 66. */
-static bool from_base64(const uint8_t *text, size_t length, uint8_t *out)
+static bool decode_base64(const uint8_t *text, size_t length, uint8_t *out)
 {
     const size_t letters = length == 64 ? 86 : 87;
     uint32_t bits = 0;
     size_t at = 0;
     for (size_t i = 0; i < 88; i++) {
-        int value = i < letters ? six_bits(text[i]) : (text[i] == '=' ? 0 : -1);
+        int value = i < letters ? decode_six_bits(text[i]) : (text[i] == '=' ? 0 : -1);
         if (value < 0) {
             return false;
         }
@@ -75,14 +75,14 @@ static const uint8_t HEAD[] = {0, 0, 0, TEDS_INITIAL_OCTETS - 4, 3, 4, 0, 128, 1
                                4, 1, 1, 5, 0, 6, 8, 0, 0, 0, 0, 0, 0, 0, 0, 101, TEXT_OCTETS};
 static const uint8_t TAIL[] = {105, 1, 1, 106, 4, 0, 0, 0, 0, 107, 4, 0, 0, 0, 0, 109, 1, 2, 110, 1, 2};
 
-void teds_initial(const teds_node *node, uint8_t out[TEDS_INITIAL_OCTETS])
+void teds_put_initial(const teds_node *node, uint8_t out[TEDS_INITIAL_OCTETS])
 {
     uint8_t *at = out + sizeof HEAD;
     memcpy(out, HEAD, sizeof HEAD);
-    base64(node->identity.point, 65, at);
+    put_base64(node->identity.point, 65, at);
     at[TEXT_OCTETS] = 102;
     at[TEXT_OCTETS + 1] = TEXT_OCTETS;
-    base64(node->identity.signature, 64, at + TEXT_OCTETS + 2);
+    put_base64(node->identity.signature, 64, at + TEXT_OCTETS + 2);
     at = out + TAIL_AT;
     memcpy(at, TAIL, sizeof TAIL);
     teds_put32(at + 5, node->state.sequence);
@@ -134,7 +134,7 @@ static bool take_text(const teds_node *node, teds_signed *out, uint8_t type, con
     const uint8_t *own = type == 101 ? node->identity.point : node->identity.signature;
     const size_t length = 64u + (type & 1u);
     uint8_t *octets = out->decoded[type == 100 ? TEDS_SIGNATURE : type == 104 ? TEDS_STATION_SIGNATURE : TEDS_STATION];
-    if (!from_base64(text, length, octets)) {
+    if (!decode_base64(text, length, octets)) {
         return false;
     }
     if ((type == 101 || type == 102) && memcmp(octets, own, length) != 0) {
@@ -207,4 +207,21 @@ bool teds_security_parse(const teds_node *node, const uint8_t *block, size_t len
         at += 2 + octets;
     }
     return next == FIELD_COUNT;
+}
+
+/* A listed block: channel 2, access code 1, digest 32, behind the head of its tuple. */
+const uint8_t *teds_listed_block(const teds_signed *teds, size_t place)
+{
+    return teds->blocks + 37 * place + 2;
+}
+
+bool teds_is_listed(const teds_signed *teds, uint16_t id)
+{
+    for (size_t i = 0; i < teds->block_count; i++) {
+        const uint8_t *block = teds_listed_block(teds, i);
+        if (block[0] == 0 && block[1] == id >> 8 && block[2] == (id & 0xFF)) {
+            return true;
+        }
+    }
+    return false;
 }

@@ -1,22 +1,38 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The Security TEDS: its initial form, and reading one. */
+/* The Security TEDS as octets: its initial form, and reading a signed one. */
 #ifndef TEDS_SRC_SECURITY_TEDS_H
 #define TEDS_SRC_SECURITY_TEDS_H
 
 #include "inside.h"
 
+/* The fields of signatures, without their base64. */
 enum { TEDS_SIGNATURE, TEDS_STATION, TEDS_STATION_SIGNATURE }; /* 100, 103, 104 */
+
+/* The fields of a signed one. */
 typedef struct teds_signed {
-    uint8_t decoded[3][66]; /* these fields without their base64 */
+    uint8_t decoded[3][66];
     bool others;            /* 101 or 102 is not this node's own */
     uint32_t numbers[2];    /* 106 sequence, 107 key epoch */
     const uint8_t *blocks;  /* the first tuple of type 108 */
     size_t block_count;
     size_t signature_at; /* of its tuple, in the data block */
 } teds_signed;
-void teds_initial(const teds_node *node, uint8_t out[TEDS_INITIAL_OCTETS]);
+
+/* Read a data block; false if it is not in the canonical form. No signature is looked at. */
 bool teds_security_parse(const teds_node *node, const uint8_t *block, size_t length, teds_signed *out);
+
+/* A block that it lists, by its place: channel 2, access code 1, digest 32. */
+const uint8_t *teds_listed_block(const teds_signed *teds, size_t place);
+
+bool teds_is_listed(const teds_signed *teds, uint16_t id);
+
+/* The Security TEDS of a node that no station has signed for. */
+void teds_put_initial(const teds_node *node, uint8_t out[TEDS_INITIAL_OCTETS]);
+
+/* Checksum of a TEDS whose `length` octets stand before it. */
 uint16_t teds_checksum(const uint8_t *octets, size_t length);
+
+/* True if an image is a TEDS by itself: length, checksum, the access code in its header. */
 bool teds_own_check(uint8_t code, const uint8_t *teds, size_t length);
 
 #endif

@@ -1,18 +1,15 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Sessions (security-teds.md, 4): Open, Sealed, their lives and ends. Sessions and half-open Opens are tables apart, so
- * that nobody's plain question, and nobody's Open, ends a session. */
+/* Sessions (security-teds.md, 4): the table of them, Open, the keys that it makes, and sealing with them. Sessions and
+ * half-open Opens are tables apart, so that no plain question, and no Open of a stranger, ends a session. When sessions
+ * begin and end is the matter of session_life.c. */
 #include "session.h"
-#include "agree.h"
 #include "clock.h"
-#include "manage.h"
-#include "operation.h"
-#include "teds_store.h"
+#include "crypto.h"
 #include "inside.h"
 
 #define HALF_OPEN_NS (60u * TEDS_SECOND)
-#define IDLE_NS (600u * TEDS_SECOND)
-#define LABEL(text) {(const uint8_t *)(text), sizeof(text)}
-#define MAC_LABEL(text) {(const uint8_t *)(text), sizeof(text) - 1u}
+
+/* -- the tables ---------------------------------------------------------------------------------------------------- */
 
 teds_session *teds_session_on(teds_node *node, teds_link link)
 {
@@ -24,7 +21,7 @@ teds_session *teds_session_on(teds_node *node, teds_link link)
     return NULL;
 }
 
-static teds_half_open *half_open_on(teds_node *node, teds_link link)
+teds_half_open *teds_half_open_on(teds_node *node, teds_link link)
 {
     for (size_t i = 0; i < TEDS_SESSIONS; i++) {
         if (node->half_open[i].used && node->half_open[i].link == link) {
@@ -36,90 +33,25 @@ static teds_half_open *half_open_on(teds_node *node, teds_link link)
 
 bool teds_any_on(teds_node *node, teds_link link)
 {
-    return teds_session_on(node, link) != NULL || half_open_on(node, link) != NULL;
+    return teds_session_on(node, link) != NULL || teds_half_open_on(node, link) != NULL;
 }
 
-void teds_session_end(teds_node *node, teds_session *session)
-{
-    if (session == NULL || !session->used) {
-        return;
-    }
 #if TEDS_OPERATION
-    teds_claims_end(node, session, UINT32_MAX, false);
+/* Key of a run: HKDF-Expand(k_m, label, run, 16); the label ends in 00. */
+int teds_run_key(const teds_node *node, const teds_session *session, const char *label, size_t length, uint8_t out[16])
+{
+    uint8_t run[2];
+    const teds_part info[] = {{(const uint8_t *)label, length}, {run, 2}};
+    teds_put16(run, session->run);
+    return teds_hkdf_expand(node, session->keys.messages, info, 2, out, 16);
+}
 #endif
-    if (node->staging_of == session) {
-        teds_staging_drop(node);
-    }
-#if TEDS_MANAGED
-    teds_upload_end(node, session);
-#endif
-    if (node->pending.used && node->pending.session == session) {
-        teds_pending_forget(node);
-    }
-    teds_wipe(session, sizeof *session);
-}
 
-void teds_link_forget(teds_node *node, teds_link link)
-{
-    teds_half_open *half = half_open_on(node, link);
-    teds_session_end(node, teds_session_on(node, link));
-    if (half != NULL) {
-        teds_wipe(half, sizeof *half);
-    }
-    for (teds_stored_reply *each = node->replies; each < node->replies + TEDS_REPLIES; each++) {
-        if (each->link == link) {
-            each->used = false;
-        }
-    }
-    if (node->pending.link == link) {
-        teds_pending_forget(node);
-    }
-}
-
-void teds_end_everything(teds_node *node)
-{
-    for (teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
-        teds_session_end(node, each);
-    }
-    teds_wipe(node->half_open, sizeof node->half_open);
-    teds_pending_forget(node);
-}
-
-/* Whether that time has come; if not, something is due then. */
-static bool is_over(uint64_t at, uint64_t now, uint64_t *due)
-{
-    if (now >= at) {
-        return true;
-    }
-    teds_sooner(due, at);
-    return false;
-}
-
-uint64_t teds_sessions_poll(teds_node *node, uint64_t now)
-{
-    uint64_t due = TEDS_NEVER;
-    for (size_t i = 0; i < TEDS_SESSIONS; i++) {
-        teds_session *session = &node->sessions[i];
-        teds_half_open *half = &node->half_open[i];
-        if (session->used && is_over(session->good_at + IDLE_NS, now, &due)) {
-#if TEDS_OPERATION
-            (void)teds_operation_poll(node, now); /* a dead-man that stopped an actuator before is told, this end is not */
-#endif
-            teds_session_end(node, session);
-        }
-        if (half->used && is_over(half->until, now, &due)) {
-            teds_wipe(half, sizeof *half);
-        }
-    }
-    if (node->pending.used && is_over(node->pending.until, now, &due)) {
-        teds_pending_forget(node);
-    }
-    return due;
-}
+/* -- Open ---------------------------------------------------------------------------------------------------------- */
 
 static void keep_half_open(teds_node *node, teds_link link, const teds_keys *keys)
 {
-    teds_half_open *place = half_open_on(node, link);
+    teds_half_open *place = teds_half_open_on(node, link);
     if (place == NULL) { /* a free one, whose time is 0; beyond its room the oldest goes */
         place = &node->half_open[0];
         for (size_t i = 1; i < TEDS_SESSIONS; i++) {
@@ -135,8 +67,8 @@ static void keep_half_open(teds_node *node, teds_link link, const teds_keys *key
 }
 
 /* Keys of the session and the node's tag, from Es, the node's one-time key and K. */
-static int derive(const teds_node *node, const uint8_t es[65], const uint8_t key_id[8], teds_keys *keys,
-                  uint8_t tag[16])
+static int derive_keys(const teds_node *node, const uint8_t es[65], const uint8_t key_id[8], teds_keys *keys,
+                       uint8_t tag[16])
 {
     const teds_port *port = node->port;
     const teds_one_time *own = &node->one_time;
@@ -198,7 +130,7 @@ int teds_open(teds_node *node, const teds_command *command, teds_origin *origin,
     failed = teds_one_time_make(node) != 0;
     if (!failed) {
         memcpy(out, node->one_time.point, 65);
-        failed = derive(node, payload + 8, payload, &keys, out + 65);
+        failed = derive_keys(node, payload + 8, payload, &keys, out + 65);
     }
     if (!failed) {
         keep_half_open(node, origin->link, &keys);
@@ -208,32 +140,10 @@ int teds_open(teds_node *node, const teds_command *command, teds_origin *origin,
     return failed ? -TEDS_FAILURE : 81;
 }
 
-/* A place for the session that a half-open Open becomes: its link's own, a free one, that of the session without a
- * claim which was silent longest; NULL where all have claims. */
-static teds_session *make_room(teds_node *node, teds_link link)
-{
-    teds_session *place = teds_session_on(node, link);
-    if (place != NULL) {
-        return place;
-    }
-    for (teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
-        if (!each->used) {
-            return each;
-        }
-#if TEDS_OPERATION
-        if (each->claims != 0) {
-            continue;
-        }
-#endif
-        if (place == NULL || each->good_at < place->good_at) {
-            place = each;
-        }
-    }
-    return place;
-}
+/* -- Sealed -------------------------------------------------------------------------------------------------------- */
 
-/* Octets of the inner frame behind the padding of RFC 5652 6.3; -1 where the padding is wrong. */
-static int unpadded(const uint8_t *plain, size_t length)
+/* Octets of the inner frame behind the padding of RFC 5652 6.3; -1 if the padding is wrong. */
+static int strip_padding(const uint8_t *plain, size_t length)
 {
     uint8_t count = length > 0 ? plain[length - 1] : 0;
     uint8_t wrong = (uint8_t)(count == 0 || count > 16 || length % 16 != 0);
@@ -243,21 +153,21 @@ static int unpadded(const uint8_t *plain, size_t length)
     return wrong ? -1 : (int)(length - count);
 }
 
-static int unseal(const teds_node *node, const teds_keys *keys, const uint8_t *payload, size_t length, uint8_t *plain)
+static int open_with(const teds_node *node, const teds_keys *keys, const uint8_t *payload, size_t length, uint8_t *plain)
 {
     uint8_t nonce[13] = {0};
     memcpy(nonce + 9, payload, 4);
     if (!node->port->ccm_open(node->port->user, keys->to_node, nonce, payload + 4, length - 20, plain, 16)) {
         return -1;
     }
-    return unpadded(plain, length - 20);
+    return strip_padding(plain, length - 20);
 }
 
-int teds_take_sealed(teds_node *node, teds_link link, const teds_arrival *arrival, const uint8_t *payload,
-                     size_t length, uint8_t *plain, teds_taken *taken)
+int teds_unseal(teds_node *node, teds_link link, const uint8_t *payload, size_t length, uint8_t *plain,
+                teds_taken *taken)
 {
     teds_session *session = teds_session_on(node, link);
-    teds_half_open *half = half_open_on(node, link);
+    teds_half_open *half = teds_half_open_on(node, link);
     const teds_keys *keys = NULL;
     uint32_t last = 0;
     int inner = -1;
@@ -267,14 +177,14 @@ int teds_take_sealed(teds_node *node, teds_link link, const teds_arrival *arriva
     if (session != NULL) {
         keys = &session->keys;
         last = session->counter;
-        inner = unseal(node, keys, payload, length, plain);
+        inner = open_with(node, keys, payload, length, plain);
     }
     if (inner >= 0) {
         half = NULL;
     } else if (half != NULL) {
         keys = &half->keys;
         last = 0;
-        inner = unseal(node, keys, payload, length, plain);
+        inner = open_with(node, keys, payload, length, plain);
     }
     if (inner < 0 || keys == NULL) {
         return -TEDS_BAD_TAG;
@@ -285,26 +195,11 @@ int teds_take_sealed(teds_node *node, teds_link link, const teds_arrival *arriva
     }
     taken->length = (size_t)inner;
     memcpy(taken->to_station, keys->to_station, 16);
-    if (half != NULL) {
-        session = make_room(node, link);
-        if (session != NULL) {
-            teds_session_end(node, session);
-            session->used = true;
-            session->link = link;
-            session->kind = arrival->kind;
-            session->keys = half->keys;
-        }
-        teds_wipe(half, sizeof *half);
-    }
     taken->session = session;
-    if (session != NULL) {
-        session->counter = taken->counter;
-        session->good_at = teds_now(node);
-    }
+    taken->half = half;
     return 0;
 }
 
-/* `payload` has room for counter, padding and tag around `inner` octets that stand at payload + 4. */
 int teds_seal_reply(const teds_node *node, const uint8_t key[16], uint32_t counter, uint8_t *payload, size_t inner,
                     size_t *length)
 {

@@ -1,28 +1,44 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Open, Sealed, and the lives of sessions. */
+/* Sessions: the table of them, and the keys in them. A link has at most one session and one half-open Open. */
 #ifndef TEDS_SRC_SESSION_H
 #define TEDS_SRC_SESSION_H
 
 #include "inside.h"
 
+/* 128.3: a good Open becomes half-open. */
 teds_handler teds_open;
+
+/* The session of a link; NULL: none. */
 teds_session *teds_session_on(teds_node *node, teds_link link);
+
+/* The Open of a link that no sealed message has followed yet; NULL: none. */
+teds_half_open *teds_half_open_on(teds_node *node, teds_link link);
+
+/* True if a sealed command of this link may be good. */
 bool teds_any_on(teds_node *node, teds_link link);
-/* Ends what is over; when the next of them is. */
-uint64_t teds_sessions_poll(teds_node *node, uint64_t now);
+
+/* A command that was unsealed. */
 typedef struct teds_taken {
-    teds_session *session; /* NULL: there was no room for it */
+    teds_session *session; /* whose key was good; NULL: that of `half`, or there is no room for a session */
+    teds_half_open *half;  /* NULL: a session's key was good */
     uint32_t counter;
     uint8_t to_station[16];
     size_t length; /* of the inner frame */
 } teds_taken;
-int teds_take_sealed(teds_node *node, teds_link link, const teds_arrival *arrival, const uint8_t *payload,
-                     size_t length, uint8_t *plain, teds_taken *taken);
+
+/* Decipher the payload of Sealed to `plain`, with the session's key or else the half-open one's; the tag before the counter.
+ * No session changes. 0, or a reason negated. */
+int teds_unseal(teds_node *node, teds_link link, const uint8_t *payload, size_t length, uint8_t *plain,
+                teds_taken *taken);
+
+/* Seal the inner reply of `inner` octets that stands at payload + 4, in place: `payload` has room for counter, padding and
+ * tag around it. */
 int teds_seal_reply(const teds_node *node, const uint8_t key[16], uint32_t counter, uint8_t *payload, size_t inner,
                     size_t *length);
-void teds_session_end(teds_node *node, teds_session *session);
-void teds_end_everything(teds_node *node);
-/* Loss of a link, but for the move that 128.10 may have left. */
-void teds_link_forget(teds_node *node, teds_link link);
+
+#if TEDS_OPERATION
+/* Key of a run of a stream or of Drive: HKDF-Expand(k_m, label, run, 16); the label ends in 00. */
+int teds_run_key(const teds_node *node, const teds_session *session, const char *label, size_t length, uint8_t out[16]);
+#endif
 
 #endif

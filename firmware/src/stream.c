@@ -1,14 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Streams and trigger (operation.md, 3, 4, 5): Subscribe, Stop, samples when they are due, data messages sealed and cut
- * into frames, Arm. A stream has one message being filled and one that waits; a waiting one is dropped when the next is
+/* Streams (operation.md, 3, 4): Subscribe, Stop, samples when they are due, data messages sealed and cut into frames. A
+ * stream has one message being filled and one that waits; a waiting one is dropped when the next is
  * full: newest wins. One message at a time is being sent. */
 #include "stream.h"
-#include "agree.h"
-#include "ble.h"
 #include "clock.h"
 #include "isotp.h"
-#include "operation.h"
 #include "session.h"
+#include "transducers.h"
 #include "inside.h"
 
 #if TEDS_OPERATION
@@ -23,6 +21,7 @@
 #define MILLION 1000000u
 #define DATA 0x1CFF0000u
 #define PATTERN 0x80u
+#define BLE_DATA_HEAD 4u /* ATT's three octets, and the stream */
 enum { PERIODIC = 0, EVENT = 1, FREE = 2 };
 
 typedef struct asked {
@@ -32,24 +31,24 @@ typedef struct asked {
     uint8_t places[16];
 } asked;
 
-static uint64_t span(const teds_stream *stream)
+static uint64_t message_span(const teds_stream *stream)
 {
     return stream->n * stream->period;
 }
 
 /* A message is one notification on BLE. */
-static uint64_t frames(uint32_t length, bool fd, bool ble)
+static uint64_t count_frames(uint32_t length, bool fd, bool ble)
 {
     uint32_t room = fd ? 64 : 8;
     return ble ? 1 : (length + room - 1) / room;
 }
 
-static uint64_t share(uint64_t count, uint64_t gap, uint64_t instants)
+static uint64_t share_of_bus(uint64_t count, uint64_t gap, uint64_t instants)
 {
     return (count * gap * TEDS_SECOND + instants - 1) / instants;
 }
 
-static teds_stream *find(teds_node *node, const teds_session *session, uint8_t number)
+static teds_stream *find_stream(teds_node *node, const teds_session *session, uint8_t number)
 {
     for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
         if (each->used && each->session == session && each->number == number) {
@@ -59,7 +58,7 @@ static teds_stream *find(teds_node *node, const teds_session *session, uint8_t n
     return NULL;
 }
 
-static void end(teds_node *node, teds_stream *stream)
+static void end_stream(teds_node *node, teds_stream *stream)
 {
     node->missed += stream->missed;
     if (node->can.data_stream == stream) {
@@ -86,7 +85,7 @@ void teds_streams_end(teds_node *node, teds_session *session, uint32_t places)
             touched = touched || (places >> each->channels[c] & 1) != 0;
         }
         if (each->used && each->session == session && touched) {
-            end(node, each);
+            end_stream(node, each);
         }
     }
 }
@@ -100,7 +99,17 @@ void teds_streams_ready(teds_node *node, teds_session *session)
     }
 }
 
-/* -- Subscribe ------------------------------------------------------------------------------------------------------------ */
+void teds_streams_start(teds_node *node, const teds_session *session, uint64_t tick)
+{
+    for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
+        if (each->used && each->session == session && each->waits) {
+            each->waits = false;
+            each->start = tick + AFTER_MARK_NS;
+        }
+    }
+}
+
+/* -- Subscribe ----------------------------------------------------------------------------------------------------- */
 
 static int read_asked(const teds_command *command, asked *out)
 {
@@ -159,7 +168,7 @@ static int check_period(const teds_node *node, const asked *in)
     return in->period < shortest || in->period > LONGEST_PERIOD ? -TEDS_OUT_OF_RANGE : 0;
 }
 
-static bool on_bus(const teds_stream *stream, bool ble)
+static bool is_on_bus(const teds_stream *stream, bool ble)
 {
     return stream->used && stream->ble == ble;
 }
@@ -169,16 +178,16 @@ static int check_budget(const teds_node *node, const asked *in, uint64_t count, 
 {
     uint64_t gap = in->gap > 0 ? in->gap : 1, sum = 0;
     for (const teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
-        if (on_bus(each, ble) && each != old && each->gap > gap) {
+        if (is_on_bus(each, ble) && each != old && each->gap > gap) {
             gap = each->gap;
         }
     }
     for (const teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
-        if (on_bus(each, ble) && each != old) {
-            sum += share(frames(each->length, each->fd, ble), gap, span(each));
+        if (is_on_bus(each, ble) && each != old) {
+            sum += share_of_bus(count_frames(each->length, each->fd, ble), gap, message_span(each));
         }
     }
-    sum += share(count, gap, in->n * in->period);
+    sum += share_of_bus(count, gap, in->n * in->period);
     return sum > MILLION ? -TEDS_DOES_NOT_FIT : 0;
 }
 
@@ -193,7 +202,7 @@ static int check_start(const asked *in, const teds_origin *origin, uint64_t now)
     return 0;
 }
 
-static teds_stream *room_for(teds_node *node, teds_stream *old)
+static teds_stream *find_stream_room(teds_node *node, teds_stream *old)
 {
     if (old != NULL) {
         return old;
@@ -206,21 +215,17 @@ static teds_stream *room_for(teds_node *node, teds_stream *old)
     return NULL;
 }
 
-/* Key of a run: HKDF-Expand(k_m, label, run, 16); the label ends in 00. */
-int teds_run_key(const teds_node *node, const teds_session *session, const char *label, size_t length, uint8_t out[16])
-{
-    uint8_t run[2];
-    const teds_part info[] = {{(const uint8_t *)label, length}, {run, 2}};
-    teds_put16(run, session->run);
-    return teds_hkdf_expand(node, session->keys.messages, info, 2, out, 16);
-}
-
 /* Octets of the longest message that this link takes; 0: its station has not enabled them. */
-static uint32_t longest(const teds_node *node, const teds_origin *origin)
+static uint32_t longest_message(const teds_node *node, const teds_origin *origin)
 {
 #if TEDS_BLE
     if (origin->arrival->kind == TEDS_AT_BLE) {
-        const uint32_t most = teds_ble_longest(node, origin->link);
+        const size_t connection = origin->link - (size_t)TEDS_LINK_BLE;
+        const teds_ble_line *line = &node->ble.lines[connection];
+        uint32_t most = 0;
+        if (connection < TEDS_BLE_CONNECTIONS && line->used && line->hears) {
+            most = line->mtu - BLE_DATA_HEAD;
+        }
         return most < TEDS_MESSAGE ? most : TEDS_MESSAGE;
     }
 #else
@@ -246,7 +251,7 @@ int teds_subscribe(teds_node *node, const teds_command *command, teds_origin *or
     if (origin->arrival->kind == TEDS_AT_NFC) {
         return -TEDS_DOES_NOT_FIT;
     }
-    most = longest(node, origin);
+    most = longest_message(node, origin);
     if (most == 0) {
         return -TEDS_WRONG_STATE;
     }
@@ -261,15 +266,15 @@ int teds_subscribe(teds_node *node, const teds_command *command, teds_origin *or
     if (length > most) {
         return -TEDS_TOO_LARGE;
     }
-    old = find(node, origin->session, in.stream);
-    refused = check_budget(node, &in, frames(length, fd, ble), ble, old);
+    old = find_stream(node, origin->session, in.stream);
+    refused = check_budget(node, &in, count_frames(length, fd, ble), ble, old);
     if (!refused) {
         refused = check_start(&in, origin, now);
     }
     if (refused) {
         return refused;
     }
-    stream = room_for(node, old);
+    stream = find_stream_room(node, old);
     if (session->run == UINT16_MAX || stream == NULL) {
         return -TEDS_NO_ROOM;
     }
@@ -278,7 +283,7 @@ int teds_subscribe(teds_node *node, const teds_command *command, teds_origin *or
         return -TEDS_FAILURE;
     }
     if (old != NULL) {
-        end(node, old);
+        end_stream(node, old);
     }
     memset(stream, 0, sizeof *stream);
     stream->used = true;
@@ -308,24 +313,24 @@ int teds_subscribe(teds_node *node, const teds_command *command, teds_origin *or
 
 int teds_stop(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    teds_stream *stream = find(node, origin->session, command->payload[0]);
+    teds_stream *stream = find_stream(node, origin->session, command->payload[0]);
     if (stream == NULL) {
         return -TEDS_WRONG_STATE;
     }
     teds_put32(out, stream->ended ? UINT32_MAX : stream->counter);
-    end(node, stream);
+    end_stream(node, stream);
     return 4;
 }
 
-/* -- samples --------------------------------------------------------------------------------------------------------------- */
+/* -- samples ------------------------------------------------------------------------------------------------------- */
 
-static void count(teds_stream *stream)
+static void advance_counter(teds_stream *stream)
 {
     stream->ended = stream->counter == UINT32_MAX;
     stream->counter++;
 }
 
-static void full(teds_stream *stream)
+static void close_message(teds_stream *stream)
 {
     stream->missed += stream->full;
     stream->full = true;
@@ -335,11 +340,11 @@ static void full(teds_stream *stream)
     stream->fill = 0;
     stream->flags = 0;
     stream->held = 0;
-    count(stream);
+    advance_counter(stream);
 }
 
 /* Sample k of a channel in a test pattern: (k + channel) mod 2^(8 octets). */
-static void pattern(uint8_t channel, uint8_t octets, uint64_t index, uint8_t *out)
+static void put_pattern(uint8_t channel, uint8_t octets, uint64_t index, uint8_t *out)
 {
     uint64_t value = index + channel;
     for (size_t i = octets; i-- > 0; value >>= 8) {
@@ -347,7 +352,7 @@ static void pattern(uint8_t channel, uint8_t octets, uint64_t index, uint8_t *ou
     }
 }
 
-static void instant(teds_node *node, teds_stream *stream, uint64_t tick)
+static void sample_instant(teds_node *node, teds_stream *stream, uint64_t tick)
 {
     uint64_t index = (uint64_t)stream->counter * stream->n + stream->held;
     if (stream->held == 0 && stream->kind == FREE) {
@@ -358,15 +363,15 @@ static void instant(teds_node *node, teds_stream *stream, uint64_t tick)
         const teds_channel *own = &node->port->channels[stream->channels[i]];
         uint8_t *at = stream->filling + stream->fill;
         if (stream->pattern != 0) {
-            pattern(own->number, own->octets, index, at);
-        } else if (!teds_value(node, stream->channels[i], tick, at)) {
+            put_pattern(own->number, own->octets, index, at);
+        } else if (!teds_read_channel(node, stream->channels[i], tick, at)) {
             stream->flags |= 1;
         }
         stream->fill = (uint16_t)(stream->fill + own->octets);
     }
     stream->held++;
     if (stream->held == stream->n) {
-        full(stream);
+        close_message(stream);
     }
 }
 
@@ -378,8 +383,8 @@ static uint64_t next_instant(const teds_stream *stream)
     return stream->start + ((uint64_t)stream->counter * stream->n + stream->held) * stream->period;
 }
 
-/* Whether the next data message of a bus may begin. */
-static bool is_free(const teds_node *node, bool ble, uint64_t now)
+/* True if the next data message of a bus may begin. */
+static bool is_bus_free(const teds_node *node, bool ble, uint64_t now)
 {
 #if TEDS_BLE
     if (ble) {
@@ -394,38 +399,38 @@ static bool is_free(const teds_node *node, bool ble, uint64_t now)
 static void sample_stream(teds_node *node, teds_stream *stream, uint64_t now)
 {
     uint64_t due = next_instant(stream);
-    stream->late = stream->late || (due <= now && now - due >= span(stream)); /* two may be full at once */
+    stream->late = stream->late || (due <= now && now - due >= message_span(stream)); /* two may be full at once */
     while ((due = next_instant(stream)) <= now) {
         if (stream->kind == EVENT) {
             teds_put64(stream->filling, due);
-            pattern(node->port->channels[stream->channels[0]].number, stream->octets, stream->counter,
-                    stream->filling + 8);
+            put_pattern(node->port->channels[stream->channels[0]].number, stream->octets, stream->counter,
+                        stream->filling + 8);
             stream->fill = (uint16_t)(8 + stream->octets);
-            full(stream);
+            close_message(stream);
             continue;
         }
         if (stream->full && stream->ready && stream->held + 1u == stream->n &&
-            (is_free(node, stream->ble, now) || stream->late)) {
+            (is_bus_free(node, stream->ble, now) || stream->late)) {
             return; /* a late loop, not a slow bus: what waits or is half sent leaves first; the loop comes back at once */
         }
-        if (stream->held == 0 && now - due >= 2 * span(stream) + ASLEEP_NS && stream->counter < UINT32_MAX) {
+        if (stream->held == 0 && now - due >= 2 * message_span(stream) + ASLEEP_NS && stream->counter < UINT32_MAX) {
             /* the board slept for longer than a station waits: those messages are lost, and shown as lost */
-            uint64_t lost = (now - due) / span(stream) - 1;
+            uint64_t lost = (now - due) / message_span(stream) - 1;
             lost = lost < UINT32_MAX - stream->counter ? lost : UINT32_MAX - stream->counter;
             stream->counter += (uint32_t)lost;
             stream->missed += lost;
             continue;
         }
-        instant(node, stream, due);
+        sample_instant(node, stream, due);
     }
     stream->late = false; /* it has caught up */
 }
 
 /* What comes sooner than the period after the last that was sent is dropped, its counter too. */
-static void event(teds_stream *stream, uint64_t tick, const uint8_t *octets, bool valid)
+static void add_event(teds_stream *stream, uint64_t tick, const uint8_t *octets, bool valid)
 {
     if (stream->had_event && tick - stream->last_event < stream->period) {
-        count(stream);
+        advance_counter(stream);
         return;
     }
     stream->had_event = true;
@@ -434,10 +439,10 @@ static void event(teds_stream *stream, uint64_t tick, const uint8_t *octets, boo
     teds_put64(stream->filling, tick);
     memcpy(stream->filling + 8, octets, stream->octets);
     stream->fill = (uint16_t)(8 + stream->octets);
-    full(stream);
+    close_message(stream);
 }
 
-static uint8_t next_of(uint8_t place)
+static uint8_t next_in_ring(uint8_t place)
 {
     return (uint8_t)((place + 1) % (TEDS_EVENTS + 1));
 }
@@ -455,7 +460,7 @@ void teds_sensor_event(teds_node *node, uint8_t channel, uint64_t tick, const ui
         return;
     }
     at = events->in;
-    if (next_of(at) == events->out) {
+    if (next_in_ring(at) == events->out) {
         events->lost++;
         return;
     }
@@ -464,23 +469,23 @@ void teds_sensor_event(teds_node *node, uint8_t channel, uint64_t tick, const ui
     for (size_t i = 0; i < own->octets; i++) {
         events->ring[at].octets[i] = octets[i];
     }
-    events->in = next_of(at);
+    events->in = next_in_ring(at);
 }
 
 /* What the interrupts of one event sensor have left, for one of its streams. */
 static void take_events(const teds_events *events, teds_stream *stream, uint8_t in, uint16_t lost, uint64_t now)
 {
     uint8_t octets[TEDS_EVENT_OCTETS];
-    for (uint8_t at = events->out; at != in && !stream->ended; at = next_of(at)) {
+    for (uint8_t at = events->out; at != in && !stream->ended; at = next_in_ring(at)) {
         for (size_t i = 0; i < stream->octets; i++) {
             octets[i] = events->ring[at].octets[i];
         }
         if (events->ring[at].tick >= stream->start) {
-            event(stream, events->ring[at].tick, octets, events->ring[at].valid);
+            add_event(stream, events->ring[at].tick, octets, events->ring[at].valid);
         }
     }
     for (; lost > 0 && now >= stream->start && !stream->ended; lost--) {
-        count(stream);
+        advance_counter(stream);
     }
 }
 
@@ -513,7 +518,7 @@ void teds_streams_sample(teds_node *node, uint64_t now)
         if (each->used) {
             sample_stream(node, each, now);
             if (each->ended && !each->full && node->can.data_stream != each) {
-                end(node, each); /* the last counter was sent */
+                end_stream(node, each); /* the last counter was sent */
             }
         }
     }
@@ -531,14 +536,14 @@ uint64_t teds_streams_due(teds_node *node)
     return due;
 }
 
-/* -- data messages ------------------------------------------------------------------------------------------------------------ */
+/* -- data messages ------------------------------------------------------------------------------------------------- */
 
 /* Of messages that wait, the one of the smaller n * period goes next; NULL: none. */
-static teds_stream *choice(teds_node *node, bool ble)
+static teds_stream *choose_stream(teds_node *node, bool ble)
 {
     teds_stream *chosen = NULL;
     for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
-        if (on_bus(each, ble) && each->ready && each->full && (chosen == NULL || span(each) < span(chosen))) {
+        if (is_on_bus(each, ble) && each->ready && each->full && (chosen == NULL || message_span(each) < message_span(chosen))) {
             chosen = each;
         }
     }
@@ -547,9 +552,9 @@ static teds_stream *choice(teds_node *node, bool ble)
 
 uint64_t teds_data_due(teds_node *node)
 {
-    uint64_t due = node->can.data_stream != NULL || choice(node, false) != NULL ? node->can.data_free_at : TEDS_NEVER;
+    uint64_t due = node->can.data_stream != NULL || choose_stream(node, false) != NULL ? node->can.data_free_at : TEDS_NEVER;
 #if TEDS_BLE
-    if (choice(node, true) != NULL && node->ble.data_free_at < due) {
+    if (choose_stream(node, true) != NULL && node->ble.data_free_at < due) {
         due = node->ble.data_free_at;
     }
 #endif
@@ -557,7 +562,7 @@ uint64_t teds_data_due(teds_node *node)
 }
 
 /* Take the message that waits, sealed. */
-static bool seal(const teds_node *node, teds_stream *stream, uint8_t *out)
+static bool seal_message(const teds_node *node, teds_stream *stream, uint8_t *out)
 {
     uint8_t nonce[13] = {0};
     stream->full = false;
@@ -572,11 +577,11 @@ static bool seal(const teds_node *node, teds_stream *stream, uint8_t *out)
     return true;
 }
 
-static bool begin(teds_node *node)
+static bool begin_message(teds_node *node)
 {
     teds_can *can = &node->can;
-    teds_stream *chosen = choice(node, false);
-    if (chosen == NULL || !seal(node, chosen, can->data)) {
+    teds_stream *chosen = choose_stream(node, false);
+    if (chosen == NULL || !seal_message(node, chosen, can->data)) {
         return false;
     }
     can->data_stream = chosen;
@@ -590,7 +595,7 @@ static uint64_t gap_of_bus(const teds_node *node, bool ble)
 {
     uint64_t gap = 1;
     for (const teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
-        gap = on_bus(each, ble) && each->gap > gap ? each->gap : gap;
+        gap = is_on_bus(each, ble) && each->gap > gap ? each->gap : gap;
     }
     return gap * MICRO;
 }
@@ -598,11 +603,11 @@ static uint64_t gap_of_bus(const teds_node *node, bool ble)
 #if TEDS_BLE
 size_t teds_data_notify(teds_node *node, teds_link *link, uint8_t *out, uint64_t now)
 {
-    teds_stream *stream = choice(node, true);
-    if (stream == NULL || !is_free(node, true, now)) {
+    teds_stream *stream = choose_stream(node, true);
+    if (stream == NULL || !is_bus_free(node, true, now)) {
         return 0;
     }
-    if (!seal(node, stream, out + 1)) {
+    if (!seal_message(node, stream, out + 1)) {
         return 0;
     }
     out[0] = stream->number;
@@ -618,7 +623,7 @@ bool teds_data_next(teds_node *node, teds_can_frame *frame, uint64_t now)
     const teds_stream *stream;
     size_t octets, room;
     uint32_t s;
-    if (now < can->data_free_at || (can->data_stream == NULL && !begin(node))) {
+    if (now < can->data_free_at || (can->data_stream == NULL && !begin_message(node))) {
         return false;
     }
     stream = can->data_stream;
@@ -639,66 +644,6 @@ bool teds_data_next(teds_node *node, teds_can_frame *frame, uint64_t now)
         can->data_stream = NULL;
     }
     return true;
-}
-
-/* -- trigger ------------------------------------------------------------------------------------------------------------------- */
-
-int teds_arm(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
-{
-    const uint8_t *payload = command->payload;
-    teds_session *session = origin->session;
-    (void)out;
-    if (payload[16] > 60 || payload[17] > 2) {
-        return -TEDS_OUT_OF_RANGE;
-    }
-    if (origin->arrival->kind != TEDS_CAN) {
-        return -TEDS_DOES_NOT_FIT;
-    }
-    session->arms[payload[17]].armed = payload[16] != 0;
-    session->arms[payload[17]].until = teds_now(node) + payload[16] * TEDS_SECOND;
-    memcpy(session->arms[payload[17]].commitment, payload, 16);
-    return 0;
-}
-
-static void act(teds_node *node, teds_session *session, size_t action, uint64_t tick)
-{
-    uint32_t acting = 0;
-    session->mark = tick;
-    if (action == 1) {
-        for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
-            if (each->used && each->session == session && each->waits) {
-                each->waits = false;
-                each->start = tick + AFTER_MARK_NS;
-            }
-        }
-    } else if (action == 2) {
-        for (size_t i = 0; i < node->port->channel_count; i++) {
-            acting |= node->port->channels[i].kind == TEDS_ACTUATOR ? UINT32_C(1) << i : 0;
-        }
-        teds_claims_end(node, session, acting, true);
-    }
-}
-
-void teds_trigger(teds_node *node, teds_link link, const uint8_t *token, uint64_t tick)
-{
-    const teds_part parts[] = {{(const uint8_t *)"TEDS1 trigger", 14}, {token, 8}};
-    teds_session *session = teds_session_on(node, link);
-    uint64_t now = teds_now(node);
-    uint8_t seen[32];
-    if (session == NULL) {
-        return;
-    }
-    teds_sha256_parts(node, parts, 2, seen);
-    for (size_t i = 0; i < 3; i++) {
-        if (session->arms[i].armed && now >= session->arms[i].until) {
-            session->arms[i].armed = false;
-        }
-        if (session->arms[i].armed &&
-            teds_equal(seen, session->arms[i].commitment, 16)) {
-            session->arms[i].armed = false;
-            act(node, session, i, tick);
-        }
-    }
 }
 
 #else

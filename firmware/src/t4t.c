@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* A Type 4 tag (NFC Forum T4T 2.0): one NDEF file that anybody reads and writes, its APDUs, and ISO-DEP below them
+/* A Type 4 tag (NFC Forum T4T 2.0): one NDEF file that any reader reads and writes, its APDUs, and ISO-DEP below them
  * (ISO/IEC 14443-4, 7). For chips whose hardware or library does neither. */
 #include "tnep.h"
 #include "inside.h"
@@ -21,7 +21,7 @@ static size_t file_octets(const teds_node *node)
     return 2u + (told != 0 && told < TEDS_MAX_NDEF ? told : TEDS_MAX_NDEF);
 }
 
-static size_t say(uint8_t *out, size_t at, const uint8_t status[2])
+static size_t put_status_word(uint8_t *out, size_t at, const uint8_t status[2])
 {
     memcpy(out + at, status, 2);
     return at + 2;
@@ -31,11 +31,11 @@ static size_t select_application(teds_node *node, const uint8_t *name, size_t le
 {
     static const uint8_t application[7] = {0xD2, 0x76, 0x00, 0x00, 0x85, 0x01, 0x01};
     if (length != sizeof application || memcmp(name, application, sizeof application) != 0) {
-        return say(out, 0, NO_FILE);
+        return put_status_word(out, 0, NO_FILE);
     }
     node->nfc.opened = 1;
     node->nfc.file_open = 0;
-    return say(out, 0, OK);
+    return put_status_word(out, 0, OK);
 }
 
 static size_t select_file(teds_node *node, const uint8_t *name, size_t length, uint8_t *out)
@@ -44,7 +44,7 @@ static size_t select_file(teds_node *node, const uint8_t *name, size_t length, u
     if (length == 2 && name[0] == 0xE1) {
         node->nfc.file_open = name[1] == 3 ? CAPABILITY : name[1] == 4 ? NDEF : 0;
     }
-    return say(out, 0, node->nfc.file_open != 0 ? OK : NO_FILE);
+    return put_status_word(out, 0, node->nfc.file_open != 0 ? OK : NO_FILE);
 }
 
 static size_t read_binary(const teds_node *node, const uint8_t *apdu, size_t length, uint8_t *out)
@@ -55,11 +55,11 @@ static size_t read_binary(const teds_node *node, const uint8_t *apdu, size_t len
     size_t offset = teds_get16(apdu + 2), octets = length == 5 && apdu[4] != 0 ? apdu[4] : 256;
     teds_put16(capability + 11, (uint16_t)file_octets(node));
     if (offset > whole) {
-        return say(out, 0, WRONG_OFFSET);
+        return put_status_word(out, 0, WRONG_OFFSET);
     }
     octets = octets < whole - offset ? octets : whole - offset;
     memcpy(out, file + offset, octets);
-    return say(out, octets, OK);
+    return put_status_word(out, octets, OK);
 }
 
 /* A length other than 0 at the begin of the file completes a message. */
@@ -67,7 +67,7 @@ static size_t update_binary(teds_node *node, size_t offset, const uint8_t *data,
 {
     size_t size;
     if (offset + length > file_octets(node)) {
-        return say(out, 0, NO_SPACE);
+        return put_status_word(out, 0, NO_SPACE);
     }
     node->nfc.stage = TEDS_NFC_QUIET; /* a reader that writes has not waited for an answer */
     node->nfc.shows_initial = false;
@@ -77,7 +77,7 @@ static size_t update_binary(teds_node *node, size_t offset, const uint8_t *data,
     if (offset == 0 && length > 1 && node->nfc.length > 0) {
         teds_nfc_came(node, node->nfc.length);
     }
-    return say(out, 0, OK);
+    return put_status_word(out, 0, OK);
 }
 
 size_t teds_t4t_apdu(teds_node *node, const uint8_t *apdu, size_t length, uint8_t out[TEDS_T4T_OCTETS])
@@ -85,7 +85,7 @@ size_t teds_t4t_apdu(teds_node *node, const uint8_t *apdu, size_t length, uint8_
     const uint8_t *data = apdu + 5;
     size_t octets = 0;
     if (length < 4) {
-        return say(out, 0, WRONG_LENGTH);
+        return put_status_word(out, 0, WRONG_LENGTH);
     }
     if (length > 5) {
         octets = apdu[4] < length - 5 ? apdu[4] : length - 5;
@@ -94,7 +94,7 @@ size_t teds_t4t_apdu(teds_node *node, const uint8_t *apdu, size_t length, uint8_
         return select_application(node, data, octets, out);
     }
     if (node->nfc.opened == 0) {
-        return say(out, 0, NOT_ALLOWED);
+        return put_status_word(out, 0, NOT_ALLOWED);
     }
     if (apdu[1] == 0xA4) {
         return select_file(node, data, octets, out);
@@ -105,10 +105,10 @@ size_t teds_t4t_apdu(teds_node *node, const uint8_t *apdu, size_t length, uint8_
     if (apdu[1] == 0xD6 && node->nfc.file_open == NDEF) {
         return update_binary(node, teds_get16(apdu + 2), data, octets, out);
     }
-    return say(out, 0, NO_COMMAND);
+    return put_status_word(out, 0, NO_COMMAND);
 }
 
-/* -- ISO-DEP --------------------------------------------------------------------------------------------------------------- */
+/* -- ISO-DEP ------------------------------------------------------------------------------------------------------- */
 
 size_t teds_isodep_start(teds_node *node, teds_isodep *card, const uint8_t *rats, size_t length, uint8_t out[5])
 {
@@ -124,30 +124,30 @@ size_t teds_isodep_start(teds_node *node, teds_isodep *card, const uint8_t *rats
 }
 
 /* The block that was kept: its PCB, then `last_length` octets of the APDU from `last_at` on. */
-static size_t kept(const teds_isodep *card, uint8_t *out)
+static size_t put_kept_block(const teds_isodep *card, uint8_t *out)
 {
     out[0] = card->last;
     memcpy(out + 1, card->apdu + card->last_at, card->last_length);
     return 1u + card->last_length;
 }
 
-static size_t keep(teds_isodep *card, uint8_t pcb, size_t at, size_t length, uint8_t *out)
+static size_t keep_block(teds_isodep *card, uint8_t pcb, size_t at, size_t length, uint8_t *out)
 {
     card->last = pcb;
     card->last_at = (uint16_t)at;
     card->last_length = (uint16_t)length;
-    return kept(card, out);
+    return put_kept_block(card, out);
 }
 
-static size_t next_part(teds_isodep *card, uint8_t *out)
+static size_t put_next_part(teds_isodep *card, uint8_t *out)
 {
     size_t at = card->at, left = (size_t)(card->length - card->at);
     size_t length = left < card->information ? left : card->information;
     card->at = (uint16_t)(at + length);
-    return keep(card, (uint8_t)(0x02u | (card->at < card->length ? 0x10u : 0) | card->number), at, length, out);
+    return keep_block(card, (uint8_t)(0x02u | (card->at < card->length ? 0x10u : 0) | card->number), at, length, out);
 }
 
-static size_t information(teds_node *node, teds_isodep *card, const uint8_t *block, size_t length, uint8_t *out)
+static size_t take_information(teds_node *node, teds_isodep *card, const uint8_t *block, size_t length, uint8_t *out)
 {
     uint8_t answer[TEDS_T4T_OCTETS];
     size_t octets = length - 1;
@@ -161,13 +161,13 @@ static size_t information(teds_node *node, teds_isodep *card, const uint8_t *blo
     card->receives = (block[0] & 0x10u) != 0;
     if (card->receives) {
         card->at = card->length;
-        return keep(card, (uint8_t)(0xA2u | card->number), 0, 0, out);
+        return keep_block(card, (uint8_t)(0xA2u | card->number), 0, 0, out);
     }
     octets = teds_t4t_apdu(node, card->apdu, card->length < 261 ? card->length : 261, answer);
     memcpy(card->apdu, answer, octets);
     card->length = (uint16_t)octets;
     card->at = 0;
-    return next_part(card, out);
+    return put_next_part(card, out);
 }
 
 size_t teds_isodep_block(teds_node *node, teds_isodep *card, const uint8_t *block, size_t length, uint8_t out[256])
@@ -178,24 +178,24 @@ size_t teds_isodep_block(teds_node *node, teds_isodep *card, const uint8_t *bloc
     }
     pcb = block[0]; /* our ATS offers neither CID nor NAD: a block with one is for another card (ISO/IEC 14443-4, 7.1) */
     if ((pcb & 0xEEu) == 0x02u) {
-        return information(node, card, block, length, out);
+        return take_information(node, card, block, length, out);
     }
     if ((pcb & 0xFEu) == 0xB2u) { /* R(NAK): our last block again, or "I heard nothing" */
         if ((pcb & 1u) == card->number && card->last != 0) {
-            return kept(card, out);
+            return put_kept_block(card, out);
         }
         out[0] = (uint8_t)(0xA2u | card->number);
         return 1;
     }
     if ((pcb & 0xFEu) == 0xA2u) { /* R(ACK): the next part of a chain */
         if ((pcb & 1u) == card->number) {
-            return card->last != 0 ? kept(card, out) : 0;
+            return card->last != 0 ? put_kept_block(card, out) : 0;
         }
         if (card->receives || card->at >= card->length) {
             return 0;
         }
         card->number ^= 1;
-        return next_part(card, out);
+        return put_next_part(card, out);
     }
     if (pcb == 0xC2u) { /* S(DESELECT) */
         out[0] = pcb;

@@ -4,9 +4,12 @@
  * One buffer is the NDEF file: the reader's message is read from it, the answer is put there. While a command runs it is
  * empty, which says "need more time". */
 #include "tnep.h"
+#include "ble.h"
 #include "clock.h"
+#include "identity.h"
+#include "links.h"
 #include "ndef.h"
-#include "node.h"
+#include "replies.h"
 #include "inside.h"
 
 #if TEDS_NFC
@@ -27,7 +30,7 @@ typedef struct piece {
     size_t length;
 } piece;
 
-static size_t most(const teds_node *node)
+static size_t most_ndef(const teds_node *node)
 {
     const uint16_t told = node->config->nfc.max_ndef;
     return told != 0 && told < TEDS_MAX_NDEF ? told : TEDS_MAX_NDEF;
@@ -39,10 +42,10 @@ static void show_message(teds_node *node, size_t length)
     teds_put16(node->nfc.file, (uint16_t)length);
 }
 
-/* -- the initial message ---------------------------------------------------------------------------------------------- */
+/* -- the initial message ------------------------------------------------------------------------------------------- */
 
 /* WLCCAP and WLCSTAI of a board with a battery (NFC Forum WLC 2.0 as open sources read it); 0 without one. */
-static size_t charge(const teds_node *node, uint8_t *out)
+static size_t put_charge(const teds_node *node, uint8_t *out)
 {
     static const uint8_t waits[4] = {0x09, 0x1E, 0x03, 0x0A};
     teds_power power = {0, 0xFF, 0, 0, 0};
@@ -66,7 +69,7 @@ static size_t charge(const teds_node *node, uint8_t *out)
 }
 
 /* Bluetooth LE out-of-band record (Core Specification Supplement, MIME type of Bluetooth SIG): which node to look for. */
-static size_t out_of_band(const teds_node *node, uint8_t *out)
+static size_t put_out_of_band(const teds_node *node, uint8_t *out)
 {
     static const char type[] = "application/vnd.bluetooth.le.oob";
     const uint8_t *address = node->config->ble_address;
@@ -84,7 +87,7 @@ static size_t out_of_band(const teds_node *node, uint8_t *out)
 }
 
 /* Service parameters: a Tp record of TNEP 1.0. All services of the tag wait alike. */
-static size_t offer(const teds_node *node, uint8_t *out, uint8_t marks, const char *name)
+static size_t put_service(const teds_node *node, uint8_t *out, uint8_t marks, const char *name)
 {
     const size_t uri = strlen(name);
     size_t at = teds_ndef_head(out, marks, TEDS_NDEF_WELL_KNOWN, "Tp", 2, 7 + uri);
@@ -95,7 +98,7 @@ static size_t offer(const teds_node *node, uint8_t *out, uint8_t marks, const ch
     out[at] = 0; /* single response */
     out[at + 1] = node->config->nfc.wt_int;
     out[at + 2] = node->config->nfc.n_wait;
-    teds_put16(out + at + 3, (uint16_t)most(node));
+    teds_put16(out + at + 3, (uint16_t)most_ndef(node));
     return at + 5;
 }
 
@@ -103,21 +106,21 @@ static void show_initial(teds_node *node)
 {
     const bool airs = TEDS_BLE && node->config->ble_address != NULL;
     uint8_t *out = node->nfc.file + 2;
-    size_t at = charge(node, out);
-    at += offer(node, out + at, at == 0 ? TEDS_NDEF_BEGINS : 0, SERVICE);
+    size_t at = put_charge(node, out);
+    at += put_service(node, out + at, at == 0 ? TEDS_NDEF_BEGINS : 0, SERVICE);
     for (size_t i = 0; i < node->config->nfc.service_count; i++) {
-        at += offer(node, out + at, 0, node->config->nfc.services[i].name);
+        at += put_service(node, out + at, 0, node->config->nfc.services[i].name);
     }
     at += teds_ndef_head(out + at, airs ? 0 : TEDS_NDEF_ENDS, TEDS_NDEF_EXTERNAL, ID_TYPE, sizeof ID_TYPE - 1, 23);
     teds_node_identify(node, out + at);
     memcpy(node->nfc.shown, out + at, 23);
     node->nfc.shows_initial = true;
     at += 23;
-    at += airs ? out_of_band(node, out + at) : 0;
+    at += airs ? put_out_of_band(node, out + at) : 0;
     show_message(node, at);
 }
 
-/* -- pieces ----------------------------------------------------------------------------------------------------------- */
+/* -- pieces -------------------------------------------------------------------------------------------------------- */
 
 static bool read_piece(const uint8_t *payload, size_t length, piece *out)
 {
@@ -142,13 +145,13 @@ static size_t put_status(uint8_t *out, uint8_t marks, uint8_t status)
     return at + 1;
 }
 
-static void say_status(teds_node *node, uint8_t status)
+static void show_status(teds_node *node, uint8_t status)
 {
     show_message(node, put_status(node->nfc.file + 2, TEDS_NDEF_BEGINS | TEDS_NDEF_ENDS, status));
 }
 
 /* Te 00 and a piece, whose body is copied in. */
-static void say_piece(teds_node *node, const piece *own)
+static void show_piece(teds_node *node, const piece *own)
 {
     uint8_t *out = node->nfc.file + 2, *payload;
     size_t at = put_status(out, TEDS_NDEF_BEGINS, SUCCESS);
@@ -167,37 +170,37 @@ static void say_piece(teds_node *node, const piece *own)
     show_message(node, at + PIECE_HEAD + own->length);
 }
 
-static size_t room(const teds_node *node)
+static size_t piece_room(const teds_node *node)
 {
-    size_t left = most(node) - STATUS_OCTETS - 3 - (sizeof TEDS_TIM_TYPE - 1);
+    size_t left = most_ndef(node) - STATUS_OCTETS - 3 - (sizeof TEDS_TIM_TYPE - 1);
     if (left > 255) {
         left = left - 3 > 255 ? left - 3 : 255; /* a payload length of 4 octets */
     }
     return left - PIECE_HEAD;
 }
 
-static void say_part(teds_node *node, uint16_t offset)
+static void show_part(teds_node *node, uint16_t offset)
 {
     const teds_stored_reply *reply = node->nfc.reply;
     const uint16_t total = (uint16_t)(reply->length - 1);
-    piece own = {ANSWER, node->nfc.answered_transaction, total, offset < total ? offset : total, NULL, room(node)};
+    piece own = {ANSWER, node->nfc.answered_transaction, total, offset < total ? offset : total, NULL, piece_room(node)};
     own.body = reply->octets + 1 + own.offset;
     if (own.length > (size_t)(total - own.offset)) {
         own.length = (size_t)(total - own.offset);
     }
     own.flags |= (uint8_t)(own.offset + own.length < total ? MORE : 0);
-    say_piece(node, &own);
+    show_piece(node, &own);
 }
 
-static void say_held(teds_node *node, const piece *asked)
+static void show_held(teds_node *node, const piece *asked)
 {
     const teds_nfc *nfc = &node->nfc;
     const bool same = nfc->collects && nfc->transaction == asked->transaction && nfc->total == asked->total;
     const piece own = {ANSWER, asked->transaction, asked->total, same ? nfc->held : 0, NULL, 0};
-    say_piece(node, &own);
+    show_piece(node, &own);
 }
 
-static void collect(teds_node *node, const piece *came)
+static void collect_piece(teds_node *node, const piece *came)
 {
     teds_nfc *nfc = &node->nfc;
     const teds_arrival arrival = {TEDS_AT_NFC, true, false, nfc->tick};
@@ -216,7 +219,7 @@ static void collect(teds_node *node, const piece *came)
         nfc->answered = false;
     }
     if (nfc->held < nfc->total) {
-        say_held(node, came);
+        show_held(node, came);
         return;
     }
     if (!nfc->answered) {
@@ -228,10 +231,10 @@ static void collect(teds_node *node, const piece *came)
         nfc->answered_transaction = nfc->transaction;
         teds_node_reply_left(node, TEDS_LINK_NFC);
     }
-    say_part(node, 0);
+    show_part(node, 0);
 }
 
-/* -- services of the application ---------------------------------------------------------------------------------------- */
+/* -- services of the application ----------------------------------------------------------------------------------- */
 
 bool teds_nfc_services_good(const teds_config *config)
 {
@@ -250,7 +253,7 @@ bool teds_nfc_services_good(const teds_config *config)
 }
 
 /* The place of a service of this name, from 1 on; 0: none. */
-static uint8_t other_named(const teds_node *node, const teds_ndef *came)
+static uint8_t find_service(const teds_node *node, const teds_ndef *came)
 {
     for (size_t i = 0; i < node->config->nfc.service_count; i++) {
         const char *name = node->config->nfc.services[i].name;
@@ -261,17 +264,17 @@ static uint8_t other_named(const teds_node *node, const teds_ndef *came)
     return 0;
 }
 
-/* A message of the reader of another service. The answer is made where requests of ours are collected: one reader has one
+/* A message of the reader of another service. The answer is made in the buffer of our own requests: one reader has one
  * service at a time. */
 static void answer_other(teds_node *node, size_t length)
 {
     const teds_nfc_service *service = &node->config->nfc.services[node->nfc.other - 1];
-    const size_t left = most(node) - STATUS_OCTETS;
+    const size_t left = most_ndef(node) - STATUS_OCTETS;
     const size_t space = left < sizeof node->nfc.request ? left : sizeof node->nfc.request;
     const int octets = service->answer(service->user, node->nfc.file + 2, length, node->nfc.request, space);
     uint8_t *out = node->nfc.file + 2;
     if (octets < 0 || (size_t)octets > space) {
-        say_status(node, GARBLED);
+        show_status(node, GARBLED);
     } else {
         const size_t at = put_status(out, octets == 0 ? TEDS_NDEF_BEGINS | TEDS_NDEF_ENDS : TEDS_NDEF_BEGINS, SUCCESS);
         memcpy(out + at, node->nfc.request, (size_t)octets);
@@ -280,7 +283,7 @@ static void answer_other(teds_node *node, size_t length)
     teds_wipe(node->nfc.request, sizeof node->nfc.request);
 }
 
-/* -- the conversation --------------------------------------------------------------------------------------------------- */
+/* -- the conversation ---------------------------------------------------------------------------------------------- */
 
 static void answer_message(teds_node *node, size_t length)
 {
@@ -288,15 +291,15 @@ static void answer_message(teds_node *node, size_t length)
     teds_ndef came;
     piece own;
     if (!teds_ndef_read(nfc->file + 2, length, &came)) {
-        say_status(node, GARBLED);
+        show_status(node, GARBLED);
         return;
     }
     if (came.selection != NULL) {
         nfc->selected =
             came.selection_length == sizeof SERVICE - 1 && memcmp(came.selection, SERVICE, sizeof SERVICE - 1) == 0;
-        nfc->other = other_named(node, &came);
+        nfc->other = find_service(node, &came);
         if (nfc->selected) {
-            say_status(node, SUCCESS);
+            show_status(node, SUCCESS);
             return;
         }
         nfc->collects = nfc->collects && nfc->other == 0;
@@ -307,7 +310,7 @@ static void answer_message(teds_node *node, size_t length)
     }
     if (nfc->other != 0) {
         if (came.chunked) {
-            say_status(node, GARBLED);
+            show_status(node, GARBLED);
         } else {
             answer_other(node, length);
         }
@@ -318,21 +321,21 @@ static void answer_message(teds_node *node, size_t length)
         return;
     }
     if (came.payload == NULL || !nfc->selected) {
-        say_status(node, PROTOCOL_ERROR);
+        show_status(node, PROTOCOL_ERROR);
         return;
     }
     if (!read_piece(came.payload, came.payload_length, &own) || (own.flags & ANSWER) != 0) {
-        say_status(node, GARBLED);
+        show_status(node, GARBLED);
     } else if (own.length > 0) {
-        collect(node, &own);
+        collect_piece(node, &own);
     } else if (nfc->answered && nfc->answered_transaction == own.transaction) {
-        say_part(node, own.offset);
+        show_part(node, own.offset);
     } else {
-        say_held(node, &own);
+        show_held(node, &own);
     }
 }
 
-static void forget(teds_node *node)
+static void forget_conversation(teds_node *node)
 {
     node->nfc.collects = false;
     node->nfc.answered = false;
@@ -355,7 +358,7 @@ void teds_nfc_field(teds_node *node, bool present)
 #endif
         show_initial(node);
     } else {
-        forget(node);
+        forget_conversation(node);
         teds_node_link_lost(node, TEDS_LINK_NFC);
     }
 }
@@ -373,7 +376,7 @@ void teds_nfc_came(teds_node *node, size_t length)
 
 bool teds_nfc_written(teds_node *node, const uint8_t *message, size_t length)
 {
-    if (length == 0 || length > most(node)) {
+    if (length == 0 || length > most_ndef(node)) {
         return false;
     }
     memcpy(node->nfc.file + 2, message, length);

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 OFFERS: Final = frozenset({"nfc", "can", "reset by hand", "power cuts"})
 """What a test may need of a node and this one has. It has no Type 2 tag, no BLE, no slow chip, no trace, no battery, no
 sources but its own, and its channels are not those of its datasheet."""
-_IDENTITY, _SLOT, _HEAD = 256, 16384, 192  # of the host port's flash file and of a slot (teds_store.c)
+_IDENTITY, _SLOT, _HEAD = 256, 16384, 192  # of the host port's flash file and of a slot (slots.c)
 _KEYED, _PROVISIONED = 1, 2
 
 

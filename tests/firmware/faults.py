@@ -61,18 +61,18 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_ABOUT_FORM": Change("about.c", "#define FORM 1u\n", "#define FORM 2u\n"),
     "FAULT_ABOUT_ANY_PAYLOAD": Change("about.c", "if (command->length != 0) {", "if (command->length > 9) {"),
     "FAULT_ABOUT_BY_RADIO": Change(
-        "node.c",
+        "commands.c",
         "return teds_in_factory(node) || origin->arrival->kind == TEDS_CAN ? 0 : -TEDS_NOT_PERMITTED;",
         "return 0;",
     ),
     "FAULT_LOCATE_FOR_ANYONE": Change(
-        "node.c",
+        "commands.c",
         "    case TEDS_RESET:\n    case TEDS_LOCATE: return",
         "    case TEDS_LOCATE: return 0;\n    case TEDS_RESET: return",
     ),
     "FAULT_LOCATE_FOR_LONG": Change("about.c", "#define LONGEST_SECONDS 60u", "#define LONGEST_SECONDS 61u"),
     "FAULT_MANAGE_UNKNOWN": Change(
-        "node.c",
+        "commands.c",
         "    default: return -TEDS_NOT_PERMITTED; /* Close, and what measures */",
         "    case TEDS_MANAGE: return -TEDS_UNKNOWN_COMMAND;\n    default: return -TEDS_NOT_PERMITTED; /* Close, and what measures */",
     ),
@@ -121,7 +121,9 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_CONFIRM_LABEL_WITH_00": Change(
         "agree.c", '{MAC_LABEL("station"), {script, 32}}', '{LABEL("station"), {script, 32}}'
     ),
-    "FAULT_STATION_LABEL_WITHOUT_00": Change("agree.c", 'LABEL("TEDS1 station key")', 'MAC_LABEL("TEDS1 station key")'),
+    "FAULT_STATION_LABEL_WITHOUT_00": Change(
+        "crypto.c", 'LABEL("TEDS1 station key")', 'MAC_LABEL("TEDS1 station key")'
+    ),
     "FAULT_SAME_NONCE": Change(
         "agree.c", "int failed = port->random(port->user, out, 16) != 0 ||", "memset(out, 7, 16);\n    int failed ="
     ),
@@ -131,21 +133,21 @@ CHANGES: Final[dict[str, Change]] = {
         "agree.c", "pending->link != origin->link ||\n        pending->session != origin->session", "false"
     ),
     "FAULT_CONFIRM_FROM_ANY_SESSION": Change(
-        "session.c", "node->pending.used && node->pending.session == session", "false"
+        "session_life.c", "node->pending.used && node->pending.session == session", "false"
     ),
     "FAULT_WRONG_TAG_LEAVES_REQUEST": Change(
         "agree.c", "        teds_pending_forget(node);\n        return -TEDS_BAD_TAG;", "        return -TEDS_BAD_TAG;"
     ),
     "FAULT_SESSIONS_SURVIVE_CONFIRM": Change("agree.c", "    origin->after = TEDS_AFTER_END_ALL;\n", ""),
-    "FAULT_REQUEST_HIGH_S": Change("agree.c", "memcmp(signature + 32, HALF_ORDER, 32) > 0", "false"),
-    "FAULT_PROVE_LABEL_WITHOUT_00": Change("node.c", '"TEDS1 prove", 12', '"TEDS1 prove", 11'),
+    "FAULT_REQUEST_HIGH_S": Change("crypto.c", "memcmp(signature + 32, HALF_ORDER, 32) > 0", "false"),
+    "FAULT_PROVE_LABEL_WITHOUT_00": Change("commands.c", '"TEDS1 prove", 12', '"TEDS1 prove", 11'),
     "FAULT_PROVE_ANY_CHALLENGE": Change(
-        "node.c",
-        "TEDS_PROVE, 32, prove}",
-        "TEDS_PROVE, ANY, prove}",
+        "commands.c",
+        "TEDS_PROVE, 32, run_prove}",
+        "TEDS_PROVE, ANY, run_prove}",
     ),
     "FAULT_RESET_WITHOUT_EPOCH": Change(
-        "node.c", "{epoch, 4}, {command->payload, 32}};", "{epoch, 0}, {command->payload, 32}};"
+        "commands.c", "{epoch, 4}, {command->payload, 32}};", "{epoch, 0}, {command->payload, 32}};"
     ),
     # -- sessions
     "FAULT_OPEN_INFO_LABEL_WITHOUT_00": Change("session.c", 'LABEL("TEDS1 session")', 'MAC_LABEL("TEDS1 session")'),
@@ -181,29 +183,31 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_FIRST_COUNTER_0": Change(
         "session.c", "if (taken->counter <= last) {", "if (half == NULL && taken->counter <= last) {"
     ),
-    "FAULT_LAST_COUNTER": Change("node.c", "if (taken.counter == UINT32_MAX && ", "if (false && "),
+    "FAULT_LAST_COUNTER": Change("commands.c", "if (taken.counter == UINT32_MAX && ", "if (false && "),
     "FAULT_CLOSE_IGNORED": Change(
-        "node.c", "    origin->after = TEDS_AFTER_END_SESSION;\n    return 0;", "    (void)origin;\n    return 0;"
+        "commands.c", "    origin->after = TEDS_AFTER_END_SESSION;\n    return 0;", "    (void)origin;\n    return 0;"
     ),
     # -- frames and states
-    "FAULT_HEADER_LENGTH_IGNORED": Change("node.c", "if (teds_get16(frame + 4) != command->length) {", "if (false) {"),
-    "FAULT_IDENTIFY_ANY_PAYLOAD": Change(
-        "node.c",
-        "TEDS_IDENTIFY, 0, identify}",
-        "TEDS_IDENTIFY, ANY, identify}",
+    "FAULT_HEADER_LENGTH_IGNORED": Change(
+        "commands.c", "if (teds_get16(frame + 4) != command->length) {", "if (false) {"
     ),
-    "FAULT_ADDRESS_240": Change("node.c", "command->payload[0] > TEDS_LAST_ADDRESS", "command->payload[0] > 240"),
-    "FAULT_ADDRESS_AGAIN": Change("node.c", "if (now < node->address_again) {", "if (false) {"),
+    "FAULT_IDENTIFY_ANY_PAYLOAD": Change(
+        "commands.c",
+        "TEDS_IDENTIFY, 0, run_identify}",
+        "TEDS_IDENTIFY, ANY, run_identify}",
+    ),
+    "FAULT_ADDRESS_240": Change("commands.c", "command->payload[0] > TEDS_LAST_ADDRESS", "command->payload[0] > 240"),
+    "FAULT_ADDRESS_AGAIN": Change("commands.c", "if (now < node->address_again) {", "if (false) {"),
     # -- writing
     "FAULT_WRITE_KEEPS_REST": Change(
-        "teds_store.c",
+        "staging.c",
         "    size_t before = 0;\n",
         "    size_t before = 0;\n    if (teds_staged(node, id, &before) != NULL && offset + length < before) {\n"
         "        memcpy((uint8_t *)(uintptr_t)teds_staged(node, id, &before) + offset, octets, length);\n        return 0;\n    }\n"
         "    before = 0;\n",
     ),
     "FAULT_STAGING_FOR_EVER": Change(
-        "session.c", "    if (node->staging_of == session) {\n        teds_staging_drop(node);\n    }\n", ""
+        "session_life.c", "    if (node->staging_of == session) {\n        teds_staging_drop(node);\n    }\n", ""
     ),
     "FAULT_OWN_CHECK": Change("commit.c", "if (!teds_own_check((uint8_t)id, image, length)) {", "if (false) {"),
     "FAULT_DIGEST_NOT_LOOKED_AT": Change("commit.c", "|| memcmp(hash, block + 3, 32) != 0) {", ") {"),
@@ -219,12 +223,12 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_REFUSES_111": Change("security_teds.c", "} else if (type <= 110) { /*", "} else { /*"),
     "FAULT_RESET_FORGETS_EPOCH": Change("commit.c", "    state.epoch = node->state.epoch;\n", ""),
     "FAULT_RESET_TAKES_TEDS": Change(
-        "teds_store.c",
+        "slots.c",
         ": id == (int32_t)TEDS_SECURITY_ID && (state->flags & TEDS_PROVISIONED) == 0) {",
         ": (state->flags & TEDS_KEYED) == 0) {",
     ),
     "FAULT_NODE_KEY_WITHOUT_UUID": Change(
-        "teds_store.c", '"TEDS1 node key", 15}, {own->uuid, 10}', '"TEDS1 node key", 15}, {own->uuid, 0}'
+        "identity.c", '"TEDS1 node key", 15}, {own->uuid, 10}', '"TEDS1 node key", 15}, {own->uuid, 0}'
     ),
     "FAULT_STALE_INITIAL": Change(
         "security_teds.c", "teds_put32(at + 11, node->state.epoch);", "teds_put32(at + 11, 0);"
@@ -260,11 +264,13 @@ CHANGES: Final[dict[str, Change]] = {
     ),
     # -- permissions, once more
     "FAULT_REQUEST_UNTAPPED": Change(
-        "node.c",
+        "commands.c",
         "    case TEDS_REQUEST:\n    case TEDS_CONFIRM:\n    case TEDS_SET_CAN_ADDRESS: return",
         "    case TEDS_REQUEST: return 0;\n    case TEDS_CONFIRM:\n    case TEDS_SET_CAN_ADDRESS: return",
     ),
-    "FAULT_RESET_LEAVES_REQUEST": Change("node.c", "    teds_pending_forget(node);\n    return 64;", "    return 64;"),
+    "FAULT_RESET_LEAVES_REQUEST": Change(
+        "commands.c", "    teds_pending_forget(node);\n    return 64;", "    return 64;"
+    ),
     # -- the agreement, once more
     "FAULT_TRANSCRIPT_EPOCH_LITTLE_ENDIAN": Change(
         "agree.c",
@@ -326,13 +332,13 @@ CHANGES: Final[dict[str, Change]] = {
         HIGH,
     ),
     "FAULT_PROVE_HIGH_S": Change(
-        "node.c",
+        "commands.c",
         "    return teds_sign(node, parts, 3, out) == 0 ? 64 : -TEDS_FAILURE;",
         "    teds_sign(node, parts, 3, out);\n    high(out + 32);\n    return 64;",
         HIGH,
     ),
     "FAULT_RESET_HIGH_S": Change(
-        "node.c",
+        "commands.c",
         "    if (teds_sign(node, parts, 4, out) != 0) {\n        return -TEDS_FAILURE;\n    }\n",
         "    teds_sign(node, parts, 4, out);\n    high(out + 32);\n",
         HIGH,
@@ -356,7 +362,7 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_SIGNATURE_BEFORE_POINTS": Change(
         "agree.c",
         "    if (!teds_point_good(node, station) || !teds_point_good(node, ca)",
-        "    if (!teds_certified(node, station, ca, signature)) {\n"
+        "    if (!teds_station_certified(node, station, ca, signature)) {\n"
         "        return -TEDS_BAD_SIGNATURE;\n    }\n    if (!teds_point_good(node, station) || !teds_point_good(node, ca)",
     ),
     "FAULT_CONFIRM_FROM_ANY_LINK": Change(
@@ -366,45 +372,49 @@ CHANGES: Final[dict[str, Change]] = {
         "agree.c", "pending->link != origin->link ||\n        pending->session != origin->session", "false"
     ),
     "FAULT_HALF_OPEN_SURVIVES_CONFIRM": Change(
-        "session.c", "    teds_wipe(node->half_open, sizeof node->half_open);\n    teds_pending", "    teds_pending"
+        "session_life.c",
+        "    teds_wipe(node->half_open, sizeof node->half_open);\n    teds_pending",
+        "    teds_pending",
     ),
     # -- frames and states, once more
     "FAULT_UNKNOWN_IS_SILENT": Change(
-        "node.c",
+        "commands.c",
         "    octets = close_reply(reply, outcome);\n",
         "    octets = outcome == -TEDS_UNKNOWN_COMMAND && frame[3] == 99 ? 0 : close_reply(reply, outcome);\n",
     ),
-    "FAULT_LONG_REFUSAL": Change("node.c", "        outcome = 1;\n", "        reply[4] = 0;\n        outcome = 2;\n"),
+    "FAULT_LONG_REFUSAL": Change(
+        "commands.c", "        outcome = 1;\n", "        reply[4] = 0;\n        outcome = 2;\n"
+    ),
     "FAULT_LENGTH_BEFORE_STATE": Change(
-        "node.c",
-        "    refused = permitted(node, command, origin);\n",
+        "commands.c",
+        "    refused = permit_command(node, command, origin);\n",
         "    if (command->command_class == TEDS_CLASS_COMMON && command->function == TEDS_WRITE && length == 6) {\n"
-        "        return -TEDS_BAD_FORM;\n    }\n    refused = permitted(node, command, origin);\n",
+        "        return -TEDS_BAD_FORM;\n    }\n    refused = permit_command(node, command, origin);\n",
     ),
     "FAULT_LONGER_THAN_MAX_MESSAGE": Change(
-        "node.c", "length > TEDS_MAX_MESSAGE ? -TEDS_TOO_LARGE", "length >= TEDS_MAX_MESSAGE ? -TEDS_TOO_LARGE"
+        "commands.c", "length > TEDS_MAX_MESSAGE ? -TEDS_TOO_LARGE", "length >= TEDS_MAX_MESSAGE ? -TEDS_TOO_LARGE"
     ),
     "FAULT_PROVE_OTHER_KEY": Change(
-        "node.c",
+        "commands.c",
         "    return teds_sign(node, parts, 3, out) == 0 ? 64 : -TEDS_FAILURE;",
         "    teds_node other = *node;\n    other.identity.key.octets[20] ^= 1;\n    return teds_sign(&other, parts, 3, out) == 0 ? 64 : -1;",
     ),
     "FAULT_PROVE_NOT_HASHED": Change(
-        "node.c",
+        "commands.c",
         "    return teds_sign(node, parts, 3, out) == 0 ? 64 : -TEDS_FAILURE;",
         "    (void)parts;\n    node->port->p256_sign(node->port->user, &node->identity.key, command->payload, out);\n"
         "    if (out[32] & 0x80) {\n        high(out + 32);\n    }\n    return 64;",
         HIGH,
     ),
     "FAULT_LIST_TWICE": Change(
-        "node.c",
+        "commands.c",
         "        length += 3;\n",
         "        length += 3;\n        if (length == 3) {\n            memcpy(out + 3, out, 3);\n            length = 6;\n        }\n",
     ),
     "FAULT_ABSENT_AVAILABLE": Change(
-        "teds_store.c", "(source.read_only ? 1u : 0u) | (there ? 0u : 2u)", "(source.read_only ? 1u : 0u)"
+        "teds_commands.c", "(source.read_only ? 1u : 0u) | (there ? 0u : 2u)", "(source.read_only ? 1u : 0u)"
     ),
-    "FAULT_TEXT_ATTRIBUTE": Change("teds_store.c", "code >= 128 ? 0x40 :", "code >= 128 ? 0x50 :"),
+    "FAULT_TEXT_ATTRIBUTE": Change("teds_commands.c", "code >= 128 ? 0x40 :", "code >= 128 ? 0x50 :"),
     "FAULT_TEDS_CHECKSUM": Change(
         "security_teds.c",
         "teds_checksum(out, TEDS_INITIAL_OCTETS - 2));",
@@ -413,7 +423,7 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_NOT_CANONICAL": Change("security_teds.c", "109, 1, 2, 110, 1, 2};", "110, 1, 2, 110, 1, 2};"),
     "FAULT_OTHER_SUITE": Change("security_teds.c", "109, 1, 2, 110, 1, 2};", "109, 1, 1, 110, 1, 2};"),
     "FAULT_READ_END_REFUSED": Change(
-        "teds_store.c",
+        "teds_commands.c",
         "    offset = offset < source.length ? offset : source.length;\n",
         "    if (offset >= source.length) {\n        return -TEDS_NO_SUCH_TEDS;\n    }\n",
     ),
@@ -432,8 +442,8 @@ CHANGES: Final[dict[str, Change]] = {
     ),
     "FAULT_FIRST_OPEN_STAYS": Change(
         "session.c",
-        "    teds_half_open *place = half_open_on(node, link);\n",
-        "    teds_half_open *place = half_open_on(node, link);\n    if (place != NULL) {\n        return;\n    }\n",
+        "    teds_half_open *place = teds_half_open_on(node, link);\n",
+        "    teds_half_open *place = teds_half_open_on(node, link);\n    if (place != NULL) {\n        return;\n    }\n",
     ),
     "FAULT_C_LITTLE_ENDIAN": Change(
         "session.c",
@@ -441,40 +451,40 @@ CHANGES: Final[dict[str, Change]] = {
         "    node->opens = __builtin_bswap64(__builtin_bswap64(node->opens) + 1);\n",
     ),
     "FAULT_ONE_SESSION": Change(
-        "session.c",
+        "session_life.c",
         "each < node->sessions + TEDS_SESSIONS; each++) {\n        if (!each->used) {",
         "each < node->sessions + 1; each++) {\n        if (!each->used) {",
     ),
     "FAULT_STRANGER_ENDS_SESSION": Change(
-        "node.c",
-        ": cut(node, frame, length, &origin, &command);\n    if (",
-        ": cut(node, frame, length, &origin, &command);\n"
+        "commands.c",
+        ": parse_command(node, frame, length, &origin, &command);\n    if (",
+        ": parse_command(node, frame, length, &origin, &command);\n"
         "    for (int8_t i = 0; !outcome && command.function == TEDS_IDENTIFY && i < TEDS_SESSIONS; i++) {\n"
         "        if (command.command_class == TEDS_CLASS_SECURITY && teds_session_on(node, link) == NULL) {\n"
         "            teds_session_end(node, &node->sessions[i]);\n        }\n    }\n    if (",
     ),
     "FAULT_ANY_SIZE": Change(
-        "teds_store.c",
+        "staging.c",
         "    if (end - before + offset + length > TEDS_STAGING) {\n        return -TEDS_TOO_LARGE;\n    }\n",
         "    if (end - before + offset + length > TEDS_STAGING) {\n        return 0;\n    }\n",
     ),
     "FAULT_REFUSED_WRITE_DROPS": Change(
-        "teds_store.c",
+        "teds_commands.c",
         "    if (offset > staged) {\n        return -TEDS_BAD_FORM;",
         "    if (offset > staged) {\n        teds_staging_drop(node);\n        return -TEDS_BAD_FORM;",
     ),
     "FAULT_EMPTY_WRITE": Change(
-        "teds_store.c",
-        "    failed = stage(node, (uint16_t)id, offset, command->payload + 5, octets);\n",
+        "teds_commands.c",
+        "    failed = teds_stage(node, (uint16_t)id, offset, command->payload + 5, octets);\n",
         "    failed = command->length == 5\n"
-        "                 ? 0 : stage(node, (uint16_t)id, offset, command->payload + 5, octets);\n",
+        "                 ? 0 : teds_stage(node, (uint16_t)id, offset, command->payload + 5, octets);\n",
     ),
     "FAULT_REFUSED_COMMIT_COUNTS": Change(
         "commit.c",
-        "    failed = check(node, &teds, image, length);\n    if (failed) {\n",
-        "    failed = check(node, &teds, image, length);\n    if (failed) {\n        node->state.sequence = teds.numbers[0];\n",
+        "    failed = check_datasheet(node, &teds, image, length);\n    if (failed) {\n",
+        "    failed = check_datasheet(node, &teds, image, length);\n    if (failed) {\n        node->state.sequence = teds.numbers[0];\n",
     ),
-    "FAULT_DATASHEET_HIGH_S": Change("agree.c", "memcmp(signature + 32, HALF_ORDER, 32) > 0", "false"),
+    "FAULT_DATASHEET_HIGH_S": Change("crypto.c", "memcmp(signature + 32, HALF_ORDER, 32) > 0", "false"),
     "FAULT_BASE64_NOT_STRICT": Change(
         "security_teds.c", "return out[65] == 0 && (length == 65 || out[64] == 0);", "return true;"
     ),
@@ -502,8 +512,8 @@ CHANGES: Final[dict[str, Change]] = {
     ),
     "FAULT_FIRST_REQUEST_STAYS": Change(
         "agree.c",
-        "    teds_pending_forget(node);\n    length = answer(node, payload, out);\n",
-        "    const teds_pending before = node->pending;\n    length = answer(node, payload, out);\n"
+        "    teds_pending_forget(node);\n    length = answer_request(node, payload, out);\n",
+        "    const teds_pending before = node->pending;\n    length = answer_request(node, payload, out);\n"
         "    if (before.used) {\n        node->pending = before;\n        return length;\n    }\n",
     ),
     "FAULT_RESET_KEEPS_CA": Change(
@@ -519,21 +529,21 @@ CHANGES: Final[dict[str, Change]] = {
         ),
     ),
     "FAULT_RESET_ANY_CHALLENGE": Change(
-        "node.c",
-        "TEDS_PROVE, 32, prove}",
-        "TEDS_PROVE, ANY, prove}",
-        more=(("TEDS_RESET, 32, reset}", "TEDS_RESET, ANY, reset}"),),
+        "commands.c",
+        "TEDS_PROVE, 32, run_prove}",
+        "TEDS_PROVE, ANY, run_prove}",
+        more=(("TEDS_RESET, 32, run_reset}", "TEDS_RESET, ANY, run_reset}"),),
     ),
     # -- frames, sessions and writing, to their end
     "FAULT_LIST_LONG": Change(
-        "node.c",
+        "commands.c",
         "    octets = close_reply(reply, outcome);\n",
         "    if (length == 6 && frame[2] == 128 && frame[3] == TEDS_LIST) {\n"
         "        outcome = 2046;\n        memset(reply + 3, 0, 2046);\n    }\n"
         "    octets = close_reply(reply, outcome);\n",
     ),
     "FAULT_WRITE_ANYWHERE": Change(
-        "node.c",
+        "commands.c",
         "    octets = close_reply(reply, outcome);\n",
         "    if (length >= 6 && frame[2] == 1 && frame[3] == TEDS_WRITE) {\n        outcome = 0;\n    }\n"
         "    octets = close_reply(reply, outcome);\n",
@@ -559,7 +569,7 @@ static bool opened(const uint8_t key[16], const uint8_t nonce[13], const uint8_t
 """,
     ),
     "FAULT_STAGING_PER_SESSION": Change(
-        "teds_store.c",
+        "teds_commands.c",
         "    if (elsewhere && now < node->staged_until) {\n        return -TEDS_BUSY;\n    }\n",
         "",
     ),
@@ -591,8 +601,8 @@ SEEN_BY_A_STATION: Final[dict[str, Change]] = {
     ),
     "FAULT_SESSION_OF_ANY_ADDRESS": Change(
         "session.c",
-        "    return teds_session_on(node, link) != NULL || half_open_on(node, link) != NULL;",
-        "    return teds_session_on(node, link) != NULL || half_open_on(node, link) != NULL || any_session(node) != NULL ||\n"
+        "    return teds_session_on(node, link) != NULL || teds_half_open_on(node, link) != NULL;",
+        "    return teds_session_on(node, link) != NULL || teds_half_open_on(node, link) != NULL || any_session(node) != NULL ||\n"
         "           node->half_open[0].used;",
         "static teds_session *any_session(teds_node *node)\n{\n    for (size_t i = 0; i < TEDS_SESSIONS; i++) {\n"
         "        if (node->sessions[i].used) {\n            return &node->sessions[i];\n        }\n    }\n    return NULL;\n}\n",
@@ -613,18 +623,18 @@ SEEN_BY_A_STATION: Final[dict[str, Change]] = {
         "    if (length < 12 || teds_get32(teds)",
         "    if (code == 5) {\n        return true;\n    }\n    if (length < 12 || teds_get32(teds)",
     ),
-    "FAULT_NEVER_PROVISIONED": Change("node.c", "(node->state.flags & TEDS_PROVISIONED) != 0 ? 2 : 1;", "1;"),
+    "FAULT_NEVER_PROVISIONED": Change("identity.c", "(node->state.flags & TEDS_PROVISIONED) != 0 ? 2 : 1;", "1;"),
     "FAULT_STAGING_SURVIVES_COMMIT": Change(
         "commit.c", "    if (!failed) {\n        teds_staging_drop(node);\n    }\n", ""
     ),
     "FAULT_ROTATION_UNPROVISIONS": Change("agree.c", "state.flags |= TEDS_KEYED;", "state.flags = TEDS_KEYED;"),
     "FAULT_READ_STAGED": Change(
-        "teds_store.c",
+        "teds_commands.c",
         "    if (!teds_find(node, (uint16_t)id, &source)) {\n        return -TEDS_NO_SUCH_TEDS;\n    }\n    offset",
         "    if (!teds_find_new(node, (uint16_t)id, &source)) {\n        return -TEDS_NO_SUCH_TEDS;\n    }\n    offset",
     ),
     "FAULT_UPDATE_STORES": Change(
-        "teds_store.c",
+        "teds_commands.c",
         "        failed = teds_own_check((uint8_t)id, image, octets) ? 0 : -TEDS_BAD_FORM;\n",
         "        failed = teds_own_check((uint8_t)id, image, octets) ? 0 : -TEDS_BAD_FORM;\n"
         "        if (!failed && octets <= sizeof stored) {\n            stored_id = id;\n            stored_octets = octets;\n"
@@ -640,8 +650,8 @@ SEEN_BY_A_STATION: Final[dict[str, Change]] = {
         ),
     ),
     "FAULT_WRITE_READ_ONLY": Change(
-        "teds_store.c",
-        "    if (find_fixed(node, (uint16_t)id, &source)) {\n        return -TEDS_NOT_PERMITTED;\n    }\n    offset",
+        "teds_commands.c",
+        "    if (teds_find_fixed(node, (uint16_t)id, &source)) {\n        return -TEDS_NOT_PERMITTED;\n    }\n    offset",
         "    (void)source;\n    offset",
     ),
     # -- frames of CAN
@@ -671,9 +681,13 @@ SEEN_BY_A_STATION: Final[dict[str, Change]] = {
         more=(("*octets >= (start == 2 ? 8u : 1u)", "*octets >= 1u"),),
     ),
     "FAULT_ANNOUNCE_CRC": Change(
-        "can.c", "teds_put32(frame->data + 2, crc_of(node));", "teds_put32(frame->data + 2, crc_of(node) ^ 1u);"
+        "can.c",
+        "teds_put32(frame->data + 2, teds_uuid_crc(node));",
+        "teds_put32(frame->data + 2, teds_uuid_crc(node) ^ 1u);",
     ),
-    "FAULT_CLAIM_REVERSED": Change("can.c", "if (crc > own || stays(node)) {", "if (crc < own || stays(node)) {"),
+    "FAULT_CLAIM_REVERSED": Change(
+        "can.c", "if (crc > own || keeps_address(node)) {", "if (crc < own || keeps_address(node)) {"
+    ),
     # -- measurement
     "FAULT_LEASE_255": Change("operation.c", "lease > 60 ||", "(lease > 60 && lease != 255) ||"),
     "FAULT_OPERATE_ANY_DIGEST": Change(
@@ -707,18 +721,18 @@ SEEN_BY_A_STATION: Final[dict[str, Change]] = {
         "session->drive.seen && counter <= session->drive.last",
         "session->drive.seen && counter < session->drive.last",
     ),
-    "FAULT_ANY_TOKEN": Change("stream.c", "teds_equal(seen, session->arms[i].commitment, 16)", "seen[0] <= 255"),
+    "FAULT_ANY_TOKEN": Change("trigger.c", "teds_equal(seen, session->arms[i].commitment, 16)", "seen[0] <= 255"),
 }
 """Faults that a station sees only if it looks for them: frame by frame, over all octets, on a board with channels."""
 
 ON_THE_BUS: Final[dict[str, Change]] = {
     "FAULT_REQUEST_RUNS_AGAIN": Change(
-        "node.c", "(frame[3] == TEDS_IDENTIFY ||", "(frame[3] == TEDS_REQUEST || frame[3] == TEDS_IDENTIFY ||"
+        "replies.c", "(frame[3] == TEDS_IDENTIFY ||", "(frame[3] == TEDS_REQUEST || frame[3] == TEDS_IDENTIFY ||"
     ),
     "FAULT_OPEN_RUNS_AGAIN": Change(
-        "node.c", "(frame[3] == TEDS_IDENTIFY ||", "(frame[3] == TEDS_OPEN || frame[3] == TEDS_IDENTIFY ||"
+        "replies.c", "(frame[3] == TEDS_IDENTIFY ||", "(frame[3] == TEDS_OPEN || frame[3] == TEDS_IDENTIFY ||"
     ),
-    "FAULT_RUNS_AGAIN": Change("node.c", "    if (!place->stored || memcmp(digest", "    if (true || memcmp(digest"),
+    "FAULT_RUNS_AGAIN": Change("replies.c", "    if (!place->stored || memcmp(digest", "    if (true || memcmp(digest"),
     "FAULT_EVERYONE_DROPS_REPLY": Change(
         "can.c",
         "    line->asked = false;\n",
@@ -727,14 +741,14 @@ ON_THE_BUS: Final[dict[str, Change]] = {
     ),
     "FAULT_BUSY_SILENT": Change(
         "can.c",
-        "    if (reason != 0) {\n        refuse(line, frame->data[head]",
-        "    if (reason == TEDS_BUSY) {\n        return;\n    }\n    if (reason != 0) {\n        refuse(line, frame->data[head]",
+        "    if (reason != 0) {\n        refuse_request(line, frame->data[head]",
+        "    if (reason == TEDS_BUSY) {\n        return;\n    }\n    if (reason != 0) {\n        refuse_request(line, frame->data[head]",
     ),
     "FAULT_ADDRESS_TOO_SOON": Change(
-        "node.c",
+        "commands.c",
         "    node->can.moves_to = command->payload[0]; /* when the reply has left */\n"
         "    node->can.moves_link = origin->link;\n",
-        "    teds_can_move(node, command->payload[0]);\n",
+        "    teds_address_move(node, command->payload[0]);\n",
     ),
     "FAULT_ADDRESS_STAYS": Change(
         "can.c",

@@ -571,14 +571,14 @@ _IN_ONE_PROCESS = "tests/firmware/test_protocol_suites.py"
 C_PATTERNS = (
     CPattern(
         "a slot is read back before it counts",
-        "teds_store.c",
-        "crc_good(port, into.area, total, &good) == 0 && good;",
-        "crc_good(port, into.area, total, &good) == 0;",
+        "slots.c",
+        "teds_area_crc_good(port, into.area, total, &good) == 0 && good;",
+        "teds_area_crc_good(port, into.area, total, &good) == 0;",
         _IN_ONE_PROCESS,
     ),
     CPattern(
         "an identity is read back before it counts",
-        "teds_store.c",
+        "identity.c",
         "return failed || good ? failed : TEDS_E_FLASH;",
         "return failed;",
         "tests/firmware/test_flash_reads.py",

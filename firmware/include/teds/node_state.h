@@ -245,6 +245,7 @@ struct teds_node {
     uint8_t slot; /* the one that counts */
     uint8_t firmware; /* flags of About, as last read */
     bool free_slot_dirty, old_slot_due;
+    bool identity_changed; /* answers to everyone on CAN that began before hold what Identify said then */
     bool spare_slot_fails; /* it could not be erased when that was last tried: the node answers and writes nothing */
     teds_session *staging_of; /* NULL: nobody's */
     uint16_t staging_end;

@@ -1,12 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 #include "memory.h"
 
-#include "can.h"
+#include "links.h"
 #include "operation.h"
 #include "security_teds.h"
 #include "session.h"
 #include "stream.h"
-#include "teds_store.h"
+#include "slots.h"
 #include "inside.h"
 
 #include <bearssl.h>
@@ -722,7 +722,7 @@ int memory_put(memory_board *board, uint8_t flags, uint8_t address, uint32_t epo
     memcpy(state.agreed.ca, ca, 65);
     memcpy(board->node.staging, teds, length);
     board->node.staging_end = (uint16_t)length;
-    failed = teds_store_write(&board->node, &state, &none);
+    failed = teds_slots_write(&board->node, &state, &none);
     board->node.staging_end = 0;
     return failed ? failed : memory_start(board);
 }
@@ -749,7 +749,7 @@ void memory_lost(memory_board *board, uint8_t link)
 
 void memory_move(memory_board *board, uint8_t address)
 {
-    teds_can_move(&board->node, address);
+    teds_address_move(&board->node, address);
 }
 
 int memory_by_hand(memory_board *board)

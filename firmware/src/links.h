@@ -1,0 +1,21 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+/* Links to stations, of every kind: their ends, and the move to another CAN address. teds_node_reply_left and
+ * teds_node_link_lost of teds/node.h are here. */
+#ifndef TEDS_SRC_LINKS_H
+#define TEDS_SRC_LINKS_H
+
+#include "inside.h"
+
+#define TEDS_FIRST_STATION 0xF1u
+#define TEDS_LAST_STATION 0xF7u
+
+/* Lose a link: session, half-open Open, stored reply, a Request that waits. */
+void teds_link_forget(teds_node *node, teds_link link);
+
+/* Lose every link of the bus, and what its lines were about to send or receive. */
+void teds_can_links_forget(teds_node *node);
+
+/* Take this CAN address now. Every link is a pair of addresses: with a new own one all begin anew. */
+void teds_address_move(teds_node *node, uint8_t address);
+
+#endif
