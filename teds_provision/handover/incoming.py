@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-from teds_provision.errors import LinkError, NoNodeError, NotAuthenticError, PolicyError, TedsProvisionError
+from teds_provision.errors import LinkError, NoNodeError, PolicyError, TedsProvisionError
 from teds_provision.handover import gc_pause
 from teds_provision.handover.deny import deny_all, why_not
 from teds_provision.handover.pending import IMPORTED, BundleNotes, digest_of
@@ -24,7 +24,7 @@ from teds_provision.protocol.handover.envelope import Source
 from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, seal_receipt
 from teds_provision.protocol.handover.revocation import Revocation as Statement
 from teds_provision.protocol.handover.strict_json import time_text
-from teds_provision.protocol.keys import fingerprint, station_key_message, verify
+from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning.agree import require_session
 from teds_provision.provisioning.conversation import Conversation
@@ -443,11 +443,8 @@ def _keep_ca(station: Station, plan: ImportPlan) -> None:
     points = station.policy.station_points()
     for digits, signature in bundle.station_signatures.items():
         point = points.get(digits)
-        if point is None or digits == station.fingerprint:
-            continue
-        if not verify(bundle.ca, station_key_message(point), signature):
-            raise NotAuthenticError(f"The bundle's CA signature over station {digits[:16]} does not verify.")
-        station.identity.keep_certificate(bundle.ca, point, signature)
+        if point is not None and digits != station.fingerprint:
+            station.identity.keep_certificate(bundle.ca, point, signature)  # which verifies it
 
 
 # A node counts as taken over when it opened a session here, under a key that after a move is new.

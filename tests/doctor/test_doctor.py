@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import sqlite3
@@ -361,6 +362,27 @@ def test_a_lost_passphrase_file_is_told_without_asking_for_anything(stationed: S
     (stationed.home / "vault.json").unlink()
     vault = by_name(stationed)["vault"]
     assert (vault.result, "restore" in vault.fix) == ("failed", True)
+
+
+@pytest.mark.parametrize(
+    ("memory", "result"), [(19 * 1024, "ok"), (19 * 1024 - 1, "warning"), ("much", "warning"), (None, "warning")]
+)
+def test_a_passphrase_file_that_costs_a_guesser_little_is_a_warning(
+    stationed: System, memory: object, result: str
+) -> None:
+    path = stationed.home / "vault.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "memory_kib": memory}))
+    (vault,) = (finding for finding in look(stationed, "vault"))
+    assert (vault.result, "19 MiB" in vault.why) == (result, result == "ok")
+
+
+def test_a_passphrase_file_of_another_store_is_a_failure(stationed: System) -> None:
+    path = stationed.home / "vault.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "store": "77" * 16}))
+    vault = by_name(stationed)["vault"]
+    assert (vault.result, vault.why, "restore" in vault.fix) == (
+        "failed", "vault.json belongs to another store.", True,
+    )  # fmt: skip
 
 
 def test_nodes_without_a_backup_are_a_warning(stationed: System) -> None:

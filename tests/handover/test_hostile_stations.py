@@ -13,7 +13,7 @@ from uuid import uuid4
 
 import pytest
 
-from teds_provision.errors import PolicyError, UsageError
+from teds_provision.errors import NotAuthenticError, PolicyError, UsageError
 from teds_provision.files import new_file
 from teds_provision.handover.deny import lift
 from teds_provision.handover.incoming import ImportPlan, ImportResult, import_bundle, plan_import
@@ -57,7 +57,12 @@ def node_of(board: Board, **more: object) -> BundledNode:
 
 
 def forged(
-    sender: Station, receiver: Station, *nodes: BundledNode, mode: Mode = "copy", revoked: tuple[str, ...] = ()
+    sender: Station,
+    receiver: Station,
+    *nodes: BundledNode,
+    mode: Mode = "copy",
+    revoked: tuple[str, ...] = (),
+    signatures: dict[str, bytes] | None = None,
 ) -> bytes:
     """A bundle that a trusted station may make by hand: its own key, and whatever content it likes."""
     now = datetime.now(UTC).replace(microsecond=0)
@@ -72,7 +77,10 @@ def forged(
         mode=mode,
         ca=sender.ca,
         nodes=nodes,
-        station_signatures={receiver.fingerprint: ca.sign(station_key_message(receiver.point))},
+        station_signatures={
+            receiver.fingerprint: ca.sign(station_key_message(receiver.point)),
+            **(signatures or {}),
+        },
         revoked=revoked,
     )
     return seal_bundle(bundle, sender.vault.identity(), [receiver.point])
@@ -154,6 +162,28 @@ def test_a_node_that_comes_back_is_rotated_and_the_plan_says_so(pair: Pair) -> N
     assert pair.north.keys.rotation_due(pair.board.uuid) is not None
     assert session(pair.north, pair.board) == 3
     assert pair.north.keys.rotation_due(pair.board.uuid) is None
+
+
+def test_a_bundle_vouches_for_other_stations_only_with_its_cas_signature(pair: Pair, west: Station) -> None:
+    """Of the stations that it names, those that are trusted here are kept; a bad signature keeps nothing at all."""
+    trust(pair.south, west)
+    ca = pair.north.vault.ca()
+    assert ca is not None
+    good = ca.sign(station_key_message(west.point))
+    unknown = {"77" * 32: good}
+    before = held(pair.south, pair.board)
+    with pytest.raises(NotAuthenticError, match="did not sign"):
+        taken(
+            pair.south,
+            forged(pair.north, pair.south, node_of(pair.board), signatures={west.fingerprint: bytes([1]) * 64}),
+        )
+    assert held(pair.south, pair.board) == before == []
+    assert pair.south.identity.certificate(pair.north.ca, pair.south.point) is None
+    assert pair.south.identity.certificate(pair.north.ca, west.point) is None
+    signatures = {west.fingerprint: good, **unknown}
+    taken(pair.south, forged(pair.north, pair.south, node_of(pair.board), signatures=signatures))
+    assert pair.south.identity.certificate(pair.north.ca, west.point) == good
+    assert len(held(pair.south, pair.board)) == 1
 
 
 # -- M3: what a move gives away, and what its receipt deletes --------------------------------------------------------

@@ -6,7 +6,8 @@ until one fails; that test is then run without the mutant once, so that none die
 no test notices is printed at the end and kept in build/mutants/survivors.txt: it is a missing test, a rule that nothing
 needs, or a change that changes nothing, and only a reader can tell which.
 
-Usage: python -m tests.mutants.run [--count N] [--room ROOM] [--minutes M] [--jobs J] [--seed S] [--patterns]
+Usage: python -m tests.mutants.run [--count N] [--room ROOM] [--only WORDS] [--minutes M] [--jobs J] [--seed S]
+[--patterns]
 Exits 1 where a pattern survived, 2 where one is not found in the code.
 """
 
@@ -185,6 +186,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--room", default="", help="a room or a module: steps, protocol/tim, provisioning/agree.py; firmware"
     )
+    parser.add_argument(
+        "--only", default="", help="a function: every mutant of it, and its patterns; or a part of a pattern's rule"
+    )
     parser.add_argument("--minutes", type=float, default=60)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=int, default=0, help="0: another sample each time, told")
@@ -213,6 +217,10 @@ def main(arguments: list[str]) -> int:
         if chosen.patterns or chosen.room == IN_C
         else drawn(max(0, chosen.count - len(named)), chosen.room, random.Random(seed))
     )
+    if chosen.only:
+        named = [mutant for mutant in named if chosen.only == mutant.function or chosen.only in mutant.rule]
+        every = [] if chosen.patterns else [mutant for module in where for mutant in any_of(module)]
+        others = [mutant for mutant in every if chosen.only in (mutant.function, mutant.function.rpartition(".")[2])]
     sources = {module.name: module.source for module in everywhere}
     sources |= {mutant.path: (ROOT / mutant.path).read_text() for mutant in named if mutant.path not in sources}
     bench = Bench(chosen.jobs, time.monotonic() + 60 * chosen.minutes, sources)

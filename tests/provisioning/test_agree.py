@@ -214,6 +214,20 @@ def test_a_node_that_shows_another_key_after_a_wrong_tag_gets_no_second_request(
     assert (len(requests(link)), held(station, board)) == (1, [])
 
 
+def test_a_node_that_reports_another_epoch_than_it_agreed_on_is_not_agreed_with(station: Station, board: Board) -> None:
+    """A datasheet for the one would never fit the other; the key stays pending, because the node has it."""
+    whitelist(station, board)
+
+    def counts_twice(_count: int, reply: bytes) -> bytes:
+        if board.state.epoch == 1:
+            board.flash.state = board.tim._flash = replace(board.state, epoch=2)
+        return reply
+
+    with pytest.raises(NotAuthenticError, match="offered key epoch 1 but reports 2 in its session"):
+        run(station, board, MemoryLink(board, tamper=counts_twice))
+    assert held(station, board) == [("pending", 1)]
+
+
 @pytest.mark.parametrize(
     ("field", "name"), [(105, "ProfileVersion 2"), (109, "SessionSuite 1"), (110, "KeyAgreement 1")]
 )

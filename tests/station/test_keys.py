@@ -154,3 +154,41 @@ def test_what_was_read_a_moment_ago_is_never_older_than_the_store(station: Stati
             station.nodes.restore(NodeRecord(OTHER))
             assert station.nodes.get(NODE) == NodeRecord(NODE, name="d"), "but for one's own changes"
         assert station.nodes.get(NODE) == NodeRecord(NODE, name="d")
+
+
+CA = bytes([4]) + bytes(range(64))
+"""P(CA) of another owner, in whose bundle a key came."""
+
+
+def test_a_key_that_came_in_a_bundle_and_opens_brings_the_ca_of_its_bundle(station: Station) -> None:
+    for key in (a_key(1, "active"), a_key(2)):
+        station.keys.add(key)
+    station.keys.set_flags({NODE: {"next_key_id": f"{2:016x}", "next_ca": CA}})
+    assert station.keys.ca_of(NODE) == station.ca != CA, "until the key is proven"
+    station.keys.promote(NODE, f"{2:016x}")
+    assert station.keys.ca_of(NODE) == CA
+    assert numbers(station) == [2]
+    flags = station.keys.all_flags()[NODE]
+    assert (flags.next_key_id, flags.next_ca) == (None, None)
+
+
+def test_a_ca_whose_key_did_not_open_is_forgotten(station: Station) -> None:
+    for key in (a_key(1, "active"), a_key(2)):
+        station.keys.add(key)
+    station.keys.set_flags({NODE: {"next_key_id": f"{2:016x}", "next_ca": CA}})
+    station.keys.promote(NODE, f"{1:016x}")
+    assert station.keys.ca_of(NODE) == station.ca
+    station.keys.add(a_key(2))
+    station.keys.promote(NODE, f"{2:016x}")
+    assert station.keys.ca_of(NODE) == station.ca, "what the bundle said of that key was dropped"
+
+
+def test_promoting_a_key_that_is_not_held_changes_nothing(station: Station) -> None:
+    for key in (a_key(1, "active"), a_key(2)):
+        station.keys.add(key)
+    station.keys.set_flags({NODE: {"next_key_id": f"{2:016x}", "next_ca": CA}})
+    before = station.keys.all_flags()
+    with pytest.raises(NotFoundError):
+        station.keys.promote(NODE, "f" * 16)
+    assert numbers(station) == [2, 1]
+    assert station.keys.all_flags() == before

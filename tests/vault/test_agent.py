@@ -222,3 +222,29 @@ def page_with(secret: bytes) -> agent.LockedPage:
     page.read(read)
     os.close(read)
     return page
+
+
+@pytest.mark.parametrize(("question", "seconds"), [(agent.END, 60.0), (agent.SECRET, -1.0)], ids=["lock", "too late"])
+def test_the_page_is_wiped_before_the_line_ends(question: bytes, seconds: float) -> None:
+    """Who sees the end of the line may count on it: a copy of the memory made from then on holds no secret."""
+    asking, answering = socket.socketpair()
+    with asking, answering:
+        page = page_with(b"Fsecret")
+        asking.sendall(question)
+        assert not agent._answer(answering, page, agent._now() + seconds)
+        assert page._memory[:16] == bytes(16)
+        assert bytes(page.view()) == b""
+        answering.shutdown(socket.SHUT_WR)
+        assert asking.recv(16) == b""
+
+
+def test_other_questions_leave_the_page_as_it_is() -> None:
+    asking, answering = socket.socketpair()
+    with asking, answering:
+        page = page_with(b"Fsecret")
+        for question in (agent.SECRET, b"?", agent.TIME):
+            asking.sendall(question)
+            assert agent._answer(answering, page, agent._now() + 60)
+        assert asking.recv(7) == b"Fsecret"
+        assert int.from_bytes(asking.recv(4), "big") in (59, 60)
+        assert bytes(page.view()) == b"Fsecret"

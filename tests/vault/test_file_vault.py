@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import signal
 import stat
@@ -19,7 +20,7 @@ from teds_provision.protocol.keys import SoftwareKey, verify
 from teds_provision.vault import create_vault, open_vault
 from teds_provision.vault.file_vault import FileVault
 from teds_provision.vault.master import Material
-from teds_provision.vault.passphrase import PRODUCT, THROWAWAY
+from teds_provision.vault.passphrase import PRODUCT, THROWAWAY, Costs, seal, unseal
 from tests.pace import costs_at_most
 from tests.passphrase_costs import product_costs
 from tests.vault.passphrase import GOOD, STORE, Person
@@ -169,6 +170,40 @@ def test_forged_costs_cannot_exhaust_the_machine(tmp_path: Path, vault: FileVaul
         (tmp_path / "vault.json").write_text(json.dumps({**content, **forged}))
         with costs_at_most(1.0), pytest.raises(VaultError):
             FileVault.open(tmp_path, STORE, Person())
+
+
+@pytest.mark.parametrize(
+    ("memory_kib", "iterations", "lanes", "good"),
+    [
+        (32, 1, 4, True),
+        (31, 1, 4, False),  # Argon2 takes 8 KiB a lane
+        (8, 1, 1, True),
+        (8, 1, 0, False),
+        (0, 1, 0, False),
+        (128, 1, 16, True),
+        (136, 1, 17, False),
+        (192 << 10, 1, 4, True),
+        ((192 << 10) + 1, 1, 4, False),
+        (32, 0, 4, False),
+        (32, (2 << 20) // 32, 4, True),
+        (32, (2 << 20) // 32 + 1, 4, False),  # memory times passes
+    ],
+)
+def test_costs_are_tried_up_to_their_bounds(memory_kib: int, iterations: int, lanes: int, good: bool) -> None:
+    assert Costs(memory_kib, iterations, lanes).bounded() is good
+
+
+@pytest.mark.parametrize("name", ["salt", "ciphertext"])
+def test_base64_has_one_form(name: str) -> None:
+    """Spare bits of the last letter are zero: a changed octet never means the same."""
+    letters = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"
+    sealed = seal(GOOD, b"sixteen octets !", context=b"c", costs=THROWAWAY)
+    assert unseal(GOOD, sealed, context=b"c")[0] == b"sixteen octets !"
+    text = sealed[name].rstrip("=")
+    bent = text[:-1] + letters[letters.index(text[-1]) + 1] + "=" * (len(sealed[name]) - len(text))
+    assert base64.b64decode(bent) == base64.b64decode(sealed[name])
+    with pytest.raises(VaultError, match="damaged"):
+        unseal(GOOD, {**sealed, name: bent}, context=b"c")
 
 
 @given(octets=st.binary(max_size=300) | st.text(max_size=100).map(lambda text: json.dumps({"format": text}).encode()))

@@ -66,7 +66,6 @@ class McapRecording(Recording):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self.foreign = 0  # messages of other topics than ours
         for code, content in self._records(chunks=False):
             if code == METADATA:
                 name, words = self._metadata(content)
@@ -138,11 +137,10 @@ class McapRecording(Recording):
 
     def _stored_entries(self) -> Iterator[Entry]:
         """See the class above."""
-        schemas: dict[int, str] = {0: ""}
+        schemas: dict[int, str] = {}
         topics: dict[int, _Topic] = {}
         waiting: dict[tuple[int, int], list[bytes]] = {}  # messages by topic and length
         joined, count = BlockJoiner(), 0
-        self.foreign = 0
         for code, content in self._records():
             if code == MESSAGE and len(content) >= MESSAGE_HEAD.size - HEAD.size:
                 number = content[0] | content[1] << 8
@@ -160,8 +158,6 @@ class McapRecording(Recording):
                         waiting, count = {}, 0
                         yield from joined.rest()
                         yield entry
-                else:
-                    self.foreign += 1
                 continue
             if code in (SCHEMA, CHANNEL, METADATA):
                 yield from self._blocks(waiting, topics, joined)

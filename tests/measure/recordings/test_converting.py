@@ -190,3 +190,30 @@ def test_notes_of_the_recorder_go_along(tmp_path: Path) -> None:
     for end in (".jsonl", ".csv", ".parquet", ".mcap"):
         [path] = convert(path, tmp_path / f"next{end}").files
         assert [note["why"] for note in told(path)["notes"]] == ["The disk was full."]
+
+
+def test_entries_come_in_the_order_in_which_they_were_measured(tmp_path: Path) -> None:
+    """A report and a note stand behind the samples that came before them, whatever was gathered meanwhile."""
+    told = NodeReport(ARM, "lost", why="The link ended.", time=1_795_000_010.0)
+    noted = Note(1_795_000_020.0, "The disk was full.")
+    items = [block(index=0), told, block(index=3), noted, block(index=6)]
+    sink = open_sink(str(tmp_path / "run.mcap"))
+    sink.copy(items, FACTS, STATION)  # type: ignore[attr-defined]
+    entries = open_recording(tmp_path / "run.mcap").entries()
+    found = [entry for entry in entries if isinstance(entry, Block | NodeReport | Note)]
+    assert [type(entry) for entry in found] == [Block, NodeReport, Block, Note, Block]
+    assert [entry.index for entry in found if isinstance(entry, Block)] == [0, 3, 6]
+    assert isinstance(found[1], NodeReport)
+    assert (found[1].uuid, found[1].why) == (ARM, "The link ended.")
+    assert found[3] == noted
+
+
+def test_more_nodes_than_an_octet_counts_keep_their_samples_apart(tmp_path: Path) -> None:
+    uuids = [f"{number:020x}" for number in range(1, 301)]
+    sink = open_sink(str(tmp_path / "run.mcap"))
+    sink.open([replace(ANGLE, uuid=uuid) for uuid in uuids], STATION)
+    fill(sink, [block([[number]], uuid=uuid) for number, uuid in enumerate(uuids)])
+    found = values(tmp_path / "run.mcap")
+    assert {key: [raw for _, raw, _ in pairs] for key, pairs in found.items()} == {
+        (uuid, 1): [number] for number, uuid in enumerate(uuids)
+    }

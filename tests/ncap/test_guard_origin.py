@@ -1,0 +1,83 @@
+"""Which host, origin and site the guard lets through, asked of it in this process."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from teds_provision.ncap.web.guard import Guard, Message, Receive, Scope, Send, front
+from teds_provision.ncap.web.tokens import Tokens
+
+PORT = 8451
+HERE = f"127.0.0.1:{PORT}"
+
+
+async def app(scope: Scope, _receive: Receive, send: Send) -> None:
+    prefix = "websocket." if scope["type"] == "websocket" else ""
+    await send({"type": f"{prefix}http.response.start", "status": 200, "headers": []})
+
+
+def status_of(guard: Guard, headers: dict[str, str], kind: str = "http") -> int:
+    sent: list[Message] = []
+
+    async def run() -> None:
+        async def send(message: Message) -> None:
+            sent.append(message)
+
+        async def receive() -> Message:
+            return {"type": "http.disconnect"}
+
+        pairs = [(name.encode(), value.encode()) for name, value in headers.items()]
+        await guard({"type": kind, "method": "GET", "path": "/api/v1/live", "headers": pairs}, receive, send)
+
+    asyncio.run(run())
+    return int(sent[0]["status"])
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({}, 200),
+        ({"host": "LOCALHOST:8451"}, 200),
+        ({"host": "127.0.0.1"}, 421),
+        ({"host": "evil.example:8451"}, 421),
+        ({"origin": f"http://{HERE}"}, 200),
+        ({"origin": f"HTTP://{HERE}"}, 200),
+        ({"origin": f"https://{HERE}"}, 403),
+        ({"origin": "http://127.0.0.1:8452"}, 403),
+        ({"origin": "null"}, 403),
+        ({"sec-fetch-site": "same-origin"}, 200),
+        ({"sec-fetch-site": "none"}, 200),
+        ({"sec-fetch-site": "same-site"}, 403),
+        ({"sec-fetch-site": "cross-site"}, 403),
+        ({"origin": f"http://{HERE}", "sec-fetch-site": "cross-site"}, 403),
+    ],
+)
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+def test_a_good_token_works_from_its_own_origin_only(
+    tmp_path: Path, kind: str, headers: dict[str, str], status: int
+) -> None:
+    tokens = Tokens(tmp_path)
+    good = {"host": HERE, "authorization": f"Bearer {tokens.add('script')}"}
+    guard = Guard(app, tokens, front((), PORT, tls=False))
+    assert status_of(guard, {**good, **headers}, kind) == status
+    without = {"host": HERE, **headers}
+    assert status_of(guard, without, kind) == (401 if status == 200 else status), "the token is looked at last"
+
+
+def test_a_browsers_websocket_names_its_origin(tmp_path: Path) -> None:
+    """Browsers send one with each WebSocket, to whatever server; a request without one is none of our page."""
+    tokens = Tokens(tmp_path)
+    guard = Guard(app, tokens, front((), PORT, tls=False))
+    cookie = {"host": HERE, "cookie": f"ncap-{PORT}={tokens.login(tokens.login_link())}"}
+    assert status_of(guard, cookie) == 200
+    assert status_of(guard, cookie, "websocket") == 403
+    assert status_of(guard, {**cookie, "origin": f"http://{HERE}"}, "websocket") == 200
+    assert status_of(guard, {**cookie, "origin": "http://evil.example"}, "websocket") == 403
+
+
+def test_the_users_own_socket_has_no_origin_to_compare(tmp_path: Path) -> None:
+    guard = Guard(app, Tokens(tmp_path), None)
+    assert status_of(guard, {"host": "anything", "origin": "http://evil.example"}) == 200
