@@ -374,7 +374,7 @@ def _new_key(
     ca = station.ca if new else station.keys.ca_of(node.uuid)
     try:
         # outside a session the result of the identification counts: on this link, a moment ago
-        teds = read_block(node, SECURITY) if node.sealed else who.security_teds
+        teds = read_block(node, SECURITY) if node.sealed or who.recalled else who.security_teds
         return _agree_anew(station, node, pinned, ca, teds, returning=returning, only_new=new and not demanded)
     except NodeRefusedError as refusal:
         # Identify may have been answered while the node was still storing the key of a run that was cut off

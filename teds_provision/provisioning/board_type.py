@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
-from teds_provision.errors import BadDataError, NodeRefusedError, PolicyError
+from teds_provision.errors import BadDataError, NodeRefusedError, PolicyError, TedsProvisionError
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import (
     DIGEST_OCTETS,
@@ -318,17 +318,40 @@ def check_hardware(node: Conversation, image: Image, shown: Mapping[int, str] | 
 def _borne(node: Conversation, image: Image, shown: Mapping[int, str] | None) -> HardwareCheck:
     described = Sheet.from_image(Image(image.uuid, image.unsigned_blocks()))  # the Security TEDS is judged already
     sheet, digest = described.shown_in(shown or {}), hashlib.sha256(image.security or b"").digest()
-    found = {channel.number: _bears(node, channel, digest) for channel in sheet.channels}
-    sensors = [channel for channel in sheet.channels if not channel.actuator and found[channel.number]]
-    if not sensors:
-        return HardwareCheck(found)
     try:
-        samples = tuple(_read(node, sheet, sensors, digest))
-    except (NodeRefusedError, BadDataError) as error:  # busy, a fault: the datasheet stands, and a person is told
-        return HardwareCheck(found, warnings=(f"No reading was taken: {error.message}",))
+        states = OperationReply.decode(node.request(OPERATION, "to report its mode")).channels
+    except (NodeRefusedError, BadDataError) as error:
+        if isinstance(error, NodeRefusedError) and error.reason == Reason.UNKNOWN_COMMAND:
+            return HardwareCheck(dict.fromkeys((channel.number for channel in sheet.channels), None))
+        found = {channel.number: _bears(node, channel, digest).accepts for channel in sheet.channels}
+        asked = any(found[channel.number] for channel in sheet.channels if not channel.actuator)
+        return HardwareCheck(found, warnings=(_no_reading(error),) if asked else ())
+    taken = {number for number, (state, _) in states.items() if state & ChannelState.CLAIMED_BY_OTHER}
+    free = [channel for channel in sheet.channels if not channel.actuator and channel.number not in taken]
+    answers: dict[int, _Answer] = {}
+    samples: tuple[dict[str, Any], ...] = ()
+    trouble: TedsProvisionError | None = None
+    try:
+        for channel in sheet.channels:
+            answers[channel.number] = _bears(node, channel, digest, lease=_LEASE if channel in free else 0)
+        trouble = next((answer.not_claimed for answer in answers.values() if answer.not_claimed is not None), None)
+        if trouble is None:
+            claimed = [channel for channel in free if answers[channel.number].accepts]
+            samples = tuple(_read(node, sheet, claimed))
+    except (NodeRefusedError, BadDataError) as error:  # the datasheet stands; a warning says why
+        trouble = error
+    finally:
+        if free:
+            node.request(idle(0), "to let go")
+    found = {number: answer.accepts for number, answer in answers.items()}
+    if trouble is not None:  # busy, a fault
+        return HardwareCheck(found, warnings=(_no_reading(trouble),))
     bad = [str(entry["channel"]) for entry in samples if not entry["valid"]]
-    warnings = (invalid_readings(bad),) if bad else ()
-    return HardwareCheck(found, samples, warnings)
+    return HardwareCheck(found, samples, (invalid_readings(bad),) if bad else ())
+
+
+def _no_reading(error: TedsProvisionError) -> str:
+    return f"No reading was taken: {error.message}"
 
 
 def invalid_readings(channels: Sequence[str]) -> str:
@@ -338,42 +361,46 @@ def invalid_readings(channels: Sequence[str]) -> str:
     return f"The readings of channels {', '.join(channels)} are invalid."
 
 
-def _bears(node: Conversation, channel: Channel, digest: bytes) -> bool | None:
+class _Answer(NamedTuple):
+    """Answer of a channel: it accepts its datasheet, None: it does not measure; and why it was not claimed."""
+
+    accepts: bool | None
+    not_claimed: NodeRefusedError | None = None
+
+
+def _bears(node: Conversation, channel: Channel, digest: bytes, *, lease: int = 0) -> _Answer:
+    """Ask a channel whether its hardware accepts its datasheet; with a ``lease`` in s by claiming it."""
+    dead_man = FIRST_DEAD_MAN if channel.actuator else None
     try:
-        operate(node, channel.number, digest, lease=0, dead_man=FIRST_DEAD_MAN if channel.actuator else None)
+        operate(node, channel.number, digest, lease=lease, dead_man=dead_man)
     except NodeRefusedError as refusal:
-        if refusal.reason == Reason.OUT_OF_RANGE:
-            return True
         if refusal.reason in (Reason.DIGEST_MISMATCH, Reason.BAD_FORM):  # 4: a sensor instead of an actuator
             raise WrongBoardError(
                 f"Channel {channel.number} ({channel.name or 'no name'}) of the board does not match this"
                 " datasheet: its hardware is of a different kind, or delivers values in a different format.",
                 hint="The board is of a different type. Provision it with the profile of its own type.",
             ) from refusal
-        return None
-    return None  # it claimed something for no time: no firmware of this profile
+        if refusal.reason == Reason.OUT_OF_RANGE and not lease:
+            return _Answer(True)
+        if refusal.reason in (Reason.BUSY, Reason.FAULT) and lease:  # these are checked last
+            return _Answer(True, refusal)
+        return _Answer(None)
+    return _Answer(True if lease else None)  # it claimed something for no time: no firmware of this profile
 
 
-def _read(node: Conversation, sheet: Sheet, sensors: list[Channel], digest: bytes) -> Iterator[dict[str, Any]]:
-    channels = OperationReply.decode(node.request(OPERATION, "to report its mode")).channels
-    taken = {number for number, (state, _) in channels.items() if state & ChannelState.CLAIMED_BY_OTHER}
-    free = [number for number in sensors if number.number not in taken]
-    readers = {channel.number: ChannelInterpreter(sheet, channel.number) for channel in free}
-    try:
-        for number in readers:
-            operate(node, number, digest, lease=_LEASE)
-        for part in _parts(readers):
-            width = sum(readers[number].octets for number in part)
-            reply = SampleReply.decode(node.request(sample(part), "to sample"), width)
-            at, raws = 0, {}
-            for number in part:
-                one = readers[number]
-                raws[number] = one.reader.raw(reply.data[at : at + one.octets])
-                at += one.octets
-            for number in part:
-                yield _to_json(readers[number], raws, valid=reply.valid)
-    finally:
-        node.request(idle(0), "to let go")
+def _read(node: Conversation, sheet: Sheet, sensors: list[Channel]) -> Iterator[dict[str, Any]]:
+    """Sample claimed sensors."""
+    readers = {channel.number: ChannelInterpreter(sheet, channel.number) for channel in sensors}
+    for part in _parts(readers):
+        width = sum(readers[number].octets for number in part)
+        reply = SampleReply.decode(node.request(sample(part), "to sample"), width)
+        at, raws = 0, {}
+        for number in part:
+            one = readers[number]
+            raws[number] = one.reader.raw(reply.data[at : at + one.octets])
+            at += one.octets
+        for number in part:
+            yield _to_json(readers[number], raws, valid=reply.valid)
 
 
 def require_working_hardware(node: Conversation, image: Image) -> None:
@@ -385,7 +412,7 @@ def require_working_hardware(node: Conversation, image: Image) -> None:
     """
     sheet = Sheet.from_image(Image(image.uuid, image.unsigned_blocks()))
     digest = hashlib.sha256(image.security or b"").digest()
-    served = [channel for channel in sheet.channels if _bears(node, channel, digest)]
+    served = [channel for channel in sheet.channels if _bears(node, channel, digest).accepts]
     if not served:
         return
     channels = OperationReply.decode(node.request(OPERATION, "to report its mode")).channels

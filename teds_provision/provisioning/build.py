@@ -594,24 +594,25 @@ def propose(station: Station, prepared: PreparedOrder, present: NodeSnapshot, *,
 
 def _proposal(station: Station, prepared: PreparedOrder, present: NodeSnapshot) -> Proposal:
     """Return the wanted content, by what the node has now and what was ordered; not guarded yet."""
-    has, order = present.image, prepared.order
-    keep = {block: has.blocks[block] for block in present.read_only}
-    if not has.unsigned_blocks().keys() - keep.keys():
-        return _composed(station, prepared, present, keep, named=True)
+    order = prepared.order
+    intact = _intact(station, present)
+    # only what the board brought, and keeps: it never had a datasheet
+    if not intact and (order.adopt or order.profile is None) and present.is_fixed:
+        return _composed(station, prepared, present, named=True)
     if order.adopt and order.name is None:
-        return _as_it_is(station, present, keep)
+        return _as_it_is(station, present)
     if order.adopt:  # what it has, under another name, whatever its type
         brought = read_factory_datasheet(station, present.image, name=order.name)
         return Proposal(brought.image, (), True, name=brought.name or None)
-    if not _intact(station, present):
+    if not intact:
         return _mended(station, prepared, present) or _composed(
-            station, prepared, present, keep, named=order.profile is not None
+            station, prepared, present, named=order.profile is not None
         )
     if order.names_nothing:
-        return _as_it_is(station, present, keep)
+        return _as_it_is(station, present)
     if order.profile is not None:
-        return _composed(station, prepared, present, keep, named=True, resume=False)
-    return _only_what_is_named(station, prepared, present, keep)
+        return _composed(station, prepared, present, named=True, resume=False)
+    return _only_what_is_named(station, prepared, present)
 
 
 def _intact(station: Station, present: NodeSnapshot) -> bool:
@@ -645,7 +646,6 @@ def _composed(
     station: Station,
     prepared: PreparedOrder,
     present: NodeSnapshot,
-    keep: Mapping[BlockId, bytes],
     *,
     named: bool,
     resume: bool = True,
@@ -656,26 +656,25 @@ def _composed(
     source = station.datasheets.draft(uuid) if pending is not None else station.nodes.get(uuid)
     name = own_name(station, pending or has, source.profile if source is not None else None)
     plan = compose(station, uuid, prepared, pending or has, name=name, as_known=resume)
-    image = Image(uuid, {**keep, **plan.blocks})
+    image = Image(uuid, {**present.fixed_beside(plan.blocks), **plan.blocks})
     named = named and not plan.changed
     return Proposal(image, (), named, plan.warnings, plan.wanted, plan.name, plan.calibrations, plan.digest)
 
 
-def _as_it_is(station: Station, present: NodeSnapshot, keep: Mapping[BlockId, bytes]) -> Proposal:
+def _as_it_is(station: Station, present: NodeSnapshot) -> Proposal:
     """Return the node's present content, unless something else was built or signed for it and never written."""
     uuid, has = present.image.uuid, present.image
     pending = pending_image(station, uuid, has)
     if pending is None or pending.unsigned_blocks() == has.unsigned_blocks():
         return Proposal(Image(uuid, has.unsigned_blocks()), (), named=True)
     draft = station.datasheets.draft(uuid)
-    image = Image(uuid, {**keep, **pending.unsigned_blocks()})
+    blocks = pending.unsigned_blocks()
+    image = Image(uuid, {**present.fixed_beside(blocks), **blocks})
     profile = draft.profile if draft is not None else None
     return Proposal(image, (), named=False, profile=profile, name=own_name(station, image, profile))
 
 
-def _only_what_is_named(
-    station: Station, prepared: PreparedOrder, present: NodeSnapshot, keep: Mapping[BlockId, bytes]
-) -> Proposal:
+def _only_what_is_named(station: Station, prepared: PreparedOrder, present: NodeSnapshot) -> Proposal:
     """Return the node's present content, with only those TEDS replaced that differ by the named values."""
     uuid, has = present.image.uuid, present.image
     record = station.nodes.get(uuid)
@@ -683,9 +682,9 @@ def _only_what_is_named(
     asked = compose(station, uuid, prepared, has, name=name, as_known=False)
     unasked = compose(station, uuid, PreparedOrder(BuildOrder(), asked.profile), has, name=name, as_known=False)
     blocks = dict(has.unsigned_blocks())
-    for block in {*asked.blocks, *unasked.blocks} - set(keep):
+    for block in {*asked.blocks, *unasked.blocks}:
         wanted = asked.blocks.get(block)
-        if wanted == unasked.blocks.get(block):
+        if wanted == unasked.blocks.get(block) or present.is_read_only(block):
             continue
         if wanted is None:
             blocks.pop(block, None)

@@ -6,7 +6,7 @@ The callers (command line, API) pass plain texts: no session, lock or link is th
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,7 +58,7 @@ from teds_provision.provisioning.progress import Reporter
 from teds_provision.provisioning.provision import add_to_whitelist, key_board
 from teds_provision.provisioning.readings import keep
 from teds_provision.provisioning.sign import SignResult, known_image, known_node_keys, require_not_measured, sign
-from teds_provision.provisioning.teds_read import read_identity, read_image, take_snapshot
+from teds_provision.provisioning.teds_read import NodeSnapshot, read_identity, read_image, take_snapshot
 from teds_provision.provisioning.verify import freshness_floor_of, session_check, unproven
 from teds_provision.provisioning.verify_node import open_or_say_why, provenance_check, verify_at_node
 from teds_provision.provisioning.write import WriteResult, write
@@ -68,7 +68,7 @@ from teds_provision.station.station import Station
 from teds_provision.station.store import DatasheetRecord, Draft
 from teds_provision.teds.codec import security
 from teds_provision.teds.diff import Change, diff_blocks
-from teds_provision.teds.image import SECURITY, BlockId, Image
+from teds_provision.teds.image import SECURITY, Image
 
 Unlock = Literal["always", "if held", "never"]
 
@@ -114,7 +114,7 @@ def at_node(
         station.node_lock(uuid),
         station.released(uuid, writes) if writes else nullcontext() as released,
     ):
-        yield NodeVisit(station, node, identify(station, node), bool(released))
+        yield NodeVisit(station, node, identify(station, node, recall=unlock != "never"), bool(released))
 
 
 # -- identify: the node on the reader or those on the bus, once or as they come ----------------------------------------
@@ -667,20 +667,18 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
 
 @dataclass(frozen=True)
 class _PresentTeds:
-    """What the node has: as last known, or (``read``) as it was read now. ``read_only`` blocks cannot be replaced."""
+    """What the node has: as last known, or (``found``) as it was read now."""
 
     image: Image | None
     epoch: int
     sequence: int
-    read_only: Collection[BlockId] = ()
-    read: bool = False
+    found: NodeSnapshot | None = None
 
     def completing(self, image: Image) -> Image:
         """Return the image with the read-only blocks of the node that it leaves out, which stay and are signed."""
-        if self.image is None:
+        if self.found is None:
             return image
-        keep = {block: self.image.blocks[block] for block in self.read_only if block not in image.blocks}
-        return Image(self.image.uuid, {**image.blocks, **keep})
+        return Image(self.found.image.uuid, {**image.blocks, **self.found.fixed_beside(image.blocks)})
 
     def security_for(self, image: Image) -> bytes | None:
         """Return the node's Security TEDS, if its signature may be used again for ``image``.
@@ -688,7 +686,7 @@ class _PresentTeds:
         Not if the node was read to hold something else than it was signed for: it takes ``image`` only under a newer
         sequence.
         """
-        if self.image is None or (self.read and self.image.unsigned_blocks() != image.unsigned_blocks()):
+        if self.image is None or (self.found is not None and self.image.unsigned_blocks() != image.unsigned_blocks()):
             return None
         return self.image.security
 
@@ -720,7 +718,7 @@ def _read_now(station: Station, node: Conversation, order: SignOrder) -> _Presen
     if not order.dry_run:  # opening a session may settle or rotate keys
         require_session(station, node)
     found = take_snapshot(node)
-    return _PresentTeds(found.image, found.identity.epoch, found.identity.sequence, found.read_only, read=True)
+    return _PresentTeds(found.image, found.identity.epoch, found.identity.sequence, found)
 
 
 def _keep(station: Station, order: SignOrder, signed: SignResult, draft: Draft | None) -> None:
@@ -816,8 +814,9 @@ def restore_datasheet(
     with at_node(station, links.after_agreeing(), uuid, reporter, unlock="always", writes="write") as visit:
         visit.session()
         present = take_snapshot(visit.node)
-        keep = {block: present.image.blocks[block] for block in present.read_only}
-        image = Image(uuid, {**record.image.unsigned_blocks(), **keep})
+        blocks = record.image.unsigned_blocks()
+        same = {block for block, teds in blocks.items() if present.image.blocks.get(block) == teds}
+        image = Image(uuid, {**blocks, **present.fixed_beside(same)})
         guard(station, image, present.image, f"datasheet of sequence {sequence} brought back")
         changes = tuple(diff_blocks(present.image.unsigned_blocks(), image.unsigned_blocks()))
         signed = sign(

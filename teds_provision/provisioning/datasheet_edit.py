@@ -86,8 +86,8 @@ def plan_sheet(
             f"The datasheet of node {node.uuid.hex()} has changed since it was read.",
             hint="Read it again, or repeat the dry run, and review the changes.",
         )
-    keep = {block: present.image.blocks[block] for block in present.read_only}
-    image = without_stale_certificates(present.image, Image(node.uuid, {**keep, **under(blocks, node.uuid)}))
+    wanted = under(blocks, node.uuid)
+    image = without_stale_certificates(present.image, Image(node.uuid, {**present.fixed_beside(wanted), **wanted}))
     differing = () if retype else differences(present.image.blocks, image)
     if differing:
         require_board_type(node.uuid, differing)

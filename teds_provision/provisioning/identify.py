@@ -37,6 +37,8 @@ class IdentifiedNode:
     address: int | None
     security_teds: bytes
     whitelisted: WhitelistEntry | None
+    recalled: bool = False
+    """``security_teds`` was read in a session before, and not now; see :func:`examine`."""
 
     @property
     def fingerprint(self) -> str:
@@ -56,7 +58,11 @@ def prove(node: Conversation, point: bytes) -> None:
 
 
 def identify(
-    station: Station, node: Conversation, *, expect: Callable[[IdentifiedNode], object] = lambda who: None
+    station: Station,
+    node: Conversation,
+    *,
+    expect: Callable[[IdentifiedNode], object] = lambda who: None,
+    recall: bool = False,
 ) -> IdentifiedNode:
     """Read UUID and key, require the proof, and check both against this station's store.
 
@@ -64,9 +70,9 @@ def identify(
     key that it brought; over a bus, where any device can use any UUID, only a whitelisted key is kept, and
     ``last_seen`` changes only if the key that signed is known. State, epoch and address of a plain Identify are hints:
     they change nothing in the store, a session does. ``expect`` is called before anything is recorded, and raises if
-    another node was meant.
+    another node was meant. ``recall``: see :func:`examine`.
     """
-    who = examine(station, node)
+    who = examine(station, node, recall=recall)
     expect(who)
     entry = who.whitelisted
     counts = node.tapped or (entry is not None and entry.fingerprint is not None)
@@ -123,14 +129,42 @@ def _opened(station: Station) -> bool:
     return False
 
 
-def examine(station: Station, node: Conversation) -> IdentifiedNode:
-    """Return what :func:`identify` finds out, without a change of the store (but for a wrong key in the audit log)."""
+def examine(station: Station, node: Conversation, *, recall: bool = False) -> IdentifiedNode:
+    """Return what :func:`identify` finds out, without a change of the store (but for a wrong key in the audit log).
+
+    ``recall``, for a caller that opens a session next: a node with a key held here, whose Security TEDS was read in a
+    session before, proves the key that was read then, and its Security TEDS is not read. If it cannot, it is read.
+    """
+    if recall and (who := _recalled(station, node)) is not None:
+        return who
     octets = read_block(node, SECURITY)
     shown = security.decode(octets)
     point = shown.node_key
     if not node_key_good(node.uuid, point, shown.node_key_signature):
         raise NotAuthenticError(f"The key that the node presents is not signed for UUID {node.uuid.hex()} (field 102).")
     prove(node, point)
+    return _examined(station, node, point, shown.node_key_signature, octets)
+
+
+def _recalled(station: Station, node: Conversation) -> IdentifiedNode | None:
+    """Have a node prove the key of its last reading in a session; None if there is none, or it cannot."""
+    with station.reading():
+        row, image = station.datasheets.reading(node.uuid), station.datasheets.datasheet(node.uuid)
+        held = station.keys.held(node.uuid)
+    octets = image.security if image is not None else None
+    if not held or octets is None or row is None or not row.in_session or node.identity.state == NodeState.FACTORY:
+        return None
+    point, signature = row.node_key, row.node_key_signature
+    if point is None or signature is None or not node_key_good(node.uuid, point, signature):
+        return None
+    try:
+        prove(node, point)
+    except NotAuthenticError:
+        return None
+    return replace(_examined(station, node, point, signature, octets), recalled=True)
+
+
+def _examined(station: Station, node: Conversation, point: bytes, signature: bytes, octets: bytes) -> IdentifiedNode:
     with station.reading():
         station.pins.check(node.uuid, point)
         entry = station.pins.entry(node.uuid)
@@ -138,7 +172,7 @@ def examine(station: Station, node: Conversation) -> IdentifiedNode:
     return IdentifiedNode(
         uuid=node.uuid,
         point=point,
-        key_signature=shown.node_key_signature,
+        key_signature=signature,
         state=identity.state,
         tag_uid=node.contact.tag_uid,
         address=node.contact.address,

@@ -289,7 +289,7 @@ class _Run:
             self.onward(self.node)
         firmware = read_firmware(self.node)
         require_firmware(who.uuid, demand, firmware or FirmwareReading(None, sealed=True))
-        present = take_snapshot(self.node, initial=who.security_teds)
+        present = take_snapshot(self.node, initial=None if who.recalled else who.security_teds)
         proposal = self._build(who, prepared, present)
         signed = self._sign(who, proposal, present)
         written = self._write(signed, proposal, present)
@@ -320,7 +320,8 @@ class _Run:
 
     def _identify(self) -> IdentifiedNode:
         with self.steps.step("identify") as step:
-            who = identify(self.station, self.node, expect=self._choose)
+            # evidence names what the board showed
+            who = identify(self.station, self.node, expect=self._choose, recall=self.line is None)
             step.detail = f"{who.uuid.hex()}, key {who.fingerprint[:16]}"
         return who
 

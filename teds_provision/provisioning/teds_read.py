@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Generator, Iterable
+from dataclasses import dataclass, field
+from functools import partial
 
 from teds_provision.errors import BadDataError, GarbledError, NodeRefusedError
 from teds_provision.links.ports import PacedLink
@@ -109,12 +110,15 @@ def list_blocks(node: Conversation) -> list[BlockId]:
     return decode_list(node.request_idempotent(security_command(Function.LIST), "to list its TEDS"))
 
 
-def read_image(node: Conversation, *, initial: bytes | None = None) -> Image:
-    """Read every TEDS of a node; ``initial`` replaces its Security TEDS if that is not worth reading again."""
+def read_image(node: Conversation, *, initial: bytes | None = None, listed: Iterable[BlockId] | None = None) -> Image:
+    """Read every TEDS of a node; ``initial`` replaces its Security TEDS if that is not worth reading again.
+
+    ``listed`` are the TEDS that it has, if that is known; None: it is asked.
+    """
     blocks: dict[BlockId, bytes] = {}
     total = 0
     until = time.monotonic() + READING_SECONDS
-    for block in list_blocks(node):
+    for block in list_blocks(node) if listed is None else listed:
         if block == SECURITY and initial is not None:
             blocks[block] = initial
             continue
@@ -185,23 +189,44 @@ def read_identity(node: Conversation) -> Identity:
 
 @dataclass(frozen=True)
 class NodeSnapshot:
-    """Content of a node, read in its session: all TEDS, and which of those that are not ours are read-only."""
+    """Content of a node, read in its session; the node is asked which TEDS are read-only if that matters, each once."""
 
     image: Image
-    read_only: frozenset[BlockId]
     identity: Identity
+    ask: Callable[[BlockId], bool] = field(repr=False, compare=False)
+    _answers: dict[BlockId, bool] = field(default_factory=dict, repr=False, compare=False)
+
+    def is_read_only(self, block: BlockId) -> bool:
+        """Return True if the node has this TEDS and nothing can replace it."""
+        if block not in self.image.blocks or block == SECURITY:
+            return False
+        if block not in self._answers:
+            self._answers[block] = self.ask(block)
+        return self._answers[block]
+
+    @property
+    def is_fixed(self) -> bool:
+        """True if no TEDS but the Security TEDS can be replaced or removed, as on a node that has no other."""
+        return all(map(self.is_read_only, self.image.unsigned_blocks()))
+
+    def fixed_beside(self, blocks: Collection[BlockId]) -> dict[BlockId, bytes]:
+        """Return the read-only TEDS that are none of these; the node is not asked about these."""
+        return {
+            block: teds
+            for block, teds in self.image.unsigned_blocks().items()
+            if block not in blocks and self.is_read_only(block)
+        }
 
 
 def take_snapshot(node: Conversation, *, initial: bytes | None = None) -> NodeSnapshot:
-    """Read all TEDS and, for those that the Security TEDS does not account for, whether they are read-only.
+    """Read all TEDS, and in a session its Identify.
 
     ``initial`` is the Security TEDS that was read before the session: of a node that was not written since its last
     reset it is unsigned and adds nothing to the session, so it is not read twice.
     """
     identity = node.proven or read_identity(node)
     image = read_image(node, initial=None if identity.state == NodeState.PROVISIONED else initial)
-    read_only = frozenset(block for block in image.unsigned_blocks() if _is_read_only(node, block))
-    return NodeSnapshot(image, read_only, identity)
+    return NodeSnapshot(image, identity, partial(_is_read_only, node))
 
 
 def _is_read_only(node: Conversation, block: BlockId) -> bool:

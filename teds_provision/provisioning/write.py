@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import PurePath
 from types import MappingProxyType
@@ -113,9 +113,21 @@ def write(
     octets += _commit(station, node, image, has, progress)
     node.proven = replace(identity, sequence=signed.sequence, state=NodeState.PROVISIONED)
     c = node.open_counter
-    back = read_image(node)
+    back = read_image(node, listed=_after_commit(image, has if present is not None else None))
     _conclude(station, node, image, back, facts, c=c, octets=octets, sequence=signed.sequence, firmware=firmware)
     return WriteResult(octets, time.monotonic() - started, back)
+
+
+def _after_commit(image: Image, read: Image | None) -> Iterable[BlockId] | None:
+    """Return the TEDS that a node has after the commit of ``image``; None if it has to be asked.
+
+    ``read`` is what it was read to have before, in the same session. Only a commit changes that: it puts in what the
+    image has, and nothing was there that the image has not. The Security TEDS, which is read back, is another one if
+    anyone else committed meanwhile.
+    """
+    if read is None or read.blocks.keys() - image.blocks.keys():
+        return None
+    return image
 
 
 def _report_written(station: Station, image: Image, known: NodeRecord, sequence: int) -> None:

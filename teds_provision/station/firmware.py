@@ -5,8 +5,10 @@ It does not affect the verdict, which covers only the datasheet: both are shown 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
@@ -113,10 +115,18 @@ class FirmwareDemands:
         if profile not in self._read:
             try:
                 folders = teds.profile.default_folders(self.home)
-                self._read[profile] = teds.profile.load_profile(profile, folders).firmware
-            except (NotFoundError, BadDataError, StoreError):
-                self._read[profile] = None
+                path = teds.profile.find_profile(profile, folders)
+                demand = _demand(path, folders, path.stat().st_mtime_ns, int(time.monotonic()))
+            except (NotFoundError, BadDataError, StoreError, OSError):
+                demand = None
+            self._read[profile] = demand
         return self._read[profile]
+
+
+@lru_cache(maxsize=64)  # two hundred nodes of one type that come together are asked about one by one
+def _demand(path: Path, folders: tuple[Path, ...], _changed: int, _second: int) -> FirmwareDemand | None:
+    """Read what a profile demands of the firmware; again each second, as the profiles that it extends may change."""
+    return teds.profile.load_profile(path, folders).firmware
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ def test_a_node_that_refuses_at_the_last_of_all_attempts_is_told_as_such(station
     link = MemoryLink(board, tamper=drop_session)
     with talk(board, link) as node:
         require_session(station, node)
-        present = NodeSnapshot(Image(board.uuid, signed.unsigned_blocks()), frozenset(), board.tim.identity())
+        present = NodeSnapshot(Image(board.uuid, signed.unsigned_blocks()), board.tim.identity(), lambda _block: False)
         with pytest.raises(NodeRefusedError) as refused:
             write(station, node, signed, present=present)
     assert (lost, refused.value.reason) == (0, Reason.DIGEST_MISMATCH)

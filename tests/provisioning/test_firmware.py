@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from teds_provision import teds
 from teds_provision.doctor.checks import System
 from teds_provision.doctor.fleet import nodes
 from teds_provision.protocol.messages.firmware import ABOUT, FirmwareFlag, FirmwareReport
@@ -32,7 +35,7 @@ from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, add_to_whitelist, provision
 from teds_provision.provisioning.verify_node import verify_at_node
-from teds_provision.station.firmware import FirmwareReading, firmware_of, state_of
+from teds_provision.station.firmware import FirmwareDemands, FirmwareReading, firmware_of, state_of
 from teds_provision.station.station import Station
 from teds_provision.teds.profile.firmware import FirmwareDemand
 from tests.bench import Board, MemoryLink, contact
@@ -308,3 +311,29 @@ def test_it_costs_identify_one_more_round_trip(
     with_it = exchanges()
     monkeypatch.setattr(commands, "read_firmware", lambda _node, *, once: None)
     assert with_it == exchanges() + 1
+
+
+def test_a_type_is_read_once_for_all_nodes_that_come_together_and_again_when_it_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of two hundred nodes read three files of TOML, three times: a sixth of what the station had to do."""
+    read: list[object] = []
+    plain = teds.profile.load_profile
+
+    def counted(*words: Any) -> Any:
+        read.append(words)
+        return plain(*words)
+
+    monkeypatch.setattr(teds.profile, "load_profile", counted)
+    monkeypatch.setattr("teds_provision.station.firmware.time.monotonic", lambda: 7.5)
+    file = tmp_path / "type.toml"
+    file.write_text(f'extends = "{ANGLE}"\n[firmware]\ntext = "nrf/angle"\n')
+    found = [FirmwareDemands(tmp_path).of(str(file)) for _ in range(20)]
+    assert len(read) == 1
+    assert {demand.text for demand in found if demand is not None} == {"nrf/angle"}
+    file.write_text(f'extends = "{ANGLE}"\n[firmware]\ntext = "nrf/other"\n')
+    os.utime(file, ns=(1, 1))
+    demand = FirmwareDemands(tmp_path).of(str(file))
+    assert demand is not None
+    assert demand.text == "nrf/other"
+    assert FirmwareDemands(tmp_path).of(str(tmp_path / "none.toml")) is None
