@@ -92,11 +92,11 @@ def store_file(system: System) -> Iterator[Finding]:
         yield Finding("store file", "failed", why, "teds-provision restore FILE (a backup)")
 
 
-def _firmware(station: Station) -> tuple[list[bytes], list[bytes]]:
+def _firmware(station: Station, sample: RowSample) -> tuple[list[bytes], list[bytes]]:
     """Return the nodes whose firmware their type does not accept, and those that another image runs on than before."""
     demands = FirmwareDemands(station.home)
     odd, changed = [], []
-    for page in chunks(station.firmware_reports.all()):
+    for page in chunks(station.firmware_reports.all(sample)):
         nodes = station.nodes.get_many([record.uuid for record in page])
         for record in page:
             node = nodes.get(record.uuid)
@@ -113,19 +113,25 @@ def nodes(system: System) -> Iterator[Finding]:
     """Report what needs an operator: ended calibrations, duplicate names, drafts, unverified nodes, rotations."""
     if not has_store(system.home):
         return
+    sample = RowSample(full=system.full)
     with Station.inspect(system.home) as station:
-        tally = station.overview.waiting(datetime.now(UTC).strftime("%Y-%m-%d"))
+        tally = station.overview.waiting(datetime.now(UTC).strftime("%Y-%m-%d"), sample)
         due = station.keys.rotations_due()
-        odd, changed = _firmware(station)
+        odd, changed = _firmware(station, sample)
     begins = {uuid: deferred_until(why) or "" for uuid, why in due.items()}
     later = tuple(uuid for uuid in tally.rotations if begins.get(uuid, "") > utc_now())
     own = tuple(uuid for uuid in tally.rotations if uuid not in later)
     first = min((begins[uuid] for uuid in later), default="")
+    among = f" (of the {SAMPLED:,} keyed last)" if sample.sampled else ""
     rows = [
         (tally.overdue, "with an expired calibration", "teds-provision nodes --due 0"),
-        (tally.twice, "with a name that another node has", "Give them different names: build UUID --name, sign, write"),
+        (
+            tally.twice,
+            f"with a name that another node has{among}",
+            "Give them different names: build UUID --name, sign, write",
+        ),
         (tally.drafts, "with a datasheet that was built but not written", "teds-provision draft list"),
-        (tally.unverified, "keyed but never verified", "teds-provision verify UUID"),
+        (tally.unverified, f"keyed but never verified{among}", "teds-provision verify UUID"),
         (odd, "with firmware that their type does not accept", "teds-provision update UUID IMAGE"),
         (changed, "whose firmware changed since calibration", "Calibrate again, or: verify UUID --accept-firmware"),
         (own, "whose key must be rotated", "Open a session once: teds-provision verify UUID"),
@@ -139,8 +145,12 @@ def nodes(system: System) -> Iterator[Finding]:
         if uuids:
             some = ", ".join(uuid.hex() for uuid in uuids[:_SHOWN]) + (" …" if len(uuids) > _SHOWN else "")
             yield Finding("nodes", "warning", f"{len(uuids)} {what}: {some}.", fix)
+    part = f"names, verdicts and firmware were looked at of the {SAMPLED:,} nodes keyed last and of some others"
     if not any(uuids for uuids, _, _ in rows):
-        yield Finding("nodes", "ok", "No node needs attention.")
+        whole = "No node needs attention"
+        yield intact("nodes", whole, f"{whole}; {part}", sample)
+    elif sample.sampled:
+        yield intact("nodes", "", f"{part[0].upper()}{part[1:]}", sample)
 
 
 @check("seals", "store")

@@ -9,7 +9,7 @@ from typing import Any
 from teds_provision.station.row_macs import MacRow, RowMacs, Values
 from teds_provision.station.store.database import places
 from teds_provision.station.store.records import FirmwareRecord, utc_now
-from teds_provision.station.store.row_sample import RowSample
+from teds_provision.station.store.row_sample import ALL_ROWS, RowSample
 from teds_provision.station.store.store import Store
 
 
@@ -28,9 +28,13 @@ class FirmwareReports:
         found = self._store.read(_record, f"SELECT * FROM firmware WHERE uuid IN ({places(uuids)})", uuids)
         return {record.uuid: record for record in found if self._counts(record)}
 
-    def all(self) -> Iterator[FirmwareRecord]:
-        """Yield what every node last reported, by UUID; what another program wrote does not count."""
-        found = self._store.read(_record, "SELECT * FROM firmware ORDER BY uuid")
+    def all(self, sample: RowSample | None = None) -> Iterator[FirmwareRecord]:
+        """Yield what every node last reported, by UUID, or those in ``sample``.
+
+        What another program wrote does not count.
+        """
+        rows = ALL_ROWS if sample is None else sample.rows(self._store, "firmware")
+        found = self._store.read(_record, f"SELECT * FROM firmware WHERE {rows} ORDER BY uuid")
         return (record for record in found if self._counts(record))
 
     def keep(self, uuid: bytes, report: bytes, *, in_session: bool, signed: bool = False) -> FirmwareRecord:

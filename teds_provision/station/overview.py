@@ -12,6 +12,7 @@ from typing import Any
 from teds_provision.station.datasheets import unpacked
 from teds_provision.station.store.database import PAGE, places
 from teds_provision.station.store.records import UUID_OCTETS
+from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 from teds_provision.teds.origin import ORIGIN, Origin, origin_of
 
@@ -20,6 +21,22 @@ _KNOWN = f"({' UNION '.join(f'SELECT uuid FROM {table}' for table in _TABLES)})"
 # table by table: SQLite would put the whole of _KNOWN together before it looks for one
 _IS_KNOWN = " OR ".join(f"EXISTS (SELECT 1 FROM {table} WHERE uuid = ?1)" for table in _TABLES)
 _NAME = "coalesce(n.name, w.name, '')"
+_NAMES_TWICE = "SELECT name FROM nodes WHERE name IS NOT NULL GROUP BY name HAVING count(*) > 1"
+_OTHERS_NAMES = (
+    "SELECT n.name FROM ({}) k JOIN nodes n ON n.uuid = k.uuid WHERE n.name IS NOT NULL"
+    " AND EXISTS (SELECT 1 FROM nodes o WHERE o.name = n.name AND o.uuid <> n.uuid)"
+)
+_UNVERIFIED = (
+    "SELECT uuid FROM keys WHERE state = 'active' EXCEPT SELECT uuid FROM readings WHERE c IS NOT NULL"
+    " EXCEPT SELECT uuid FROM nodes WHERE retired IS NOT NULL EXCEPT SELECT uuid FROM tombstones"
+    " EXCEPT SELECT uuid FROM revocations ORDER BY uuid"  # tables in the order of their key: one merge
+)
+_UNVERIFIED_OF = (
+    "SELECT uuid FROM ({}) k WHERE NOT EXISTS (SELECT 1 FROM readings WHERE uuid = k.uuid AND c IS NOT NULL)"
+    " AND NOT EXISTS (SELECT 1 FROM nodes WHERE uuid = k.uuid AND retired IS NOT NULL)"
+    " AND NOT EXISTS (SELECT 1 FROM tombstones WHERE uuid = k.uuid)"
+    " AND NOT EXISTS (SELECT 1 FROM revocations WHERE uuid = k.uuid) ORDER BY uuid"  # a look-up each: few are asked for
+)
 
 
 @dataclass(frozen=True)
@@ -83,24 +100,24 @@ class Overview:
         for first in range(0, len(uuids), PAGE):
             yield from self._page(uuids[first : first + PAGE])
 
-    def waiting(self, today: str) -> WaitingNodes:
-        """Return the nodes that wait for an operator; ``today`` is a day, ISO 8601."""
+    def waiting(self, today: str, sample: RowSample) -> WaitingNodes:
+        """Return the nodes that wait for an operator; ``today`` is a day, ISO 8601.
+
+        With a ``sample`` of many nodes only those keyed last are compared by name, and with what was verified.
+        """
 
         def some(statement: str, *values: Any) -> tuple[bytes, ...]:
             return tuple(bytes(uuid) for (uuid,) in self._store.execute(statement, values))
 
+        newest = sample.newest_keyed(self._store)
         return WaitingNodes(
             some("SELECT uuid FROM nodes WHERE due < ? ORDER BY due, uuid", today),
             some(
-                "SELECT uuid FROM nodes WHERE name IN"
-                " (SELECT name FROM nodes WHERE name IS NOT NULL GROUP BY name HAVING count(*) > 1) ORDER BY name, uuid"
+                f"SELECT uuid FROM nodes WHERE name IN ({_OTHERS_NAMES.format(newest) if newest else _NAMES_TWICE})"
+                " ORDER BY name, uuid"
             ),
             some("SELECT uuid FROM drafts ORDER BY uuid"),
-            some(
-                "SELECT uuid FROM keys WHERE state = 'active' EXCEPT SELECT uuid FROM readings WHERE c IS NOT NULL"
-                " EXCEPT SELECT uuid FROM nodes WHERE retired IS NOT NULL EXCEPT SELECT uuid FROM tombstones"
-                " EXCEPT SELECT uuid FROM revocations ORDER BY uuid"  # tables in the order of their key: one merge
-            ),
+            some(_UNVERIFIED_OF.format(newest) if newest else _UNVERIFIED),
             some("SELECT uuid FROM marks WHERE rotation IS NOT NULL ORDER BY uuid"),
         )
 

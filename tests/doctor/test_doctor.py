@@ -38,6 +38,7 @@ from teds_provision.station.store import (
     WhitelistEntry,
     row_sample,
 )
+from teds_provision.station.store.database import Database
 from teds_provision.teds.image import Image
 from teds_provision.vault import forget_vaults
 from tests.bench import PASSPHRASE, make_station
@@ -550,6 +551,54 @@ def test_of_a_large_store_a_sample_is_checked_and_said_to_be_one(crowded: System
     assert all("--full" in finding.why for finding in look(crowded, "seals"))
     whole = replace(crowded, full=True)
     assert verdicts(whole) == dict.fromkeys(("store", "audit log", "seals"), ("ok", False))
+
+
+def steps_of(system: System, monkeypatch: pytest.MonkeyPatch) -> int:
+    """Instructions that SQLite runs for the checks of the store, in tens."""
+    counted, begin = [0], Database.__init__
+
+    def count() -> int:
+        counted[0] += 1
+        return 0
+
+    def watched(database: Database, path: Path, connection: sqlite3.Connection) -> None:
+        begin(database, path, connection)
+        connection.set_progress_handler(count, 10)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Database, "__init__", watched)
+        for name in ("store", "nodes", "seals"):
+            assert all(finding.result != "failed" for finding in look(system, name))
+    return counted[0]
+
+
+def test_what_a_check_reads_does_not_grow_with_the_nodes(crowded: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    few, whole = steps_of(crowded, monkeypatch), replace(crowded, full=True)
+    full = steps_of(whole, monkeypatch)
+    with Station.open(crowded.home, ask=lambda prompt, confirm: PASSPHRASE) as station, station.transaction():
+        station.unlock()
+        for number in range(100, 700):
+            uuid = number.to_bytes(2) * 5
+            station.pins.put(WhitelistEntry(uuid, f"{number:064x}", name=f"node {number}"))
+            station.nodes.put(NodeRecord(uuid, None, f"node {number}", None, 1, 0, 0))
+            station.keys.add(KeyRecord(uuid, 1, "ab" * 8, "active", 1, b"wrapped"))
+            station.audit("verify", uuid, "authentic")
+    assert steps_of(crowded, monkeypatch) < 1.5 * few
+    assert steps_of(whole, monkeypatch) > 5 * full
+
+
+def test_nodes_without_a_key_are_sampled_too(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(row_sample, "SAMPLED", 20)
+    monkeypatch.setattr(row_sample, "_RUN", 5)
+    forget_vaults()
+    with Station.open(stationed.home, ask=lambda prompt, confirm: PASSPHRASE) as station, station.transaction():
+        station.unlock()
+        for number in range(60):
+            station.pins.put(WhitelistEntry(bytes([number]) * 10, f"{number:064x}"))
+    system = replace(stationed, ask=lambda prompt, confirm: PASSPHRASE)
+    assert verdicts(system)["seals"] == ("ok", True)
+    changed_in(stationed.home, "UPDATE whitelist SET fingerprint = 'ff' WHERE uuid > x'05'")
+    assert verdicts(system)["seals"][0] == "failed"
 
 
 def test_what_another_program_did_to_the_newest_is_always_found(crowded: System) -> None:

@@ -1,14 +1,16 @@
 """Which rows of a large table a check reads: the newest and some at random, so that its time does not grow with them.
 
-A row that another program changed in a table of n rows is found with a probability of ``SAMPLED / n`` by each run; a
-pin, a key or a CA is checked whenever it is used anyway.
+Nothing here counts or reads a whole large table. A row of a node with a key, or of a table with numbers, that another
+program changed is found with a probability of half of ``SAMPLED / n`` at least by each run; other rows as their keys
+are spread. A pin, a key or a CA is checked whenever it is used anyway.
 """
 
 from __future__ import annotations
 
 import json
 import random
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from teds_provision.station.store.database import Database
@@ -18,7 +20,7 @@ SAMPLED: Final = 5_000
 ALL_ROWS: Final = "1"
 _NEWEST: Final = 500
 _RUN: Final = 50
-"""Entries of a log that are read in one go, from a random one on."""
+"""Rows or entries of a log that are read in one go, from a random one on."""
 
 
 class RowSample:
@@ -31,26 +33,57 @@ class RowSample:
         """True once a table was too large to be read whole."""
 
     def rows(self, store: Database, table: str, key: str = "uuid") -> str:
-        """Return the condition in SQL for the rows of ``table`` to read, whose key are these columns.
+        """Return the condition in SQL for the rows of ``table`` to read, whose primary key begins with this column.
 
-        Of a table that lists nodes, the nodes keyed last are always among them.
+        Of a table that lists nodes: the nodes keyed last, others with a key at random, and runs of neighbours that
+        begin anywhere, as a node may have no key.
         """
-        counted = None if self.full else store.one(f"SELECT count(*) FROM {table}")
-        if counted is None or counted[0] <= SAMPLED:
+        if not self._is_large(store, table):
             return ALL_ROWS
         self.sampled = True
-        chosen = f"SELECT {key} FROM {table} WHERE (random() & 0x7fffffffffff) % {counted[0]} < {SAMPLED}"
+        chosen = set(_runs(store, table, [key], SAMPLED // 2))
         if key == "uuid":
-            chosen += f" UNION SELECT uuid FROM (SELECT uuid FROM keys ORDER BY seq DESC LIMIT {_NEWEST})"
-        return f"({key}) IN ({chosen})"
+            keyed = f"SELECT uuid FROM keys WHERE {self._numbers(store, 'keys', SAMPLED // 2)}"
+            chosen.update(uuid for (uuid,) in store.execute(keyed))
+        return f"{key} IN ({_listed(chosen)})"
+
+    def newest_keyed(self, store: Database) -> str:
+        """Return a query in SQL for the nodes that were keyed last, "" if there are few and all are meant."""
+        if not self._is_large(store, "keys"):
+            return ""
+        self.sampled = True
+        return f"SELECT uuid FROM keys WHERE state = 'active' ORDER BY seq DESC LIMIT {SAMPLED}"
+
+    def row_runs(self, store: Database, table: str, key: Sequence[str]) -> bool:
+        """Read runs of rows of a large table without numbers, whose primary key are these columns, each row whole.
+
+        False, and nothing is read, if it is not large.
+        """
+        if not self._is_large(store, table):
+            return False
+        self.sampled = True
+        for _ in _runs(store, table, key, SAMPLED, whole=True):
+            pass
+        return True
+
+    def _is_large(self, store: Database, table: str) -> bool:
+        """Return True if a table has more rows than are read; counts no further."""
+        if self.full:
+            return False
+        counted = store.one(f"SELECT count(*) FROM (SELECT 1 FROM {table} LIMIT {SAMPLED + 1})")
+        return counted is not None and counted[0] > SAMPLED
 
     def numbered_rows(self, store: Database, table: str) -> str:
         """Return what :meth:`rows` does for a table whose rows have numbers (SQLite's rowid); reads nothing else."""
+        numbers = self._numbers(store, table, SAMPLED)
+        self.sampled |= numbers != ALL_ROWS
+        return numbers
+
+    def _numbers(self, store: Database, table: str, count: int) -> str:
         last = None if self.full else store.one(f"SELECT max(rowid) FROM {table}")
         if last is None or (last[0] or 0) <= SAMPLED:
             return ALL_ROWS
-        self.sampled = True
-        numbers = [*random.sample(range(1, last[0] + 1), SAMPLED), *range(last[0] - _NEWEST, last[0] + 1)]
+        numbers = [*random.sample(range(1, last[0] + 1), count), *range(last[0] - _NEWEST, last[0] + 1)]
         return f"rowid IN (SELECT value FROM json_each('{json.dumps(numbers)}'))"
 
     def runs(self, count: int) -> list[tuple[int, int]]:
@@ -61,3 +94,54 @@ class RowSample:
         older = count - SAMPLED
         starts = sorted(random.sample(range(1, older - _RUN + 2), SAMPLED // _RUN))
         return [*((first, first + _RUN - 1) for first in starts), (older + 1, count)]
+
+
+def _runs(store: Database, table: str, key: Sequence[str], count: int, *, whole: bool = False) -> Iterator[Any]:
+    """Yield so many rows in runs of neighbours that begin at random, and the last run: the key's first column of each.
+
+    A start is drawn between the first and the last value of each column of the key in turn, not among the rows, which
+    nobody has counted. So rows that are close together by their key are read as one run or not at all.
+    """
+    columns, what = ", ".join(key), "*" if whole else key[0]
+    places = ", ".join("?" * len(key))
+    after = f"SELECT {what} FROM {table} WHERE ({columns}) >= ({places}) ORDER BY {columns} LIMIT {_RUN}"
+    for _ in range(max(1, count // _RUN)):
+        yield from (row[0] for row in store.execute(after, _drawn(store, table, key)))
+    last = ", ".join(f"{column} DESC" for column in key)
+    yield from (row[0] for row in store.execute(f"SELECT {what} FROM {table} ORDER BY {last} LIMIT {_RUN}"))
+
+
+def _drawn(store: Database, table: str, key: Sequence[str]) -> list[Any]:
+    """Return the values of a key that is there, drawn column by column."""
+    values: list[Any] = []
+    for column in key:
+        fixed = "".join(f"{name} = ? AND " for name in key[: len(values)])
+        ends = [
+            store.one(f"SELECT {column} FROM {table} WHERE {fixed}1 ORDER BY {column} {way} LIMIT 1", values)
+            for way in ("ASC", "DESC")
+        ]
+        first, last = (end[0] if end is not None else None for end in ends)
+        found = store.one(
+            f"SELECT {column} FROM {table} WHERE {fixed}{column} >= ? ORDER BY {column} LIMIT 1",
+            [*values, _between(first, last)],
+        )
+        values.append(found[0] if found is not None else last)
+    return values
+
+
+def _between(first: Any, last: Any) -> Any:
+    """Return a random value from ``first`` to ``last``, in the order of SQLite: both integers, blobs or texts."""
+    if isinstance(first, int):
+        return random.randint(first, last)
+    if isinstance(first, str):
+        try:
+            return _between(bytes.fromhex(first), bytes.fromhex(last)).hex()  # of other characters none is a key
+        except ValueError:
+            return _between(first.encode(), last.encode()).decode(errors="ignore")
+    size = max(len(first), len(last))
+    low, high = int.from_bytes(first.ljust(size, b"\0")), int.from_bytes(last.ljust(size, b"\xff"))
+    return random.randint(low, high).to_bytes(size)
+
+
+def _listed(values: Iterable[bytes]) -> str:
+    return ", ".join(f"x'{value.hex()}'" for value in values)

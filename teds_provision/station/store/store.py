@@ -91,16 +91,15 @@ class Store(Database):
         return None if found == "ok" else found
 
     def _spot_check(self, sample: RowSample) -> str:
-        """Return what SQLite finds, "ok" if nothing; of a large table with numbered rows, only read the sample.
-
-        Choosing rows at random in a table whose rows have no numbers takes as long as checking it.
-        """
+        """Return what SQLite finds, "ok" if nothing; of a large table, only read the sample."""
         tables = self.execute("SELECT name, wr FROM pragma_table_list WHERE schema = 'main' AND type = 'table'")
         for table, without_numbers in tables:
-            rows = ALL_ROWS if without_numbers else sample.numbered_rows(self, table)
-            if rows != ALL_ROWS:
+            if without_numbers:
+                key = f"SELECT name FROM pragma_table_info('{table}') WHERE pk ORDER BY pk"
+                large = sample.row_runs(self, table, [name for (name,) in self.execute(key)])
+            elif large := (rows := sample.numbered_rows(self, table)) != ALL_ROWS:
                 self.execute(f"SELECT * FROM {table} WHERE {rows}")
-            elif (found := self._checked(f"'{table}'")) != "ok":
+            if not large and (found := self._checked(f"'{table}'")) != "ok":
                 return found
         return "ok"
 
