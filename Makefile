@@ -35,14 +35,16 @@ types: $(VENV)/.dev
 	$(BIN)/mypy
 
 # Three times the cores: half of the time that a test takes is waiting for a node, a reader, a lock (4 on two cores: 47 %).
-# What holds a rule about time then runs two at a time: it waits for five sixths of its time.
+# What holds a rule about time then runs three at a time: it waits for three quarters of its time.
 WORKERS ?= 6
+PUNCTUAL ?= 3
 USUAL := not soak and not machine and not rclpy and not nightly
 # Of what fails, up to three tests that run other processes get a second try, alone (tests/second_try.py).
 unit: $(VENV)/.dev
 	@mkdir -p build && rm -f build/not-tested build/second-tries
 	$(BIN)/python -m tests.second_try -n $(WORKERS) --dist worksteal -rs --hypothesis-profile=gate -m '$(USUAL) and not realtime'
-	$(BIN)/python -m tests.second_try -n 2 --dist worksteal -rsR -m '$(USUAL) and realtime'
+	$(BIN)/python -m tests.second_try -n $(PUNCTUAL) --dist worksteal -rsR -m '$(USUAL) and realtime' \
+	  $$(grep -rl --include='test_*.py' 'mark\.realtime' tests)
 	@cat build/not-tested build/second-tries 2>/dev/null || true
 
 # Every test module compiled once, its asserts rewritten, beside mypy: the workers begin together, and each would do it for

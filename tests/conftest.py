@@ -24,7 +24,7 @@ from hypothesis import HealthCheck, settings
 from teds_provision.station.station import Station
 from tests.bench import Board, make_station
 from tests.firmware.c_node import OFFERS
-from tests.nightly import REFUSED, refusals
+from tests.nightly import REFUSED, UNNAMED, refusals
 from tests.passphrase_costs import lower_costs
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -95,16 +95,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """
     if not any("::" in word for word in config.args):  # files are collected whole
         config.stash[REFUSED] = refusals(items)
+    timed: set[Path] = set()
     items[:] = [item for item in items if not _in_c(item) or _needed(item) <= OFFERS]
     for item in items:
         if item.get_closest_marker("realtime"):
             item.add_marker(pytest.mark.flaky(reruns=2))
+            timed.add(item.path)
+    config.stash[UNNAMED] = [path for path in timed if "mark.realtime" not in path.read_text(encoding="utf-8")]
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_finish() -> None:
     """Leave what the collection made out of garbage collections: 300 MB of it, and none of it ends before the run."""
-    gc.collect()
     gc.freeze()
 
 

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import pytest
 
 OUTSIDE = ("nightly", "soak", "machine", "rclpy")
 REFUSED = pytest.StashKey[list[str]]()
+UNNAMED = pytest.StashKey[list[Path]]()
+"""Files with tests marked realtime in which the mark does not stand: make unit finds them by it."""
 _ID = re.compile(r"tests/[\w/]+\.py::\w+(?:\[[^\]]*\])?")
 
 
@@ -28,18 +31,19 @@ def refusals(items: Sequence[pytest.Item]) -> list[str]:
 
     An id without brackets stands for all cases of its test, of which one at least is in the gate.
     """
-    files = {item.nodeid.partition("::")[0] for item in items}
-    gate = [item.nodeid for item in items if not any(item.get_closest_marker(mark) for mark in OUTSIDE)]
+    marked = [(item.nodeid, reason, _ID.findall(reason)) for item in items for reason in reasons(item)]
+    named = {name.partition("[")[0] for _, _, names in marked for name in names}
+    holders = [item for item in items if item.nodeid.partition("[")[0] in named]
+    gate = [item.nodeid for item in holders if not any(item.get_closest_marker(mark) for mark in OUTSIDE)]
     there = {*gate, *(name.partition("[")[0] for name in gate)}
+    files = {item.nodeid.partition("::")[0] for item in items}
     wrong = []
-    for item in items:
-        for reason in reasons(item):
-            names = _ID.findall(reason)
-            if not names or not reason.startswith(names[0]):
-                wrong.append(f"{item.nodeid}: the reason of its mark nightly begins with no test")
-            wrong += [
-                f"{item.nodeid}: its rule is not held in the gate by {name}"
-                for name in names
-                if name not in there and name.partition("::")[0] in files
-            ]
+    for test, reason, names in marked:
+        if not names or not reason.startswith(names[0]):
+            wrong.append(f"{test}: the reason of its mark nightly begins with no test")
+        wrong += [
+            f"{test}: its rule is not held in the gate by {name}"
+            for name in names
+            if name not in there and name.partition("::")[0] in files
+        ]
     return wrong

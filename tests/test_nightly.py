@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.nightly import REFUSED, refusals
+from tests.nightly import REFUSED, UNNAMED, refusals
 
 
 class Invented(pytest.Item):
@@ -26,6 +26,11 @@ def suite(request: pytest.FixtureRequest) -> list[pytest.Item]:
 def test_each_test_that_is_out_of_the_gate_names_one_in_it(request: pytest.FixtureRequest) -> None:
     """Of all that this run collected."""
     assert not request.config.stash.get(REFUSED, [])
+
+
+def test_each_file_with_a_test_marked_realtime_has_the_mark_in_its_text(request: pytest.FixtureRequest) -> None:
+    """``make unit`` collects those files alone for rules about time: a collection of all takes 6 s of CPU."""
+    assert request.config.stash[UNNAMED] == []
 
 
 @pytest.mark.parametrize(
