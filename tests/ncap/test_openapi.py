@@ -13,13 +13,16 @@ import pytest
 
 from teds_provision.api.operations import OPERATIONS, document
 from teds_provision.client import ApiError, Client
-from teds_provision.ncap.daemon import Daemon
-from teds_provision.ncap.web.resources import Resources
+from teds_provision.ncap.service_part import KINDS
+from teds_provision.ncap.web.resources import Resources, routes_of_parts
 from tests.ncap.service import Service
 
 
+@pytest.mark.needs_room("plant")
 def test_every_route_is_described_and_nothing_else() -> None:
-    routes = Resources(cast("Daemon", None)).routes()
+    nothing = cast("Any", None)
+    parts = [kind.make(nothing, nothing, list) for kind in KINDS.parts()]
+    routes = [*Resources(nothing).routes(), *routes_of_parts(parts)]
     there = {
         (method, re.sub(r":\w+}", "}", route.path))
         for route in routes

@@ -17,8 +17,8 @@ from in_toto_attestation.v1.statement import Statement
 from securesystemslib.dsse import Envelope
 from securesystemslib.signer import SSlibKey
 
-from teds_provision.cli.plant import line as line_command
 from teds_provision.errors import BadDataError, NodeSilentError, NotAuthenticError, TedsProvisionError
+from teds_provision.plant.commands import line as line_command
 from teds_provision.plant.evidence import sign_evidence
 from teds_provision.plant.line import _firmware_in_session
 from teds_provision.plant.verify_evidence import JudgedEvidence

@@ -25,7 +25,7 @@ from teds_provision.ncap.web import metrics, simulation, wot
 from teds_provision.ncap.web.answers import ASKED, answer_bug, answer_error, answer_refusal, changing
 from teds_provision.ncap.web.clause12 import Clause12
 from teds_provision.ncap.web.guard import CALLER, SAFE, Caller, RequestRefusedError
-from teds_provision.ncap.web.resources import Resources
+from teds_provision.ncap.web.resources import Resources, routes_of_parts
 from teds_provision.ncap.web.tokens import Tokens
 from teds_provision.shapes.problem import Error, Problem
 
@@ -46,6 +46,7 @@ def build(daemon: Daemon) -> Starlette:
             API,
             routes=[
                 *Resources(daemon).routes(),
+                *routes_of_parts(daemon.parts.values()),
                 WebSocketRoute("/live", _live(daemon)),
                 WebSocketRoute("/virtual/{name}/source", simulation.feeding(daemon, _watched(daemon))),
                 Route("/{rest:path}", _nothing),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -32,6 +32,7 @@ from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.measurement_supervisor import LONGEST_LOAN, NodeLoan
 from teds_provision.ncap.nodes.directory import for_reader
 from teds_provision.ncap.nodes.update_actions import UpdateRequest
+from teds_provision.ncap.service_part import ServicePart
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.answers import body_of, changing, moving, reading
 from teds_provision.ncap.web.guard import CALLER, Caller
@@ -58,11 +59,6 @@ class Resources:
         return [
             Route("/status", self.status),
             Route("/detection", self.detection, methods=["GET", "PUT"]),
-            *(
-                Route(path, _of_part(answer))
-                for part in self._daemon.parts.values()
-                for path, answer in part.resources().items()
-            ),
             Route("/discover", self.discover, methods=["POST"]),
             Route("/nodes", self.nodes),
             Route("/nodes/{uuid}", self.node),
@@ -453,6 +449,11 @@ class Resources:
             raise NotFoundError(f"{uuid} is not a virtual transducer of this station.")
         await changing(self._daemon.drop_virtual, uuid)
         return JSONResponse({"virtual": self._daemon.virtuals.all()})
+
+
+def routes_of_parts(parts: Iterable[ServicePart]) -> list[Route]:
+    """Return the paths below /api/v1 that optional rooms bring."""
+    return [Route(path, _of_part(answer)) for part in parts for path, answer in part.resources().items()]
 
 
 def _of_part(answer: Callable[[Request], Awaitable[dict[str, Any]]]) -> Handler:
