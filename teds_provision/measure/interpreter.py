@@ -21,6 +21,10 @@ from teds_provision.teds.calibration.vectorized import ManyChannels
 from teds_provision.teds.sheet import Sheet
 
 NODE_SAYS_SO = "the node marks them as invalid"
+QUICK, BLOCKS = 20, 64
+"""Messages a second from which all values of a stream are calibrated beforehand, and after how many of its blocks: the
+first value does not wait for that, and two hundred slow nodes have no table of half a megabyte each."""
+_SECOND = 1_000_000_000
 
 
 class StreamInterpreter:
@@ -63,6 +67,8 @@ class StreamInterpreter:
 
         usable = [interpreter.channel.number not in self.problems for interpreter in self._channels]
         self._many = ManyChannels.side_by_side(self._channels, usable)
+        quick = self._period * self._n * QUICK <= _SECOND
+        self._until_calibrated = BLOCKS if quick else 0
         self._invalid: dict[tuple[int, str], int] = {}
 
     @property
@@ -169,6 +175,10 @@ class StreamInterpreter:
     def _values(self, octets: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return raw values, values (NaN where not valid), and validity of the instants in messages."""
         if self._many is not None:
+            if self._until_calibrated:
+                self._until_calibrated -= 1
+                if not self._until_calibrated:
+                    self._many.calibrate_all()
             raws = self._many.raw(octets)
             return raws, *self._many.values(raws)
         rows = np.frombuffer(octets, dtype=np.uint8).reshape(-1, self._row)

@@ -20,13 +20,14 @@ from teds_provision.links.can.isotp import Frame
 from teds_provision.links.streaming import MeasuringLink
 from teds_provision.measure.blocks import Block
 from teds_provision.measure.clock import ClockMap, Exchange, HostClock, MonotonicStamps, WallClock
-from teds_provision.measure.interpreter import StreamInterpreter
+from teds_provision.measure.interpreter import BLOCKS, StreamInterpreter
 from teds_provision.measure.stream_receiver import GATHER, ReceivedStream, StreamReceiver
 from teds_provision.protocol.operation.can_frames import DataAddress, StreamAssembly, cut
 from teds_provision.protocol.operation.datagram import DatagramSealer, stream_key
 from teds_provision.protocol.operation.stream_commands import StreamKind, SubscribeReply
 from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
 from teds_provision.teds.calibration import fit
+from teds_provision.teds.calibration.vectorized import ManyChannels
 from tests.pace import until
 from tests.teds.test_interpreter import sheet_of
 
@@ -229,3 +230,17 @@ def test_a_stream_that_is_forgotten_is_taken_no_more_by_its_link() -> None:
         hearing.register(0x21, 0, scene.heard)
         assert hearing.forget(0x21, 0) is scene.heard
         assert not port._streams.opened
+
+
+@pytest.mark.parametrize(("period", "quick"), [(MS, True), (100 * MS, False)])
+def test_all_values_are_calibrated_beforehand_only_for_a_stream_of_many_messages(
+    period: int, quick: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two milliseconds and half a megabyte for each of two hundred nodes, before its first value, for one a second."""
+    made: list[int] = []
+    scene = Scene(period=period)
+    monkeypatch.setattr(ManyChannels, "calibrate_all", lambda _many: made.append(len(scene.blocks)))
+    for counter in range(BLOCKS + 5):
+        scene.heard.whole(scene.message(counter), scene.arrival(counter))
+        scene.heard.finish()
+    assert made == ([BLOCKS - 1] if quick else [])

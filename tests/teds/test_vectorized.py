@@ -91,7 +91,11 @@ def test_every_value_that_a_channel_can_have_is_calibrated_beforehand(number: in
     many = ManyChannels.side_by_side([one], [True])
     assert many is not None
     octets = np.arange(65536).astype(">u2")
+    computed = many.values(many.raw(octets.tobytes()))
+    many.calibrate_all()
     value, valid = many.values(many.raw(octets.tobytes()))
+    np.testing.assert_array_equal(valid, computed[1])
+    np.testing.assert_array_equal(value, computed[0])
     alone = one.values(one.reader.raw(octets.view(np.uint8).reshape(-1, 2)))
     assert 0 < np.count_nonzero(alone.valid) < 65536
     np.testing.assert_array_equal(valid[:, 0], alone.valid)
@@ -106,6 +110,7 @@ def test_channels_of_8_bits_are_looked_up_each_in_its_own(raw: list[list[int]], 
     channels = [ChannelInterpreter(replace(known, channels=tuple(small)), number) for number in range(1, 5)]
     many = ManyChannels.side_by_side(channels, [True, True, True, last])
     assert many is not None
+    many.calibrate_all()
     octets = np.array(raw, dtype=np.uint8)
     value, valid = many.values(many.raw(octets.tobytes()))
     for column, interpreter in enumerate(channels):

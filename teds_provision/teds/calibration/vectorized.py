@@ -27,8 +27,8 @@ _FAR_FROM_OVERFLOW: Final = 1e100
 _MOST_SEGMENTS: Final = 64
 """Longer tables are searched channel by channel: here each boundary is compared."""
 _MOST_KNOWN: Final = 1 << 16
-"""Raw values of all channels together that are calibrated beforehand, half a megabyte: one channel of 16 bits, or 256
-of 8. Then a message is looked up, and its curves are not computed."""
+"""Raw values of all channels together that :meth:`ManyChannels.calibrate_all` calibrates, half a megabyte: one channel
+of 16 bits, or 256 of 8."""
 
 
 class ManyChannels:
@@ -75,11 +75,17 @@ class ManyChannels:
             largest = sum(np.abs(term).max() * reach**power for power, term in enumerate(self._terms))
         self._tame = bool(largest < _FAR_FROM_OVERFLOW)
         self._known: Floats | None = None
+
+    def calibrate_all(self) -> None:
+        """Calibrate every possible raw value, if they are few: from then on a message is looked up, in half the time.
+
+        That takes 2 ms and half a megabyte for a channel of 16 bits, so it is for a stream that has many messages.
+        """
         possible = 1 << 8 * self._width
-        if possible * len(self._columns) <= _MOST_KNOWN:
+        if self._known is None and possible * len(self._columns) <= _MOST_KNOWN:
             every = np.repeat(np.arange(possible)[:, None], len(self._columns), axis=1)
-            self._known = np.ascontiguousarray(self.values(every)[0].T).ravel()
             self._places = self._columns * possible if len(self._columns) > 1 else None
+            self._known = np.ascontiguousarray(self.values(every)[0].T).ravel()
 
     @staticmethod
     def _bare(row: Floats) -> Floats | float:
