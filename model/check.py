@@ -1,7 +1,7 @@
 """Check the models of a key's life and of the plant with SPIN: the rules hold, and each broken rule is found.
 
-Usage: python model/check.py [--quick]. Prints a line per run: what was tried, how many states, how long, and whether
-the outcome is the expected one; exits 1 where one is not, 2 where spin or a C compiler is missing.
+Usage: python model/check.py [--quick | --quicker]. Prints a line per run: what was tried, how many states, how
+long, and whether the outcome is the expected one; exits 1 if one is not, 2 if spin or a C compiler is missing.
 """
 
 from __future__ import annotations
@@ -101,6 +101,8 @@ HARMLESS = ("RECEIPT_ALL", "LATE", "MOVE_DUE", "IMPORT_TWICE", "EPOCH_UNCHECKED"
 """Rules of the code without which nothing goes wrong in the model, as another rule does the same (README)."""
 BY_TEST = {"M1", "LIFTED", "BACK_NO_ROTATION", "UNSETTLED", "M6", "PENDING", "LATE+MOVE_DUE", "HELD_BACK"}
 BY_TEST |= {"MOVE_ORDER", "EPOCH_BACK", "CONTINUED", "GIVEN_COMMIT", "SESSION", "ERASE"}
+"""Rules that ``--quick`` breaks, and those that ``--quicker`` breaks: one of each kind."""
+AT_THE_GATE = {"M1", "LIFTED", "EPOCH_BACK", "SESSION"}
 FOUND = [Run(bounds, rule) for bounds, rules in BROKEN.items() for rule in rules.split()]
 FOUND += [Run(bounds, rule) for bounds, rules in PLANT_BROKEN.items() for rule in rules.split()]
 PLANT_RUNS = [Run(PlantBounds(3)), Run(PlantBounds(2, owners=2))]
@@ -179,8 +181,10 @@ def main(arguments: list[str]) -> int:
         print(f"{' and '.join(missing)} missing: apt-get install spin gcc libc6-dev", file=sys.stderr)
         return 2
     wrong = 0
-    quick = "--quick" in arguments
-    found = [run for run in FOUND if run.broken in BY_TEST] if quick else FOUND
+    quicker = "--quicker" in arguments
+    quick = quicker or "--quick" in arguments
+    chosen = AT_THE_GATE if quicker else BY_TEST
+    found = [run for run in FOUND if run.broken in chosen] if quick else FOUND
     harmless = [] if quick else [Run(SMALL, rule) for rule in HARMLESS]
     small = [*SMALL_RUNS, *([] if quick else PLANT_RUNS), *found, *harmless]
     with ThreadPoolExecutor(os.cpu_count()) as pool:

@@ -16,8 +16,21 @@ pytestmark = [
 ]
 
 
-def test_a_cut_or_a_failing_disk_loses_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    acts = ("agree", "provision", "rotate", "move", "receipt")
+@pytest.mark.parametrize(
+    "acts",
+    [
+        ("agree", "provision", "rotate", "receipt"),
+        pytest.param(
+            ("move",),
+            marks=pytest.mark.nightly(
+                "tests/handover/test_handover_cut.py::test_an_export_cut_at_every_write,"
+                " tests/handover/test_move.py::test_a_first_contact_cut_anywhere_is_carried_on"
+            ),
+        ),
+    ],
+    ids=" ".join,
+)
+def test_a_cut_or_a_failing_disk_loses_nothing(capsys: pytest.CaptureFixture[str], acts: tuple[str, ...]) -> None:
     code = main(["--quick", "--jobs", "3", *(word for act in acts for word in ("--only", act))])
     told = capsys.readouterr().out
     assert code == 0, told

@@ -140,7 +140,9 @@ def _words(module: Module, tree: ast.stmt) -> frozenset[str]:
 
 def found(pattern: Pattern, where: list[Module]) -> list[Mutant]:
     """The places of a pattern: an expression, or a statement that is one expression; one, where all is well."""
-    wanted, told = ast.unparse(ast.parse(pattern.was, mode="eval")), f"{pattern.rule}: {pattern.was}  ->  {pattern.now}"
+    parsed = ast.parse(pattern.was, mode="eval")
+    kind, wanted = type(parsed.body), ast.unparse(parsed)
+    told = f"{pattern.rule}: {pattern.was}  ->  {pattern.now}"
     return [
         replace(
             module.mutant(node, pattern.now, function, told, _words(module, tree)), test=pattern.test, rule=pattern.rule
@@ -150,7 +152,7 @@ def found(pattern: Pattern, where: list[Module]) -> list[Mutant]:
         for function, tree in module.functions()
         if function == pattern.function
         for node in ast.walk(tree)
-        if isinstance(node, ast.expr) and ast.unparse(node) == wanted
+        if isinstance(node, kind) and ast.unparse(node) == wanted  # to unparse all would take twice as long
     ]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import math
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -18,8 +18,10 @@ _AFTER_THE_REST = ("tests/system/", "tests/page/", "tests/faults/", "tests/fuzz/
 class Suite:
     """The test files of the house, and how far each is from a module of the package."""
 
-    def __init__(self) -> None:
-        paths = [*(ROOT / "teds_provision").rglob("*.py"), *(ROOT / "tests").rglob("*.py")]
+    def __init__(self, tests: Sequence[str] = ("",)) -> None:
+        """``tests`` are the rooms of the tests that may be chosen: all, if none is named."""
+        of_tests = (path for room in tests for path in (ROOT / "tests" / room).rglob("*.py"))
+        paths = [*(ROOT / "teds_provision").rglob("*.py"), *of_tests]
         self._paths = {_dotted(path): path for path in paths}
         self._text = {name: path.read_text() for name, path in self._paths.items()}
 

@@ -51,7 +51,7 @@ def test_what_chance_draws_is_python_that_says_something_else(house: list[Module
 
 
 def test_the_nearest_tests_of_a_module_come_first(house: list[Module]) -> None:
-    tests = Suite()
+    tests = Suite(("provisioning", "ncap", "protocol", "station", "cli"))
 
     def first(name: str) -> list[str]:
         module = next(module for module in house if module.name == f"teds_provision/{name}")
