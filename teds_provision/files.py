@@ -217,7 +217,7 @@ def require_no_pipe(path: Path) -> None:
 
 
 def _is_named(path: Path) -> bool:
-    return not str(path).startswith(("/dev/", "/proc/"))
+    return not str(path).startswith(("/dev/fd/", "/dev/std", "/proc/"))
 
 
 @contextmanager

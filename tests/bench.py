@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
+import functools
+import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +31,29 @@ def make_station(home: Path, name: str = "bench") -> Station:
     """A station with a passphrase vault at the lowest cost."""
     costs = passphrase.THROWAWAY
     return initialise(home, name=name, keystore="file", ask=lambda prompt, confirm: PASSPHRASE, costs=costs)[0]
+
+
+@functools.cache
+def _template() -> Path:
+    """Return the home that this process copies: made at the first need, removed with the process."""
+    folder = tempfile.TemporaryDirectory()
+    atexit.register(folder.cleanup)
+    make_station(Path(folder.name) / "bench").close()
+    return Path(folder.name) / "bench"
+
+
+def copy_home(home: Path) -> None:
+    """Make the home of a station as ``make_station`` does, by a copy: a tenth of the CPU, and no wait for the disk.
+
+    Every copy has the same keys: a test that needs two owners makes the other one by ``make_station``.
+    """
+    shutil.copytree(_template(), home, dirs_exist_ok=True)
+
+
+def copied_station(home: Path) -> Station:
+    """A station with a passphrase vault at the lowest cost, by :func:`copy_home`."""
+    copy_home(home)
+    return Station.open(home, ask=lambda prompt, confirm: PASSPHRASE)
 
 
 @dataclass

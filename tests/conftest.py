@@ -22,7 +22,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from teds_provision.station.station import Station
-from tests.bench import Board, make_station
+from tests.bench import Board, copied_station
 from tests.firmware.c_node import OFFERS
 from tests.nightly import REFUSED, UNNAMED, refusals
 from tests.passphrase_costs import lower_costs
@@ -46,6 +46,8 @@ OF_TERMINALS = {
 }
 OF_PROXIES = {"http_proxy", "https_proxy", "all_proxy", "no_proxy"}
 OF_THE_CALLER = OF_TERMINALS | {"AMENT_PREFIX_PATH", "CYCLONEDDS_URI", "NOTIFY_SOCKET", "WATCHDOG_USEC"}
+IN_MEMORY = Path("/dev/shm", f"tp{os.getuid()}")
+ROOM = 8 << 30  # octets free there; a run of all tests needs less than a tenth of it
 LONGEST_TEMPORARY = 20  # characters: tests bind Unix sockets below it, whose whole path has 107 at most
 SHARED = ("hall", "bench", "lab")  # fixtures of a module whose value says ``visited``
 
@@ -61,10 +63,13 @@ gc.set_threshold(50_000, 20, 100)  # parsing the whole package takes 3.2 s of CP
 def pytest_configure() -> None:
     """Take Ctrl-C as usual: what a shell starts in the background ignores it, and so would the programs under test.
 
+    Homes and recordings lie in memory if there is room: a test waits for a disk at every durable write, for nothing.
     And what the caller's environment says of terminals, proxies, ROS and this program is nothing that a test asked for.
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if "TMPDIR" not in os.environ and _in_memory_is_room():
+        os.environ["TMPDIR"] = tempfile.tempdir = str(IN_MEMORY)
     if len(tempfile.gettempdir()) > LONGEST_TEMPORARY and os.access("/tmp", os.W_OK | os.X_OK):
         os.environ["TMPDIR"] = tempfile.tempdir = "/tmp"
     for name in list(os.environ):
@@ -74,10 +79,26 @@ def pytest_configure() -> None:
     lower_costs()
 
 
+def _in_memory_is_room() -> bool:
+    try:
+        found = os.statvfs(IN_MEMORY.parent)
+        IN_MEMORY.mkdir(mode=0o700, exist_ok=True)
+    except OSError:
+        return False
+    return IN_MEMORY.stat().st_uid == os.getuid() and found.f_bavail * found.f_frsize >= ROOM
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run what is marked ``both_nodes`` with the Python node and with the one in C."""
-    if metafunc.definition.get_closest_marker("both_nodes") and not ALL_IN_C:
-        metafunc.parametrize("node_kind", ["python", pytest.param("c", marks=pytest.mark.system)])
+    """Run what is marked ``both_nodes`` with the Python node and with the one in C.
+
+    ``both_nodes(nightly_in_c=why)``: the gate has the Python node alone. ``why`` says which tests hold the node in C.
+    """
+    mark = metafunc.definition.get_closest_marker("both_nodes")
+    if mark is not None and not ALL_IN_C:
+        in_c = [pytest.mark.system]
+        if why := mark.kwargs.get("nightly_in_c"):
+            in_c.append(pytest.mark.nightly(f"{metafunc.definition.nodeid} holds this with the Python node; {why}"))
+        metafunc.parametrize("node_kind", ["python", pytest.param("c", marks=in_c)])
 
 
 @pytest.fixture
@@ -160,7 +181,7 @@ def nothing_left(request: pytest.FixtureRequest) -> Iterator[None]:
 @pytest.fixture
 def station(tmp_path: Path) -> Iterator[Station]:
     """A new station with a passphrase vault at the lowest cost."""
-    made = make_station(tmp_path / "home")
+    made = copied_station(tmp_path / "home")
     yield made
     made.close()
 

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -14,7 +15,16 @@ import pytest
 
 from teds_provision import files
 from teds_provision.errors import BadDataError, NotFoundError, StoreError, UsageError, VaultError
-from teds_provision.files import SHARED, holds, private_folder, read_limited, whole_file, write_new, write_whole
+from teds_provision.files import (
+    SHARED,
+    holds,
+    private_folder,
+    read_limited,
+    require_no_pipe,
+    whole_file,
+    write_new,
+    write_whole,
+)
 
 
 def names(folder: Path) -> list[str]:
@@ -88,6 +98,16 @@ def test_a_device_is_never_replaced(tmp_path: Path, link: bool) -> None:
     assert pipe.is_fifo()
     assert named.is_symlink()
     assert sorted(tmp_path.iterdir()) == [named, pipe]
+
+
+@pytest.mark.parametrize("folder", ["/tmp", "/dev/shm"])
+def test_a_named_pipe_is_no_file_wherever_it_lies(folder: str) -> None:
+    """Below /dev/shm it was taken for a shell's ``<(command)``, and reading it waited for ever."""
+    with tempfile.TemporaryDirectory(dir=folder) as made:
+        pipe = Path(made) / "pipe"
+        os.mkfifo(pipe)
+        with pytest.raises(NotFoundError, match="is a pipe"):
+            require_no_pipe(pipe)
 
 
 def test_nothing_is_left_when_writing_fails(tmp_path: Path) -> None:

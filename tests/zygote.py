@@ -53,6 +53,7 @@ FOREIGN = (
     "rich.console",
     "rich.table",
 )
+LISTENS = 1.5  # seconds; see _listen_shortly
 FIRST_FD = 3  # of the descriptors that a child is given beside stdin, stdout and stderr
 LARGEST = 1 << 17
 
@@ -351,6 +352,18 @@ def _import_all() -> None:
     for name in FOREIGN:
         importlib.import_module(name)
     importlib.import_module("tests.passphrase_costs").lower_costs()
+    _listen_shortly()
+
+
+def _listen_shortly() -> None:
+    """Have commands that collect nodes listen half as long unless ``--timeout`` is given; each test waits for that.
+
+    A node of a test answers at once. The usual time is held by tests/provisioning/test_identify_at.py and by every
+    program that a test starts by an interpreter.
+    """
+    options = importlib.import_module("teds_provision.cli.options")
+    assert options.LISTEN_SECONDS > LISTENS
+    options.LISTEN_SECONDS = LISTENS  # type: ignore[attr-defined]
 
 
 def main() -> None:

@@ -13,14 +13,14 @@ from teds_provision.teds.image import Image
 from teds_provision.vault import forget_vaults
 from tests.backup.backups import ONE, POINT, TWO, add_key
 
-from ..bench import make_station
+from ..bench import copied_station
 
 
 @pytest.fixture
 def station(tmp_path: Path) -> Iterator[Station]:
     """A station with two nodes in use, one of them in the middle of a rotation, and one trusted CA."""
     forget_vaults()
-    made = make_station(tmp_path / "home")
+    made = copied_station(tmp_path / "home")
     for uuid in (ONE, TWO):
         made.pins.put(WhitelistEntry(uuid, assurance="tap"))
         made.nodes.put(NodeRecord(uuid, POINT, state=2, epoch=1, sequence=5))

@@ -33,6 +33,8 @@ from tests.protocol.desk import META, NAME
 Bend = Callable[[pytest.MonkeyPatch], None]
 ADDRESS_SECONDS = 3.0
 """Between two writes of the address, of the 10 s that the profile has: nobody waits for them here."""
+BOARD = (sys.executable, "-m", "tests.check.board")
+"""The program: FAULT --nfc PLACE | --can PLACE; it says that it is ready, and runs until it is ended."""
 
 
 def _runs_again(patch: pytest.MonkeyPatch) -> None:
@@ -176,9 +178,7 @@ def main() -> None:
     for server in servers:
         server.start()
     print("ready", flush=True)
-    sys.stdin.read()
-    for server in servers:
-        server.stop()
+    threading.Event().wait()  # until it is ended
 
 
 if __name__ == "__main__":

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from contextlib import closing, contextmanager
 
 import pytest
 
@@ -15,13 +12,12 @@ from teds_provision.check.run import CheckReport, check_at
 from teds_provision.links import LinkSettings
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
-from tests.check.board import ADDRESS_SECONDS
-from tests.cli.shell import clean_environment
+from tests.check.board import ADDRESS_SECONDS, BOARD
+from tests.e2e.desk import Running
 from tests.pace import PATIENCE
 from tests.places import free_bus, free_reader
 
 pytestmark = pytest.mark.link
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)
@@ -34,17 +30,9 @@ def board(fault: str, link: str, *options: str) -> Iterator[LinkSettings]:
     """A board with this fault on a reader (``nfc``) or a bus (``can``, ``fd``) of its own."""
     place = free_reader() if link == "nfc" else free_bus() + ("&fd=1" if link == "fd" else "")
     via = "nfc" if link == "nfc" else "can"
-    with subprocess.Popen(
-        [sys.executable, "-m", "tests.check.board", fault, f"--{via}", place, *options],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=clean_environment(),
-    ) as process:  # fmt: skip
-        assert process.stdin is not None
-        assert process.stdout is not None
-        try:
-            assert process.stdout.readline() == "ready\n"
-            yield LinkSettings(via, place, place, timeout=PATIENCE)
-        finally:
-            process.stdin.close()
+    with closing(Running(fault, f"--{via}", place, *options, program=BOARD)) as process:
+        process.wait_for("ready\n")
+        yield LinkSettings(via, place, place, timeout=PATIENCE)
 
 
 def checked(station: Station, fault: str, link: str, *options: str, factory: bool = False) -> CheckReport:
@@ -60,7 +48,16 @@ def broken(report: CheckReport) -> dict[str, str]:
     return {check.rule: check.detail for check in report.checks if check.result == "failed"}
 
 
-@pytest.mark.parametrize("link", ["nfc", "can", "fd"])
+FD = pytest.param(
+    "fd",
+    marks=pytest.mark.nightly(
+        "tests/check/test_link_rules.py::test_the_good_board_breaks_no_rule_of_its_link[can], and "
+        "tests/check/test_link_rules.py::test_a_fault_of_the_link_is_found[can-form fd] breaks no other rule of FD"
+    ),
+)
+
+
+@pytest.mark.parametrize("link", ["nfc", "can", FD])
 def test_the_good_board_breaks_no_rule_of_its_link(station: Station, link: str) -> None:
     report = checked(station, "", link, factory=True)
     assert broken(report) == {}
@@ -76,12 +73,19 @@ FAULTS = [
     ("", "nfc", ("--wait-time", "5"), "nfc-wait-time", "WT_INT is 5"),
     ("WTX 63", "nfc", (), "nfc-wtx", "multiplier 63: 1 to 59"),
     ("found as of an older epoch", "nfc", (), "identify-found", "epoch=3"),
-    ("found as of an older epoch", "can", (), "identify-found", "epoch=3"),
+    pytest.param(
+        *("found as of an older epoch", "can", (), "identify-found", "epoch=3"),
+        marks=pytest.mark.nightly(
+            "tests/check/test_link_rules.py::test_a_fault_of_the_link_is_found[identify-found nfc]"
+        ),
+    ),
 ]
 
 
 @pytest.mark.parametrize(
-    ("fault", "link", "options", "rule", "told"), FAULTS, ids=[f"{rule} {link}" for _, link, _, rule, _ in FAULTS]
+    ("fault", "link", "options", "rule", "told"),
+    FAULTS,
+    ids=["can-form fd", "nfc-wait-time nfc", "nfc-wtx nfc", "identify-found nfc", "identify-found can"],
 )
 def test_a_fault_of_the_link_is_found(
     station: Station, fault: str, link: str, options: tuple[str, ...], rule: str, told: str
@@ -91,12 +95,18 @@ def test_a_fault_of_the_link_is_found(
     assert told in found[rule]
 
 
+OTHER_CHOICE = pytest.mark.nightly(
+    "tests/check/test_link_rules.py::test_what_a_node_may_choose_is_told_and_not_failed, one choice of three; "
+    "tests/links/can/test_can_small_nodes.py::test_a_node_asks_for_its_own_block_size_and_gap"
+)
+
+
 @pytest.mark.parametrize(
     ("choice", "told"),
     [
-        ("padding 00", "padding 00"),
+        pytest.param("padding 00", "padding 00", marks=OTHER_CHOICE),
         ("block size 8", "block size 8, STmin 0 ms"),
-        ("gap of 5 ms", "block size 16, STmin 5 ms"),
+        pytest.param("gap of 5 ms", "block size 16, STmin 5 ms", marks=OTHER_CHOICE),
     ],
 )
 def test_what_a_node_may_choose_is_told_and_not_failed(station: Station, choice: str, told: str) -> None:

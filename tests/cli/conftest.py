@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 
 from teds_provision.vault import forget_vaults
-from tests.bench import make_station
+from tests.bench import copy_home
 
 
 @pytest.fixture
 def home(tmp_path: Path) -> Iterator[Path]:
     """The home of a station with a passphrase vault at the lowest cost; every command unlocks it anew."""
     folder = tmp_path / "home"
-    make_station(folder).close()
+    copy_home(folder)
     forget_vaults()
     yield folder
     forget_vaults()

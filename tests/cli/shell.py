@@ -150,10 +150,16 @@ def set_passphrase(home: Path, old: str, new: str) -> Outcome:
         os.close(read)
 
 
-def spawn(*words: object, passphrase: str | None = None, environment: dict[str, str] | None = None) -> Outcome:
+def spawn(
+    *words: object,
+    passphrase: str | None = None,
+    environment: dict[str, str] | None = None,
+    program: tuple[str, ...] = PROGRAM,
+) -> Outcome:
     """Run the program as a process of its own to its end; ``passphrase`` is given through --passphrase-fd."""
+    how: dict[str, Any] = {"passphrase": passphrase, "environment": environment, "program": program}
     with TemporaryFile() as out, TemporaryFile() as err:
-        done = begin(*words, passphrase=passphrase, environment=environment, out=out.fileno(), err=err.fileno())
+        done = begin(*words, out=out.fileno(), err=err.fileno(), **how)
         try:
             code = done.wait(60)
         finally:

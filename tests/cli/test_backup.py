@@ -143,7 +143,12 @@ def test_a_recovery_key_that_openssl_made(home: Path, tmp_path: Path) -> None:
     assert (code, told["action"]) == (0, "rebuilt")
 
 
-@pytest.mark.parametrize("seed", range(6))
+OTHER_MOMENTS = pytest.mark.nightly(
+    "tests/cli/test_backup.py::test_killed_at_any_moment_the_home_is_empty_or_the_station"
+)
+
+
+@pytest.mark.parametrize("seed", [pytest.param(seed, marks=OTHER_MOMENTS if seed % 2 else ()) for seed in range(6)])
 def test_killed_at_any_moment_the_home_is_empty_or_the_station(
     home: Path, sealed: Path, tmp_path: Path, seed: int
 ) -> None:
@@ -226,7 +231,14 @@ def test_a_full_disk_leaves_the_old_backup_and_no_rest(home: Path, sealed: Path,
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(sealed.name)] == [sealed.name]
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.002, 0.01])
+OTHER_DELAYS = pytest.mark.nightly(
+    "tests/cli/test_backup.py::test_killed_while_it_writes_a_backup_is_the_old_or_the_new_one[0.002]"
+)
+
+
+@pytest.mark.parametrize(
+    "delay", [pytest.param(0.0, marks=OTHER_DELAYS), 0.002, pytest.param(0.01, marks=OTHER_DELAYS)]
+)
 def test_killed_while_it_writes_a_backup_is_the_old_or_the_new_one(
     home: Path, sealed: Path, tmp_path: Path, delay: float
 ) -> None:

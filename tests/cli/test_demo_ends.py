@@ -32,8 +32,14 @@ def test_the_whole_story_as_make_demo_starts_it(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+OTHER_SIGNAL = pytest.mark.nightly(
+    "tests/cli/test_demo_ends.py::test_an_ended_demo_takes_its_node_and_its_folder_away[2], and "
+    "tests/cli/test_signals.py::test_no_signal_handler_takes_a_lock holds what both signals share"
+)
+
+
 @pytest.mark.link
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=OTHER_SIGNAL), signal.SIGINT])
 def test_an_ended_demo_takes_its_node_and_its_folder_away(tmp_path: Path, number: signal.Signals) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "teds_provision", "demo"],

@@ -41,7 +41,7 @@ from teds_provision.station.store import (
 from teds_provision.station.store.database import Database
 from teds_provision.teds.image import Image
 from teds_provision.vault import forget_vaults
-from tests.bench import PASSPHRASE, make_station
+from tests.bench import PASSPHRASE, copy_home
 from tests.places import free_bus, free_reader
 
 
@@ -56,7 +56,7 @@ def system(tmp_path: Path) -> System:
 @pytest.fixture
 def stationed(system: System) -> Iterator[System]:
     forget_vaults()
-    make_station(system.home).close()
+    copy_home(system.home)
     yield system
     forget_vaults()
 

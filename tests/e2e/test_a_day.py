@@ -15,7 +15,10 @@ from tests.terminal import on_terminal
 
 from .desk import ANGLE, FINGER, Desk, Node, Station, results
 
-pytestmark = [pytest.mark.link, pytest.mark.both_nodes]
+pytestmark = [
+    pytest.mark.link,
+    pytest.mark.both_nodes(nightly_in_c="test_whole_runs.py and tests/firmware/test_host_port.py hold the one in C"),
+]
 
 CALIBRATION = "raw,value [degree]\n0,0\n32768,{middle}\n65535,359.9\n"
 

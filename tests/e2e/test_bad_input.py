@@ -109,6 +109,10 @@ def test_no_reader_no_bus_and_nobody_there_are_5(station: Station) -> None:
             assert said["hint"]
 
 
+@pytest.mark.nightly(
+    "tests/links/nfc/test_nfc_exchange.py::test_a_foreign_tag_is_named_once_and_waited_past, "
+    "tests/links/nfc/test_nfc_exchange.py::test_a_tag_that_says_nonsense_is_a_foreign_tag"
+)
 def test_a_tag_that_is_no_node_is_named_and_left_alone(station: Station) -> None:
     links = station.desk.links
     options = {"path": links.nfc, "uuid": "00" * 10, "tag": "2", "uid": "02112233445566", "initial": NOT_A_NODE}
@@ -132,6 +136,10 @@ def test_a_node_that_talks_nonsense_is_an_error_of_one_line(station: Station, to
     assert said["code"] == (code or "garbled")
 
 
+@pytest.mark.nightly(
+    "tests/e2e/test_pulled_steps.py::test_above_the_udp_driver pulls it half written; that a lost node is 5 says "
+    "tests/e2e/test_cut_short.py::test_a_node_that_lost_power_is_carried_on_with"
+)
 def test_a_node_that_moves_away_in_the_transfer_is_5(station: Station, node: Node) -> None:
     node.start("--flash-delay", "300")
     command = station.start("provision", "--profile", ANGLE, "--yes", *station.desk.links.over("nfc"))
@@ -145,8 +153,14 @@ def test_a_node_that_moves_away_in_the_transfer_is_5(station: Station, node: Nod
     assert [(entry["uuid"], entry["outcome"]) for entry in failed] == [(node.uuid, "node-silent")]
 
 
+NO_KEY = pytest.mark.nightly(
+    "tests/provisioning/test_provision.py::test_power_cut_at_every_flash_commit; the flash that fails at the datasheet "
+    "is here, and tests/provisioning/test_provision.py::test_a_broken_flash_is_told"
+)
+
+
 @pytest.mark.needs("flash.json")
-@pytest.mark.parametrize("room", [100, 2500])
+@pytest.mark.parametrize("room", [pytest.param(100, marks=NO_KEY), 2500])
 def test_a_node_whose_flash_fails_is_refused_by_it_and_stays_as_it_was(station: Station, node: Node, room: int) -> None:
     """No room for the key, or for the datasheet: old state whole, and the same command finishes on a mended board."""
     node.start(program=limited(room))
@@ -164,6 +178,7 @@ def test_a_node_whose_flash_fails_is_refused_by_it_and_stays_as_it_was(station: 
 # -- datasheets --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly("tests/provisioning/test_verify.py::test_every_flipped_octet_is_caught")
 def test_an_image_that_was_tampered_with_is_not_authentic(station: Station, finished: Node, tmp_path: Path) -> None:
     """One octet in each TEDS, and in each part of the Security TEDS; every single octet: tests/provisioning."""
     image, file = tmp_path / "image.json", tmp_path / "tampered.json"
@@ -207,6 +222,10 @@ def test_a_node_whose_flash_was_tampered_with_is_found_out_and_mended(station: S
 
 
 @pytest.mark.needs("flash.json")
+@pytest.mark.nightly(
+    "tests/e2e/test_bad_input.py::test_a_node_whose_flash_was_tampered_with_is_found_out_and_mended; by hand "
+    "tests/provisioning/test_by_hand.py::test_what_the_node_lost_since_it_was_read_is_sent_again"
+)
 def test_a_tampered_flash_is_mended_by_hand_too(station: Station, finished: Node) -> None:
     links = station.desk.links.over("nfc")
     finished.stop()
@@ -343,6 +362,9 @@ def test_a_second_process_waits_and_goes_on_when_the_store_is_free(station: Stat
     assert command.end().code == 0
 
 
+@pytest.mark.nightly(
+    "tests/station/test_lock.py::test_the_second_process_is_told_who_holds_the_store without 10 s of waiting"
+)
 def test_a_second_process_says_at_last_who_holds_the_store(station: Station, finished: Node) -> None:
     with unchanged(station, finished, without=("nodes",)), StoreLock(station.home, command="backup"):
         said = station.refuses("provision", "--yes", *station.desk.links.over("can"), code=7)

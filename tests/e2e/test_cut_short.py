@@ -19,6 +19,25 @@ pytestmark = [pytest.mark.link, pytest.mark.needs("a slow chip")]
 SLOW = ("--crypto-delay", "120", "--flash-delay", "250")
 """A node slow enough that every step can be met in the middle; milliseconds."""
 
+OTHER_MOMENTS = pytest.mark.nightly(
+    "tests/e2e/test_cut_short.py::test_a_killed_station_carries_on is killed between and in all three transactions; "
+    "tests/provisioning/test_provision.py::test_cut_at_every_message_the_same_command_carries_on cuts all others"
+)
+
+OTHER_POWER = pytest.mark.nightly(
+    "tests/e2e/test_cut_short.py::test_a_node_that_lost_power_is_carried_on_with[in the write-nfc]; over CAN "
+    "tests/e2e/test_cut_short.py::test_a_node_whose_power_only_flickers_needs_no_second_command_or_one[can]"
+)
+
+OTHER_LINK = pytest.mark.nightly(
+    "tests/e2e/test_cut_short.py::test_a_node_whose_power_only_flickers_needs_no_second_command_or_one[can], "
+    "tests/e2e/test_cut_short.py::test_a_station_that_fell_asleep_in_the_write_wakes_up_well[nfc]: one of each link"
+)
+
+OTHER_CTRL_C = pytest.mark.nightly(
+    "tests/e2e/test_cut_short.py::test_ctrl_c_ends_at_once_and_loses_nothing[in the write-nfc] ends a wait on that link"
+)
+
 Moment = Callable[[Station, Node, Running], bool]
 
 
@@ -101,8 +120,22 @@ def carries_on(station: Station, node: Node, via: str) -> None:
     assert station.log_is_whole()
 
 
+KILLED = {
+    ("key stored, not confirmed", "nfc"),
+    ("key committed, reply under way", "can"),
+    ("in the write", "nfc"),
+    ("datasheet committed", "nfc"),
+}
+"""Moments of the gate: between the two ends' durable writes of the key, in the write, and behind it."""
+
+
 @pytest.mark.parametrize(
-    ("moment", "via"), [*((moment, "nfc") for moment in MOMENTS), *((moment, "can") for moment in [*MOMENTS][1:-1:2])]
+    ("moment", "via"),
+    [
+        pytest.param(moment, via, marks=() if (moment, via) in KILLED else OTHER_MOMENTS)
+        for via, moments in (("nfc", [*MOMENTS]), ("can", [*MOMENTS][1:-1:2]))
+        for moment in moments
+    ],
 )
 def test_a_killed_station_carries_on(desk: Desk, station: Station, node: Node, moment: str, via: str) -> None:
     node, command, _ = up_to(MOMENTS[moment], station, node, via)
@@ -111,7 +144,7 @@ def test_a_killed_station_carries_on(desk: Desk, station: Station, node: Node, m
     carries_on(station, node, via)
 
 
-@pytest.mark.parametrize("via", ["nfc", "can"])
+@pytest.mark.parametrize("via", ["nfc", pytest.param("can", marks=OTHER_LINK)])
 def test_a_node_that_is_still_storing_the_key_when_the_next_run_begins(station: Station, node: Node, via: str) -> None:
     """It identifies itself as in factory state and is keyed a moment later: the key that was sent is found to work."""
     node, command, _ = up_to(key_pending, station, node, via, ("--flash-delay", "1500"))
@@ -124,11 +157,11 @@ def test_a_node_that_is_still_storing_the_key_when_the_next_run_begins(station: 
 @pytest.mark.parametrize(
     ("moment", "via"),
     [
-        ("in the agreement", "nfc"),
-        ("key committed, reply under way", "can"),
-        ("agreed", "nfc"),
+        pytest.param("in the agreement", "nfc", marks=OTHER_POWER),
+        pytest.param("key committed, reply under way", "can", marks=OTHER_POWER),
+        pytest.param("agreed", "nfc", marks=OTHER_POWER),
         ("in the write", "nfc"),
-        ("in the write", "can"),
+        pytest.param("in the write", "can", marks=OTHER_POWER),
     ],
 )
 def test_a_node_that_lost_power_is_carried_on_with(station: Station, node: Node, moment: str, via: str) -> None:
@@ -144,7 +177,7 @@ def test_a_node_that_lost_power_is_carried_on_with(station: Station, node: Node,
     carries_on(station, node, via)
 
 
-@pytest.mark.parametrize("via", ["nfc", "can"])
+@pytest.mark.parametrize("via", [pytest.param("nfc", marks=OTHER_LINK), "can"])
 def test_a_node_whose_power_only_flickers_needs_no_second_command_or_one(
     station: Station, node: Node, via: str
 ) -> None:
@@ -158,7 +191,12 @@ def test_a_node_whose_power_only_flickers_needs_no_second_command_or_one(
 
 @pytest.mark.realtime
 @pytest.mark.parametrize(
-    ("moment", "via"), [("in the agreement", "nfc"), ("key stored, not confirmed", "can"), ("in the write", "nfc")]
+    ("moment", "via"),
+    [
+        pytest.param("in the agreement", "nfc", marks=OTHER_CTRL_C),
+        ("key stored, not confirmed", "can"),
+        ("in the write", "nfc"),
+    ],
 )
 def test_ctrl_c_ends_at_once_and_loses_nothing(station: Station, node: Node, moment: str, via: str) -> None:
     node, command, _ = up_to(MOMENTS[moment], station, node, via)
@@ -186,7 +224,7 @@ def test_ctrl_c_while_waiting_for_a_node(station: Station, node: Node) -> None:
     carries_on(station, node, "nfc")
 
 
-@pytest.mark.parametrize("via", ["nfc", "can"])
+@pytest.mark.parametrize("via", ["nfc", pytest.param("can", marks=OTHER_LINK)])
 def test_a_station_that_fell_asleep_in_the_write_wakes_up_well(station: Station, node: Node, via: str) -> None:
     node, command, _ = up_to(MOMENTS["in the write"], station, node, via)
     command.signal(signal.SIGSTOP)
@@ -214,6 +252,7 @@ def kill_after_growing_delays(station: Station, node: Node, via: str, *, first: 
 
 
 @pytest.mark.parametrize("via", ["nfc", "can"])
+@pytest.mark.nightly("tests/e2e/test_cut_short.py::test_a_killed_station_carries_on at the moments that matter")
 def test_a_station_that_is_killed_again_and_again_gets_there(station: Station, node: Node, via: str) -> None:
     node.start(*SLOW, nfc=via == "nfc", can=via == "can")
     assert kill_after_growing_delays(station, node, via, first=0.3, step=0.15) > 2

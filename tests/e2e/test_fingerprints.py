@@ -24,7 +24,13 @@ def entry(station: Station, uuid: str) -> dict[str, Any]:
     return dict(found)
 
 
-@pytest.mark.parametrize("via", ["nfc", "can"])
+BY_BUS = pytest.mark.nightly(
+    "tests/e2e/test_fingerprints.py::test_first_digits_pin_a_key_and_the_first_contact_makes_them_whole[nfc]; "
+    "tests/provisioning/test_whitelist_pin.py::test_a_bus_pins_nothing holds what differs over a bus"
+)
+
+
+@pytest.mark.parametrize("via", ["nfc", pytest.param("can", marks=BY_BUS)])
 def test_first_digits_pin_a_key_and_the_first_contact_makes_them_whole(desk: Desk, via: str) -> None:
     station, (node, digits) = desk.station(), made(desk, "node")
     spoken = " ".join(digits[at : at + 4] for at in range(0, 32, 4)).upper()
@@ -76,7 +82,22 @@ def test_trust_by_the_digits_that_its_owner_reads(desk: Desk, tmp_path: Path) ->
     assert bench.ask("trust", "list")["trusted"][0]["name"] == "rival"
 
 
-@pytest.mark.parametrize(("answer", "code"), [("y", 0), ("whole", 0), ("first", 0), ("other", 6), ("n", 6), ("", 6)])
+PLAIN = pytest.mark.nightly(
+    "tests/e2e/test_a_day.py::test_no_at_the_question_skips_the_board answers n and y; digits of the key are here"
+)
+
+
+@pytest.mark.parametrize(
+    ("answer", "code"),
+    [
+        pytest.param("y", 0, marks=PLAIN),
+        pytest.param("n", 6, marks=PLAIN),
+        ("whole", 0),
+        ("first", 0),
+        ("other", 6),
+        ("", 6),
+    ],
+)
 def test_a_question_takes_the_digits_of_the_key(desk: Desk, answer: str, code: int) -> None:
     station, (node, digits) = desk.station(), made(desk, "node")
     node.start()

@@ -11,7 +11,10 @@ from tests.places import free_bus
 
 from .desk import ANGLE, Desk, Node, Station
 
-pytestmark = [pytest.mark.link, pytest.mark.both_nodes]
+pytestmark = [
+    pytest.mark.link,
+    pytest.mark.both_nodes(nightly_in_c="test_whole_runs.py and tests/firmware/test_host_port.py hold the one in C"),
+]
 
 
 ARM = "slew's $(arm)"

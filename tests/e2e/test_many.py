@@ -9,7 +9,10 @@ import pytest
 
 from .desk import ANGLE, Desk, Node, Station, results
 
-pytestmark = [pytest.mark.link, pytest.mark.both_nodes]
+pytestmark = [
+    pytest.mark.link,
+    pytest.mark.both_nodes(nightly_in_c="test_whole_runs.py and tests/firmware/test_host_port.py hold the one in C"),
+]
 
 UUIDS = ("8d4d9da65281f7000000", "8d4d9da65281f7000001", "00112233445566778899")
 
@@ -93,8 +96,11 @@ def test_a_dry_run_plans_every_node_of_the_bus_that_is_meant(station: Station, b
     assert ([node.octets for node in bus], station.tables()) == (flashes, store)
 
 
+AT_ONCE = pytest.mark.nightly("tests/e2e/test_many.py::test_two_owners_race_for_a_new_node_and_one_has_it[python-200]")
+
+
 @pytest.mark.needs("a slow chip")
-@pytest.mark.parametrize("delay", ["0", "200"])
+@pytest.mark.parametrize("delay", [pytest.param("0", marks=AT_ONCE), "200"])
 def test_two_owners_race_for_a_new_node_and_one_has_it(desk: Desk, delay: str) -> None:
     node = desk.node(uuid=UUIDS[0]).start("--crypto-delay", delay, nfc=False, can=True)
     owners = desk.station(), desk.station("rival")

@@ -90,6 +90,9 @@ def pull_each(watch: Running, field: Field, boards: list[tuple[str, str]], key: 
     assert pulled >= len(parts) - 1  # on a busy machine one may have needed fewer frames, and be done before
 
 
+@pytest.mark.nightly(
+    "tests/e2e/test_pulled_steps.py::test_above_the_udp_driver pulls at the start of every step and half written"
+)
 def test_pulled_at_every_part_of_provision(station: Station, field: Field, boards: list[tuple[str, str]]) -> None:
     watch = station.start("--json", "provision", "--watch", "--yes", "--profile", ANGLE, "--nfc", field.path)
     pull_each(watch, field, boards, "verdict", (0.2, 0.4, 0.6, 0.8))  # agree, build, write, verify
@@ -99,6 +102,9 @@ def test_pulled_at_every_part_of_provision(station: Station, field: Field, board
     assert {known[uuid]["verdict"] for uuid, _ in boards} == {"authentic"}
 
 
+@pytest.mark.nightly(
+    "tests/e2e/test_pulled_steps.py::test_under_identify_another_one_comes_first, one pull instead of two"
+)
 def test_pulled_while_it_is_identified(station: Station, field: Field, boards: list[tuple[str, str]]) -> None:
     watch = station.start("--json", "identify", "--watch", "--nfc", field.path)
     pull_each(watch, field, boards, "fingerprint", (0.6, 0.75))
@@ -127,6 +133,10 @@ def serial(field: Field) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     process.stdout.close()
 
 
+@pytest.mark.nightly(
+    "tests/e2e/test_pulled_steps.py::test_above_the_udp_driver; the same driver and chip are held by "
+    "tests/e2e/test_pulled.py::test_a_pn532_needs_few_host_commands_and_one_lost_answer_is_not_told"
+)
 def test_pulled_above_a_pn532_on_a_serial_line(
     station: Station, field: Field, boards: list[tuple[str, str]], serial: tuple[str, subprocess.Popen[str]]
 ) -> None:

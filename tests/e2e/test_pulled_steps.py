@@ -92,6 +92,10 @@ def test_above_the_udp_driver(
     pull_at_each(station.home, field, field.path, boards)
 
 
+@pytest.mark.nightly(
+    "tests/e2e/test_pulled_steps.py::test_above_the_udp_driver; pulls below that driver are held by "
+    "tests/links/nfc/test_nfc_pulled.py::test_pulled_at_every_frame_below_a_usb_reader"
+)
 def test_above_the_pn53x_driver(
     station: Station,
     field: Field,

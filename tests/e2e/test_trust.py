@@ -8,7 +8,10 @@ import pytest
 
 from .desk import ANGLE, Desk, Node, Station, results
 
-pytestmark = [pytest.mark.link, pytest.mark.both_nodes]
+pytestmark = [
+    pytest.mark.link,
+    pytest.mark.both_nodes(nightly_in_c="test_whole_runs.py and tests/firmware/test_host_port.py hold the one in C"),
+]
 
 UUID = "8d4d9da65281f7000000"
 
@@ -48,6 +51,10 @@ def test_a_whitelist_entry_with_a_fingerprint_takes_that_key_alone(station: Stat
     assert node.flash["key"] is None
 
 
+@pytest.mark.nightly(
+    "tests/provisioning/test_agree.py::test_a_board_that_replaces_another_begins_at_its_own_epoch, and "
+    "tests/provisioning/test_whitelist_pin.py::test_another_board_under_the_same_uuid_is_refused_until_the_entry_is_removed"
+)
 def test_a_replaced_board_is_taken_after_the_old_pin_is_removed(desk: Desk, station: Station) -> None:
     """The operator decides: ``whitelist remove`` forgets the pinned key, and the new board may be pinned."""
     old, new = desk.node("old", uuid=UUID), desk.node("new", uuid=UUID)
@@ -79,7 +86,13 @@ def test_the_same_board_comes_back_after_it_was_taken_off_the_whitelist(station:
     assert station.keys(node.uuid) == [("active", 1)]
 
 
-@pytest.mark.parametrize("via", ["nfc", "can"])
+BY_BUS = pytest.mark.nightly(
+    "tests/e2e/test_trust.py::test_a_station_of_another_owner_cannot_take_a_node[python-nfc]; without a tap "
+    "tests/provisioning/test_agree.py::test_a_station_of_another_owner_cannot_rekey_a_node"
+)
+
+
+@pytest.mark.parametrize("via", ["nfc", pytest.param("can", marks=BY_BUS)])
 def test_a_station_of_another_owner_cannot_take_a_node(desk: Desk, via: str) -> None:
     owner, rival = desk.station(), desk.station("rival")
     node = desk.node().start(nfc=via == "nfc", can=via == "can")
@@ -100,7 +113,13 @@ def test_a_station_of_another_owner_cannot_take_a_node(desk: Desk, via: str) -> 
     assert owner.ask("verify", node.uuid, *links)["verdict"] == "authentic"
 
 
-@pytest.mark.parametrize("by_hand", [True, False])
+BY_HAND = pytest.mark.nightly(
+    "tests/e2e/test_trust.py::test_after_a_reset_a_new_owner_may_take_the_node[python-False]; by hand "
+    "tests/provisioning/test_provision.py::test_a_node_reset_by_hand_is_provisioned_again"
+)
+
+
+@pytest.mark.parametrize("by_hand", [pytest.param(True, marks=BY_HAND), False])
 def test_after_a_reset_a_new_owner_may_take_the_node(desk: Desk, by_hand: bool) -> None:
     owner, rival = desk.station(), desk.station("rival")
     node = desk.node().start()

@@ -47,7 +47,7 @@ def update(station: Station, *words: object, code: int = 0) -> tuple[list[Any], 
     return lines, last["totals"]
 
 
-@pytest.mark.both_nodes
+@pytest.mark.both_nodes(nightly_in_c="tests/firmware/test_host_updates.py updates the one in C")
 def test_a_board_gets_new_firmware_and_keeps_everything_else(desk: Desk, owner: Owner) -> None:
     station, node = desk.station(), board(desk, owner)
     station.provision("can", *PROVISIONED)
@@ -100,7 +100,7 @@ def test_a_board_gets_new_firmware_and_keeps_everything_else(desk: Desk, owner: 
     assert station.log_is_whole()
 
 
-@pytest.mark.both_nodes
+@pytest.mark.both_nodes(nightly_in_c="tests/firmware/test_host_updates.py updates the one in C")
 def test_an_image_that_crashes_does_not_speak_or_confirms_itself(desk: Desk, owner: Owner) -> None:
     station, node = desk.station(), board(desk, owner)
     station.provision("can", *PROVISIONED)
@@ -120,7 +120,7 @@ def test_an_image_that_crashes_does_not_speak_or_confirms_itself(desk: Desk, own
     assert node.octets == before
 
 
-@pytest.mark.both_nodes
+@pytest.mark.both_nodes(nightly_in_c="tests/firmware/test_host_updates.py updates the one in C")
 def test_kill_9_of_either_end_in_an_upload_and_the_same_command_goes_on(desk: Desk, owner: Owner) -> None:
     station, node = desk.station(), board(desk, owner)
     station.provision("can", *PROVISIONED)

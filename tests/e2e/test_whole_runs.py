@@ -9,7 +9,10 @@ import pytest
 
 from .desk import ANGLE, FINGER, Desk, Node, Station, results
 
-pytestmark = [pytest.mark.link, pytest.mark.both_nodes]
+pytestmark = [
+    pytest.mark.link,
+    pytest.mark.both_nodes(nightly_in_c="the first test here and tests/firmware/test_host_port.py hold the one in C"),
+]
 
 SECURITY = 128
 CHANGING = ("audit", "nodes", "datasheets", "drafts", "readings", "last_places")
@@ -31,6 +34,7 @@ def settled(node: Node) -> dict[str, Any]:
     return {name: flash[name] for name in ("provisioned", "epoch", "sequence", "read_only")} | {"blocks": blocks}
 
 
+@pytest.mark.both_nodes
 @pytest.mark.parametrize("tag", ["4", pytest.param("2", marks=pytest.mark.needs("type 2 tag"))])
 def test_a_tapped_node_is_provisioned_and_a_second_run_finds_nothing_to_do(
     station: Station, node: Node, tag: str
@@ -83,7 +87,13 @@ def test_a_node_that_was_tapped_is_written_over_the_bus(station: Station, node: 
     assert station.ask("verify", node.uuid, *links.over("nfc"))["verdict"] == "authentic"
 
 
-@pytest.mark.parametrize("via", ["nfc", "can"])
+BY_BUS = pytest.mark.nightly(
+    "tests/e2e/test_whole_runs.py::test_every_step_by_hand_ends_where_provision_does[python-nfc]; on a bus "
+    "tests/e2e/test_whole_runs.py::test_each_step_again_changes_nothing"
+)
+
+
+@pytest.mark.parametrize("via", ["nfc", pytest.param("can", marks=BY_BUS)])
 def test_every_step_by_hand_ends_where_provision_does(desk: Desk, tmp_path: Path, via: str) -> None:
     """Each command alone, with the JSON keys of the contract; the node's state is that after ``provision``."""
     station, uuid = desk.station(), "8d4d9da65281f7000000"
@@ -143,6 +153,7 @@ def test_each_step_again_changes_nothing(station: Station, node: Node, tmp_path:
     assert station.tables(without=CHANGING) == store
 
 
+@pytest.mark.nightly("tests/provisioning/test_agree.py::test_rotation_gives_a_new_key_over_any_link")
 def test_a_key_is_rotated_over_either_link_and_the_node_stays_authentic(station: Station, node: Node) -> None:
     node.start(can=True)
     station.provision("nfc", "--profile", ANGLE)

@@ -60,7 +60,7 @@ def compile_host(program: Path, source: Path | None = None, *options: str) -> No
     sources = [str(source if source is not None and path.name == source.name else path) for path in good]
     flags = [word for word in words if not word.endswith(".c")]
     done = subprocess.run(
-        ["gcc", "-O1", "-w", *flags, *options, *sources, "-o", str(program), "-lbearssl", "-lm"],
+        ["gcc", "-O0", "-w", *flags, *options, *sources, "-o", str(program), "-lbearssl", "-lm"],
         cwd=FIRMWARE, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -19,7 +19,7 @@ from teds_provision.links.ports import BusFrame, BusFrames
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import Repetition
 from teds_provision.station.station import Station
-from tests.bench import make_station
+from tests.bench import copied_station
 from tests.check import nodes
 from tests.check.faults import FAULTS
 from tests.check.faulty import FaultyBus
@@ -37,7 +37,7 @@ MAX_MESSAGE, STAGING = 2048, 16388
 @pytest.fixture
 def station(tmp_path: Path) -> Iterator[Station]:
     """A station in this process."""
-    made = make_station(tmp_path / "station")
+    made = copied_station(tmp_path / "station")
     yield made
     made.close()
 
@@ -165,13 +165,19 @@ SAMPLE: Final = {"FAULT_OLDER_EPOCH", "FAULT_ANY_TARGET", "FAULT_DRIVE_TWICE"}
 ALL: Final = {**CHANGES, **SEEN_BY_A_STATION}
 
 
+AT_NIGHT = pytest.mark.nightly(
+    "tests/check/test_faults.py::test_a_faulty_node_is_found_by_its_rule has its sister in Python"
+)
+
+
 def of_the_gate() -> Iterator[Any]:
-    """Yield each fault; but for each sixth, and for the sample, they are left to ``make firmware``.
+    """Yield each fault; but for each twelfth, and for the sample, they are left to the night and to ``make firmware``.
 
     ``tests/check/test_faults.py`` holds each rule at the gate, against the faulty nodes in Python.
     """
     for number, name in enumerate(CHANGES):
-        yield pytest.param(name, marks=[pytest.mark.soak] if number % 6 else [])
+        marks = [pytest.mark.soak] if number % 6 else [AT_NIGHT] if number % 12 else []
+        yield pytest.param(name, marks=marks)
     for name in SEEN_BY_A_STATION:
         yield pytest.param(name, marks=[] if name in SAMPLE else [pytest.mark.soak])
 

@@ -81,8 +81,18 @@ class Flood:
         return frames
 
 
+EVERYONE = pytest.param(
+    True,
+    id="of everyone",
+    marks=pytest.mark.nightly(
+        "tests/firmware/test_flood.py::test_a_measurement_of_both_nodes_loses_nothing_while_strangers_ask: the other "
+        "case asks everyone too"
+    ),
+)
+
+
 @pytest.mark.realtime
-@pytest.mark.parametrize("everyone_alone", [True, False], ids=["of everyone", "of everyone and of the node"])
+@pytest.mark.parametrize("everyone_alone", [EVERYONE, pytest.param(False, id="of everyone and of the node")])
 def test_a_measurement_of_both_nodes_loses_nothing_while_strangers_ask(
     desk: Desk, station: Station, node: CNode, everyone_alone: bool
 ) -> None:

@@ -32,7 +32,17 @@ OF_OTHER_LINKS = {"nfc-wait-time", "nfc-wtx", "confirm-elsewhere", "write-read-o
 WITH_AN_ACTUATOR = "1 sensor 0 2 100000\n2 actuator 0 2 1000000\n"
 
 
-@pytest.mark.parametrize("fd", [False, True], ids=["classic", "fd"])
+FD = pytest.param(
+    True,
+    id="fd",
+    marks=pytest.mark.nightly(
+        "tests/firmware/test_host_port.py::test_it_keeps_every_rule_of_the_profile[classic]; "
+        "tests/firmware/test_faults.py::test_a_good_node_keeps_every_rule[measuring can]"
+    ),
+)
+
+
+@pytest.mark.parametrize("fd", [pytest.param(False, id="classic"), FD])
 def test_it_keeps_every_rule_of_the_profile(desk: Desk, station: Station, node: CNode, fd: bool) -> None:
     node.channels = node.channels if fd else WITH_AN_ACTUATOR
     node.start(*(["--fd"] if fd else []))
@@ -149,7 +159,7 @@ def test_an_actuator_is_set_held_and_goes_safe(desk: Desk, station: Station, nod
     )
     done = station.provision("can", "--profile", "gripper", "--calibration", calibration)
     assert done["verdict"] == "authentic"
-    held = station.start("set", node.uuid, "1", "20", "--unit", "mm", "--dead-man", "5000", "--hold", "60", *links)
+    held = station.start("set", node.uuid, "1", "20", "--unit", "mm", "--dead-man", "2000", "--hold", "60", *links)
     rival = [*links[:-1], f"{links[-1]}&source=0xf2"]
 
     def state() -> set[str]:

@@ -249,7 +249,14 @@ def _quiet(command: list[str], environment: dict[str, str]) -> subprocess.Popen[
     return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT)
 
 
-@pytest.fixture(params=["ros1", "ros2"])
+OTHER_ROS = pytest.mark.nightly(
+    "tests/measure/test_actuator_safety.py::test_by_topics_consumer_node_and_station_may_die[ros1]: behind both sinks "
+    "a set point is one thing to the code; how one comes by ROS 2 is held by "
+    "tests/ncap/test_by_topics.py::test_set_points_move_it_and_whatever_dies_it_is_safe"
+)
+
+
+@pytest.fixture(params=["ros1", pytest.param("ros2", marks=OTHER_ROS)])
 def ros(request: pytest.FixtureRequest, master: Master) -> Iterator[Ros1 | Ros2]:  # noqa: F811
     with ros_of(request.param, master) as made:
         yield made

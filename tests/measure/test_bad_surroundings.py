@@ -78,7 +78,7 @@ def test_a_bus_that_dies_is_opened_again_when_it_is_back(hall: Hall) -> None:
 def test_a_full_disk_ends_that_recording_and_nothing_else(hall: Hall, tmp_path: Path) -> None:
     hall.nodes["a"].start()
     file = tmp_path / "full.csv"
-    running = hall.begin(hall.nodes["a"].uuid, "--rate", 200, "--to", file, program=limited(200_000))
+    running = hall.begin(hall.nodes["a"].uuid, "--rate", 500, "--to", file, program=limited(200_000))
     running.wait_for("cannot be written", 90)
     data = running.out.count('"event":"data"')
     wait_for_count(running, '"event":"data"', data + 5)

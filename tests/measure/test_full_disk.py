@@ -72,7 +72,7 @@ def hall(tmp_path: Path) -> Iterator[Hall]:
 def test_measure_goes_on_when_there_is_room_again(hall: Hall, tmp_path: Path) -> None:
     disk = SmallDisk(tmp_path / "disk")
     to = [word for suffix in SUFFIXES for word in ("--to", disk.folder / f"run.{suffix}")]
-    running = hall.begin(hall.nodes["a"].uuid, "--rate", 100, *to, program=disk.program)
+    running = hall.begin(hall.nodes["a"].uuid, "--rate", 400, *to, program=disk.program)
     wait_for_data(running)
     folder = disk.seen_by(running)
     until(lambda: all((folder / f"run.{suffix}").stat().st_size > 4000 for suffix in SUFFIXES))

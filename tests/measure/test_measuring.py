@@ -305,7 +305,17 @@ def test_a_node_that_is_not_there_is_5_after_the_time_allowed(bench: Bench, tmp_
     assert end["error"]["code"] == "no-node"
 
 
-@pytest.mark.parametrize("words", [[], ["--trigger"]], ids=["start time", "trigger"])
+BY_START_TIME = pytest.param(
+    [],
+    id="start time",
+    marks=pytest.mark.nightly(
+        "tests/measure/test_measuring.py::test_a_node_that_never_came_is_5_at_the_end_of_the_others[trigger]; "
+        "tests/measure/test_lookout.py::test_nodes_that_are_there_in_time_begin_at_one_moment_and_a_late_one_when_it_comes"
+    ),
+)
+
+
+@pytest.mark.parametrize("words", [BY_START_TIME, pytest.param(["--trigger"], id="trigger")])
 def test_a_node_that_never_came_is_5_at_the_end_of_the_others(bench: Bench, words: list[str]) -> None:
     """It was 0: nothing said that one of two was not in the file."""
     bench.gripper.kill()

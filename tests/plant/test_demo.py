@@ -5,9 +5,16 @@ import pytest
 from teds_provision.plant.demo import cluster, plant
 from teds_provision.provisioning.progress import SilentReporter
 
+BY_DATABASE = pytest.mark.nightly(
+    "tests/plant/test_demo.py::test_three_stations_share_a_key_and_refuse_what_the_stolen_one_signs[files]; every test "
+    "with a database runs the demo's server, and syncs as tests/plant/test_synced_by_database.py does"
+)
+
 
 @pytest.mark.link
-@pytest.mark.parametrize("driver", [pytest.param(True, marks=pytest.mark.system), False], ids=["postgresql", "files"])
+@pytest.mark.parametrize(
+    "driver", [pytest.param(True, marks=[pytest.mark.system, BY_DATABASE]), False], ids=["postgresql", "files"]
+)
 def test_three_stations_share_a_key_and_refuse_what_the_stolen_one_signs(
     driver: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -275,6 +275,10 @@ def test_an_office_signs_for_a_line_over_a_folder(desk: Desk, owner: Station, we
 
 @pytest.mark.system
 @pytest.mark.slow
+@pytest.mark.nightly(
+    "tests/plant/test_line_commands.py::test_an_office_signs_for_a_line_over_a_folder; what signs in a token is held "
+    "by tests/vault/token/test_token_keys.py::test_the_station_key_and_the_ca_key_sign_low_s_and_verify"
+)
 def test_an_office_whose_key_lies_in_a_token_signs_for_a_line(
     desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -111,7 +111,15 @@ def other(request, tmp_path):
     return CTool(tmp_path) if request.param is CTool else JwCrypto()
 
 
-@pytest.mark.parametrize("count", [1, 1_000, pytest.param(10_000, marks=pytest.mark.slow)])
+OF_A_THOUSAND = pytest.mark.nightly(
+    "tests/protocol/test_jose_tools.py::test_we_open_the_others_bundle, "
+    "tests/protocol/test_jose_tools.py::test_the_other_opens_our_bundle, with 1 node and with 10,000"
+)
+
+
+@pytest.mark.parametrize(
+    "count", [1, pytest.param(1_000, marks=OF_A_THOUSAND), pytest.param(10_000, marks=pytest.mark.slow)]
+)
 def test_the_other_opens_our_bundle(other, count):
     made = bundle(count, to=RECEIVERS)
     octets = seal_bundle(made, SENDER, [key.point for key in RECEIVERS])
@@ -120,7 +128,9 @@ def test_the_other_opens_our_bundle(other, count):
         assert json.loads(payload) == json.loads(payload_of(made))
 
 
-@pytest.mark.parametrize("count", [1, 1_000, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "count", [1, pytest.param(1_000, marks=OF_A_THOUSAND), pytest.param(10_000, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("receivers", [RECEIVERS[:1], RECEIVERS], ids=["one receiver", "two receivers"])
 def test_we_open_the_others_bundle(other, count, receivers):
     made = bundle(count, to=receivers)

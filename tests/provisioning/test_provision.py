@@ -31,7 +31,7 @@ from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY
 from tests.answers import Answers
-from tests.bench import Board, MemoryLink, make_station, talk
+from tests.bench import Board, MemoryLink, copied_station, make_station, talk
 
 ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")
 
@@ -109,14 +109,14 @@ def test_an_identified_node_may_be_written_over_the_other_link(station: Station,
 
 def exchanges_of_a_whole_run(tmp_path: Path) -> int:
     link = MemoryLink(Board())
-    run(make_station(tmp_path / "count"), link.board, link)
+    run(copied_station(tmp_path / "count"), link.board, link)
     return link.count - 1  # the last one closes the session
 
 
 @pytest.mark.parametrize("half", ["lose_request", "lose_reply"])
 def test_cut_at_every_message_the_same_command_carries_on(tmp_path: Path, half: str) -> None:
     for lost in range(1, exchanges_of_a_whole_run(tmp_path) + 1):
-        station, board = make_station(tmp_path / f"{half}{lost}"), Board()
+        station, board = copied_station(tmp_path / f"{half}{lost}"), Board()
         with pytest.raises(NodeSilentError):
             run(station, board, MemoryLink(board, **{half: lost}))  # type: ignore[arg-type]
         assert run(station, board).verified.verdict == "authentic", f"{half} {lost}"

@@ -26,7 +26,7 @@ from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import provision
 from teds_provision.provisioning.update import BoardUpdate, UpdateOrder, update_boards
 from teds_provision.station.station import Station
-from tests.bench import PASSPHRASE, make_station
+from tests.bench import PASSPHRASE, copied_station
 from tests.firmware_images import make_key, sign
 
 PROFILE = "tactile-finger-sensor"
@@ -48,7 +48,7 @@ class Owner:
         first = sign(folder, "1.0.0", self.key, counter=1)
         create(folder / "node", profile=PROFILE).release()
         ImageSlots.create(folder / "node", first, self.key)
-        station = make_station(folder / "home")
+        station = copied_station(folder / "home")
         bench = UpdateBench(folder, station, self)
         bench.provision()
         bench.close()

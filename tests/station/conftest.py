@@ -8,7 +8,7 @@ import pytest
 from teds_provision.station.station import Station
 from teds_provision.station.store import Store
 
-from ..bench import make_station
+from ..bench import copied_station
 
 
 @pytest.fixture
@@ -24,5 +24,5 @@ def store(home: Path) -> Iterator[Store]:
 
 @pytest.fixture
 def station(home: Path) -> Iterator[Station]:
-    with make_station(home) as made:
+    with copied_station(home) as made:
         yield made

@@ -6,9 +6,7 @@ Each line is a file that took minutes or gigabytes, or that raised something for
 from __future__ import annotations
 
 import json
-import resource
-import subprocess
-import sys
+import signal
 from pathlib import Path
 
 import pytest
@@ -19,11 +17,11 @@ from teds_provision.teds import AccessCode, compose
 from teds_provision.teds.formats import read_blocks
 from teds_provision.teds.image import Image
 from teds_provision.teds.units import parse_unit
+from tests.cli.shell import Outcome, spawn
+from tests.teds.limited import LIMITED
 
 pytestmark = pytest.mark.slow
 MIB = 1 << 20
-# The address space holds the interpreter and numpy too (their own 200 MB are mapped, not used).
-SPACE = 300 * MIB + 700 * MIB
 NAMESPACE = "urn:teds-provision:teds:1"
 
 
@@ -96,7 +94,7 @@ HOSTILE = {
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, subprocess.CompletedProcess[str]]:
+def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
     """Every hostile file through ``show``, each in its own process with 10 s of processor and bounded memory."""
     folder = tmp_path_factory.mktemp("hostile")
     out = {}
@@ -109,30 +107,29 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, subprocess.Comp
     return out
 
 
-def limited() -> None:
-    resource.setrlimit(resource.RLIMIT_CPU, (10, 12))
-    resource.setrlimit(resource.RLIMIT_AS, (SPACE, SPACE))
+def show(path: Path) -> Outcome:
+    return spawn("show", path, program=LIMITED)
 
 
-def show(path: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "teds_provision", "show", str(path)]
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=110, check=False, preexec_fn=limited, env={"LC_ALL": "C.UTF-8"}
-    )
-
-
-def test_no_hostile_file_costs_more_than_its_limits(shown: dict[str, subprocess.CompletedProcess[str]]) -> None:
+def test_no_hostile_file_costs_more_than_its_limits(shown: dict[str, Outcome]) -> None:
     wrong = [
-        (name, done.returncode, done.stderr[-300:])
+        (name, done.code, done.err[-300:])
         for name, done in shown.items()
-        if done.returncode != (0 if name == "inputs.json" else 8) or "Traceback" in done.stderr
+        if done.code != (0 if name == "inputs.json" else 8) or "Traceback" in done.err
     ]
     assert not wrong
 
 
-def test_what_is_refused_says_in_which_file_and_what_is_too_much(
-    shown: dict[str, subprocess.CompletedProcess[str]],
-) -> None:
+@pytest.mark.parametrize(
+    ("words", "ends"), [("while True: pass", -signal.SIGXCPU), ("bytes(2 << 30)", 1)], ids=["time", "memory"]
+)
+def test_the_limits_hold(tmp_path: Path, words: str, ends: int) -> None:
+    """What costs more does end, and not well."""
+    (tmp_path / "costs.py").write_text(words)
+    assert spawn(tmp_path / "costs.py", "1", program=LIMITED).code == ends
+
+
+def test_what_is_refused_says_in_which_file_and_what_is_too_much(shown: dict[str, Outcome]) -> None:
     words = {
         "lists.json": "values",
         "deep-image.json": "levels",
@@ -147,8 +144,8 @@ def test_what_is_refused_says_in_which_file_and_what_is_too_much(
         "digits.toml": "digits.toml:1: an integer of more than",
         "unit.toml": "is not a unit",
     }
-    wrong = [(name, shown[name].stderr) for name, word in words.items() if word not in shown[name].stderr]
-    wrong += [(name, done.stderr) for name, done in shown.items() if done.returncode == 8 and name not in done.stderr]
+    wrong = [(name, shown[name].err) for name, word in words.items() if word not in shown[name].err]
+    wrong += [(name, done.err) for name, done in shown.items() if done.code == 8 and name not in done.err]
     assert not wrong
 
 
@@ -156,7 +153,7 @@ def test_a_calibration_of_many_terms_is_looked_at_in_bounded_time(tmp_path: Path
     path = tmp_path / "steep.json"
     path.write_text(steep())
     done = show(path)
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.err
 
 
 @pytest.mark.parametrize(

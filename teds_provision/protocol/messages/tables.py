@@ -322,12 +322,14 @@ NETWORK: Final[dict[tuple[int, int], Spec]] = {
 
 # In words, for people who look at what goes over a link: names, numbers and sizes, no content.
 
+_NUMBERS: Final = {kind: frozenset(map(int, kind)) for kind in (Function, TedsFunction)}
+
 
 def describe_command(command: Command) -> str:
     """Describe a command: name, class and function, payload octets; "Prove (128.8), 31 octets"."""
     number = f"{command.command_class}.{command.function}"
     kind = Function if command.command_class == SECURITY else TedsFunction
-    if command.command_class in (COMMON, SECURITY) and command.function in {int(code) for code in kind}:
+    if command.command_class in (COMMON, SECURITY) and command.function in _NUMBERS[kind]:
         number = f"{kind(command.function).name.replace('_', ' ').capitalize()} ({number})"
     elif (spec := COMMANDS.get((command.command_class, command.function))) is not None:
         number = f"{spec.name} ({number})"

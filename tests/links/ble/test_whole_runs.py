@@ -68,6 +68,11 @@ def over_the_air(station: OpenStation, reporter: SilentReporter, order: BuildOrd
         return provision(station, node, order, operator=AcceptingOperator(), reporter=reporter)
 
 
+@pytest.mark.nightly(
+    "tests/links/ble/test_port.py::test_a_request_whose_connection_is_cut_is_repeated_over_a_new_one, "
+    "tests/links/ble/test_port.py::test_an_order_whose_connection_is_cut_is_given_up, "
+    "tests/provisioning/test_provision.py::test_cut_at_every_message_the_same_command_carries_on"
+)
 def test_a_cut_in_the_middle_of_every_step_does_no_harm(station: OpenStation, air: Air, tmp_path: Path) -> None:
     tapped_once(station, tmp_path / "node")
     radio = air([tmp_path / "node"], manners={"mtu": 23})
@@ -184,6 +189,10 @@ def test_no_trigger_goes_over_the_air(desk: Desk, bench: Station) -> None:
     assert "CAN bus" in refused["message"]
 
 
+@pytest.mark.nightly(
+    "tests/firmware/test_ble.py::test_it_is_checked_written_verified_and_measured_over_the_air; the rules on the "
+    "Python node: tests/check/test_node_check.py::test_the_reference_node_keeps_every_rule"
+)
 def test_node_check_and_mode_work_over_the_air(desk: Desk, air: Air) -> None:
     home = desk.folder / "home"
     station = make_station(home)

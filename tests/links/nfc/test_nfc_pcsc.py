@@ -87,9 +87,15 @@ def scene(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Scene]:
     scene.close()
 
 
+OTHER_TAG = pytest.mark.nightly(
+    "tests/links/nfc/test_nfc_pcsc.py::test_a_node_is_identified_over_a_pc_sc_reader[4], "
+    "tests/links/nfc/test_nfc_pcsc.py::test_a_node_is_provisioned_over_a_pc_sc_reader[2]: either tag type once"
+)
+
+
 @pytest.mark.system
 @pytest.mark.link
-@pytest.mark.parametrize("scene", ["4", "2"], indirect=True)
+@pytest.mark.parametrize("scene", ["4", pytest.param("2", marks=OTHER_TAG)], indirect=True)
 def test_a_node_is_identified_over_a_pc_sc_reader(scene: Scene) -> None:
     none = scene.run("identify", "--nfc", READER, "--timeout", "1")
     assert (none["code"], none["error"]["code"]) == (5, "no-node")
@@ -109,7 +115,7 @@ def test_a_node_is_identified_over_a_pc_sc_reader(scene: Scene) -> None:
 
 @pytest.mark.system
 @pytest.mark.link
-@pytest.mark.parametrize("scene", ["4", "2"], indirect=True)
+@pytest.mark.parametrize("scene", ["2", pytest.param("4", marks=OTHER_TAG)], indirect=True)
 def test_a_node_is_provisioned_over_a_pc_sc_reader(scene: Scene) -> None:
     scene.do("put")
     words = ["provision", "--yes", "--profile", "temperature-sensor", "--nfc", READER, "--timeout", "40"]

@@ -97,7 +97,13 @@ def field() -> Iterator[Field]:
     field.close()
 
 
-@pytest.mark.parametrize("tag", ["4", "2"])
+OTHER_TAG = pytest.mark.nightly(
+    "tests/links/nfc/test_nfc_pulled.py::test_pulled_at_frames_all_over_an_exchange_between_two_processes[2], "
+    "tests/links/nfc/test_nfc_pulled.py::test_pulled_at_every_frame_below_a_usb_reader[4]: either tag type once"
+)
+
+
+@pytest.mark.parametrize("tag", ["2", pytest.param("4", marks=OTHER_TAG)])
 def test_pulled_at_frames_all_over_an_exchange_between_two_processes(
     field: Field, start_node: StartNode, tag: str
 ) -> None:
@@ -123,7 +129,7 @@ def test_pulled_at_frames_all_over_an_exchange_between_two_processes(
         watch.end()
 
 
-@pytest.mark.parametrize("tag", ["4", "2"])
+@pytest.mark.parametrize("tag", ["4", pytest.param("2", marks=OTHER_TAG)])
 def test_pulled_at_every_frame_below_a_usb_reader(chip: Chip, make_node: Callable[[str], Node], tag: str) -> None:
     node = make_node(tag)
     node.put_down()

@@ -10,6 +10,7 @@ import sys
 import time
 import xmlrpc.client
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -73,17 +74,17 @@ class Master:
         self.echoes.append(subprocess.Popen(command, env=self.environment, stdout=subprocess.PIPE, text=True))
         return self.echoes[-1]
 
-    def published(self) -> set[str]:
-        """Topics that somebody publishes, by the master."""
+    def published(self) -> dict[str, list[str]]:
+        """Topics that somebody publishes, and the names of who does, by the master."""
         return self._topics(0)
 
-    def heard(self) -> set[str]:
-        """Topics that somebody subscribes to, by the master."""
+    def heard(self) -> dict[str, list[str]]:
+        """Topics that somebody subscribes to, and the names of who does, by the master."""
         return self._topics(1)
 
-    def _topics(self, which: int) -> set[str]:
+    def _topics(self, which: int) -> dict[str, list[str]]:
         state: Any = xmlrpc.client.ServerProxy(self.uri).getSystemState("/test")
-        return {topic for topic, _ in state[2][which]}
+        return dict(state[2][which])
 
     def tool(self, *words: str) -> str:
         command = ["/usr/bin/python3", f"/usr/bin/{words[0]}", *words[1:]]
@@ -93,14 +94,39 @@ class Master:
 
 @pytest.fixture
 def master(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Master]:
+    """A master of this test alone, not started yet."""
     one = Master(tmp_path)
-    for name in ("ROS_IP", "ROS_HOME", "ROS_LOG_DIR"):
-        monkeypatch.setenv(name, one.environment[name])
-    yield one
-    for echo in one.echoes:
-        echo.kill()
-        echo.wait()
+    with _visited(one, monkeypatch):
+        yield one
     one.stop()
+
+
+@pytest.fixture(scope="module")
+def _standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Master]:
+    one = Master(tmp_path_factory.mktemp("master"))
+    one.start()
+    yield one
+    one.stop()
+
+
+@pytest.fixture
+def shared(_standing: Master, monkeypatch: pytest.MonkeyPatch) -> Iterator[Master]:
+    """A master that runs for all tests that end none: what a closed sink published is gone from it."""
+    with _visited(_standing, monkeypatch):
+        yield _standing
+
+
+@contextmanager
+def _visited(master: Master, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    for name in ("ROS_IP", "ROS_HOME", "ROS_LOG_DIR"):
+        monkeypatch.setenv(name, master.environment[name])
+    try:
+        yield
+    finally:
+        for echo in master.echoes:
+            echo.kill()
+            echo.wait()
+        master.echoes.clear()
 
 
 def ros1(master: Master, commands: Callable[[SetPointCommand], None] | None = None) -> Ros1Sink:
@@ -116,14 +142,13 @@ def feed(sink: Ros1Sink, k: int) -> None:
     sink.write_group(GroupRows("crane", ((ARM, 1), (HAND, 3)), np.array([time.time()]), values, values * 0))
 
 
-def test_debians_tools_see_topics_values_metadata_and_parameters(master: Master) -> None:
-    master.start()
-    sink = ros1(master)
+def test_debians_tools_see_topics_values_metadata_and_parameters(shared: Master) -> None:
+    sink = ros1(shared)
     sink.open([ANGLE, OIL, GRIP], STATION)
     sink.report(NodeReport(ARM, "running", lost=2))
     until(lambda: sink.stats.state == "running")
     feed(sink, 0)
-    reader, array = master.echo("/bench/hand/oil"), master.echo("/bench/crane")
+    reader, array = shared.echo("/bench/hand/oil"), shared.echo("/bench/crane")
     k = 0
     while reader.poll() is None or array.poll() is None:
         k += 1
@@ -139,43 +164,41 @@ def test_debians_tools_see_topics_values_metadata_and_parameters(master: Master)
     assert "variance: 0.03" in temperature
     assert "- arm/angle" in row
     assert "[1.0, nan]" in row
-    topics = set(master.tool("rostopic", "list").split())
+    topics = set(shared.tool("rostopic", "list").split())
     assert {"/bench/arm/angle", "/bench/hand/oil", "/bench/crane", "/bench/arm/teds", "/diagnostics"} <= topics
     assert "/bench/hand/force/cmd" not in topics, "nobody takes commands here"
-    assert master.tool("rostopic", "type", "/bench/arm/angle").strip() == "std_msgs/Float64"
-    latched = master.tool("rostopic", "echo", "-n", "1", "/bench/arm/teds")
+    assert shared.tool("rostopic", "type", "/bench/arm/angle").strip() == "std_msgs/Float64"
+    latched = shared.tool("rostopic", "echo", "-n", "1", "/bench/arm/teds")
     assert ANGLE.fingerprint in latched, "a late comer gets the metadata"
-    assert f"uuid: {ARM}" in master.tool("rosparam", "get", "/bench/arm/angle")
-    diagnostics = master.tool("rostopic", "echo", "-n", "1", "/diagnostics")
+    assert f"uuid: {ARM}" in shared.tool("rosparam", "get", "/bench/arm/angle")
+    diagnostics = shared.tool("rostopic", "echo", "-n", "1", "/diagnostics")
     assert 'key: "lost"' in diagnostics
     sink.close()
     assert sink.stats.error == ""
 
 
-def test_the_datasheet_of_a_node_that_got_another_name_is_found_under_that_alone(master: Master) -> None:
+def test_the_datasheet_of_a_node_that_got_another_name_is_found_under_that_alone(shared: Master) -> None:
     """As of an adopted board: its topics begin under the trusted name, and nobody finds the old datasheet any more."""
-    master.start()
-    sink = ros1(master)
+    sink = ros1(shared)
     sink.open([replace(ANGLE, unverified=True)], STATION)
-    until(lambda: "/bench/unverified/arm/teds" in master.published())
+    until(lambda: "/bench/unverified/arm/teds" in shared.published())
     sink.describe([ANGLE])
-    until(lambda: "/bench/arm/teds" in master.published())
-    until(lambda: "/bench/unverified/arm/teds" not in master.published())
-    assert ANGLE.fingerprint in master.tool("rostopic", "echo", "-n", "1", "/bench/arm/teds")
+    until(lambda: "/bench/arm/teds" in shared.published())
+    until(lambda: "/bench/unverified/arm/teds" not in shared.published())
+    assert ANGLE.fingerprint in shared.tool("rostopic", "echo", "-n", "1", "/bench/arm/teds")
     sink.close()
 
 
-def test_a_vector_and_a_wrench_are_messages_of_their_own(master: Master) -> None:
+def test_a_vector_and_a_wrench_are_messages_of_their_own(shared: Master) -> None:
     forces = [
         replace(ANGLE, number=n, name=f"f{n}", units=parse_units("N" if n < 4 else "N m"), vector=members)
         for members in ((1, 2, 3), (4, 5, 6))
         for n in members
     ]
-    master.start()
-    sink = ros1(master)
+    sink = ros1(shared)
     sink.open(forces, STATION)
     until(lambda: sink.stats.state == "running")
-    echo = master.echo("/bench/arm/wrench")
+    echo = shared.echo("/bench/arm/wrench")
     k = 0
     while echo.poll() is None:
         k += 1
@@ -192,16 +215,15 @@ def test_a_vector_and_a_wrench_are_messages_of_their_own(master: Master) -> None
     assert sink.stats.error == ""
 
 
-def test_a_command_topic_moves_an_actuator(master: Master) -> None:
-    master.start()
+def test_a_command_topic_moves_an_actuator(shared: Master) -> None:
     came: queue.Queue[SetPointCommand] = queue.Queue()
-    sink = ros1(master, came.put)
+    sink = ros1(shared, came.put)
     sink.open([GRIP], STATION)
     until(lambda: sink.stats.state == "running")
     topic = "/bench/hand/force/cmd"
     words = ["/usr/bin/rostopic", "pub", "-r", "5", topic, "std_msgs/Float64", "1.25"]
     command = ["/usr/bin/python3", *words]
-    publisher = subprocess.Popen(command, env=master.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    publisher = subprocess.Popen(command, env=shared.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         one = came.get(timeout=60)
     finally:
@@ -220,7 +242,7 @@ def test_without_a_master_it_waits_and_says_for_what_then_carries_on(master: Mas
     until(lambda: sink.stats.dropped == 3)
     master.start()
     until(lambda: sink.stats.state == "running")
-    until(lambda: "/bench/arm/teds" in master.tool("rostopic", "list"))
+    until(lambda: "/bench/arm/teds" in master.published())
     sink.close()
 
 
@@ -235,14 +257,13 @@ def test_a_master_and_a_child_that_die_are_survived(master: Master) -> None:
     until(lambda: sink.stats.state == "waiting")
     master.start()
     until(lambda: sink.stats.state == "running")
-    until(lambda: (sink.write(block(start=time.time())), "/bench/arm/angle" in master.tool("rostopic", "list"))[1])
+    until(lambda: (sink.write(block(start=time.time())), "/bench/arm/angle" in master.published())[1])
     sink.close()
     assert sink.stats.error == ""
 
 
-def test_nothing_of_the_child_outlives_the_sink(master: Master) -> None:
-    master.start()
-    sink = ros1(master)
+def test_nothing_of_the_child_outlives_the_sink(shared: Master) -> None:
+    sink = ros1(shared)
     sink.open([ANGLE], STATION)
     until(lambda: sink.stats.state == "running")
     child = sink._child
@@ -266,39 +287,37 @@ def test_a_child_that_waits_for_a_master_ends_when_its_parent_was_killed() -> No
     until(lambda: not Path(f"/proc/{orphan}").exists(), "the child outlives its parent")
 
 
-def test_two_stations_of_one_name_do_not_end_each_other(master: Master) -> None:
+def test_two_stations_of_one_name_do_not_end_each_other(shared: Master) -> None:
     """The master ends the node whose name another one takes: it comes back under a name of its own, and both stay."""
-    master.start()
-    sinks = [ros1(master), ros1(master)]
+    sinks = [ros1(shared), ros1(shared)]
     try:
         for sink in sinks:
             sink.open([ANGLE, FORCE], STATION)
-        until(lambda: master.tool("rostopic", "info", "/bench/crane").count(" * /teds_provision_bench") == 2)
-        publishers = master.tool("rostopic", "info", "/bench/crane")
-        assert publishers.count(f"/teds_provision_bench_{os.getpid()} ") == 1, publishers
+        until(lambda: len(shared.published().get("/bench/crane", [])) == 2)
+        publishers = shared.published()["/bench/crane"]
+        assert sorted(publishers) == ["/teds_provision_bench", f"/teds_provision_bench_{os.getpid()}"]
     finally:
         for sink in sinks:
             sink.close()
 
 
 @pytest.fixture
-def subscriber(master: Master) -> Iterator[subprocess.Popen[str]]:
+def subscriber(shared: Master) -> Iterator[subprocess.Popen[str]]:
     """A node that subscribed the group's rows before anybody published them."""
-    master.start()
     command = ["/usr/bin/python3", "-s", str(Path(__file__).with_name("ros1_subscriber.py")), "/bench/crane"]
-    reader = subprocess.Popen(command, env=master.environment, stdout=subprocess.PIPE, text=True)
+    reader = subprocess.Popen(command, env=shared.environment, stdout=subprocess.PIPE, text=True)
     yield reader
     reader.kill()
     reader.wait()
 
 
-def test_a_subscriber_gets_every_row_from_the_first_on(master: Master, subscriber: subprocess.Popen[str]) -> None:
+def test_a_subscriber_gets_every_row_from_the_first_on(shared: Master, subscriber: subprocess.Popen[str]) -> None:
     """Rows come in bursts of 20, as a thousand a second do, the first before he has connected; then it ends at once."""
     assert subscriber.stdout is not None
     while subscriber.stdout.readline() != "ready\n":  # before it stands that it waited for the master
         assert subscriber.poll() is None
-    until(lambda: "/listener" in master.tool("rostopic", "info", "/bench/crane"))
-    sink = ros1(master)
+    until(lambda: "/listener" in shared.heard().get("/bench/crane", []))
+    sink = ros1(shared)
     sink.open([ANGLE, FORCE], STATION)
     until(lambda: sink.stats.state == "running")
     sent = list(range(400))
