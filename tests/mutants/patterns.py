@@ -656,6 +656,20 @@ PATTERNS = (
         "tests/ncap/test_guard_origin.py",
     ),
     Pattern(
+        "a node that is switched off looks no more",
+        "Peripheral._look_after",
+        "not self._is_off",
+        "True",
+        "tests/links/ble/test_power_off.py",
+    ),
+    Pattern(
+        "a node that is switched off ends its sessions",
+        "Peripheral.power_off",
+        "asyncio.to_thread(_finish_turns, lines)",
+        "asyncio.sleep(0)",
+        "tests/links/ble/test_power_off.py",
+    ),
+    Pattern(
         "a request comes from the page's own origin",
         "_require_origin",
         "headers['origin'].lower() not in named.origins",

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
@@ -30,6 +31,8 @@ _LONGEST: Final = 0xFFFF
 _FIRST_SOURCE: Final = 2
 _MOST_WAITING: Final = 4
 _LOOK_SECONDS: Final = 0.5
+_END_SECONDS: Final = 3.0
+"""For commands that run when the node is switched off."""
 _INTERVAL_MS: Final = 100
 _FLAGS: Final = b"\x06"
 """LE general discoverable, no BR/EDR."""
@@ -68,6 +71,7 @@ class Peripheral:
         self._advertising = False
         self._news = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
+        self._is_off = False
         self._device: Any = None
         self._notify: Any = None
         self._data: Any = None
@@ -102,15 +106,18 @@ class Peripheral:
 
     async def power_off(self) -> None:
         """End every connection and every session."""
+        self._is_off = True
         if self._task is not None:
             self._task.cancel()
             with suppress(asyncio.CancelledError):
                 await self._task
-        for line in list(self._lines.values()):
+        lines = list(self._lines.values())
+        for line in lines:
             await self._drop(line)
         with suppress(Exception):
             await self._device.stop_advertising()
             await self._device.power_off()
+        await asyncio.to_thread(_finish_turns, lines)  # the workers' end drops what waits: a session would not end
         await asyncio.to_thread(self._workers.end)
 
     def tapped(self) -> None:
@@ -129,7 +136,7 @@ class Peripheral:
     # -- advertising -----------------------------------------------------------------------------------------------
 
     async def _look_after(self) -> None:
-        while True:
+        while not self._is_off:  # until Python 3.12, wait_for loses a cancellation that comes together with its event
             try:
                 await self._look()
             except Exception:  # noqa: BLE001 - bumble raises what its controller says; it is tried again at the next look
@@ -273,6 +280,15 @@ class Peripheral:
         line = self._line_of(connection)
         if line is not None and value[:1] == b"\0":
             line.turns.put(lambda: self._node.drive(line.name, bytes(value[1:])))
+
+
+def _finish_turns(lines: Sequence[CentralState]) -> None:
+    """Wait until the jobs of these connections have run, the loss of each among them."""
+    until = time.monotonic() + _END_SECONDS
+    for line in lines:
+        ended = threading.Event()
+        line.turns.put(ended.set)
+        ended.wait(max(0.0, until - time.monotonic()))
 
 
 def _unread(_connection: Any) -> bytes:
