@@ -85,7 +85,8 @@ def _in_memory_is_room() -> bool:
         IN_MEMORY.mkdir(mode=0o700, exist_ok=True)
     except OSError:
         return False
-    return IN_MEMORY.stat().st_uid == os.getuid() and found.f_bavail * found.f_frsize >= ROOM
+    runs_programs = not found.f_flag & os.ST_NOEXEC  # tests compile programs there
+    return runs_programs and IN_MEMORY.stat().st_uid == os.getuid() and found.f_bavail * found.f_frsize >= ROOM
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
