@@ -11,7 +11,7 @@ import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeGuard
@@ -30,13 +30,18 @@ class Module:
     imports: frozenset[str]
 
 
-def modules() -> dict[str, Module]:
-    """Every module of the package by its dotted name."""
+def parsed(path: Path) -> ast.Module:
+    """Return the tree of a file."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def modules(parse: Callable[[Path], ast.Module] = parsed) -> dict[str, Module]:
+    """Every module of the package by its dotted name; ``parse`` may keep the trees."""
     found: dict[str, tuple[Path, ast.Module]] = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
         name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-        found[name] = path, ast.parse(path.read_text(encoding="utf-8"))
+        found[name] = path, parse(path)
     return {
         name: Module(name, path, tree, frozenset(_targets(tree, set(found)) - {name}))
         for name, (path, tree) in found.items()

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.optional_rooms import OPTIONAL, Hook, load, rooms
+from tests.parsed import parsed
 
 PACKAGE = Path(__file__).parent.parent / "teds_provision"
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -85,11 +86,6 @@ def imports(tree: ast.AST) -> Iterator[tuple[str, int]]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "imports are absolute"
             yield from ((f"{node.module}.{alias.name}", node.lineno) for alias in node.names)
-
-
-@cache
-def parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"), str(path))
 
 
 def may_import(room: str) -> set[str]:

@@ -10,6 +10,7 @@ import pytest
 import teds_provision
 from teds_provision.client import ApiError
 from teds_provision.errors import EXIT_CODES, LinkError, NotFoundError
+from tests.parsed import parsed
 
 
 def test_a_word_that_nobody_can_read_is_cut_in_the_middle() -> None:
@@ -26,7 +27,7 @@ def test_each_code_of_the_tree_has_an_exit_code_which_the_client_has_too() -> No
     codes = {
         part.value.value
         for file in files
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        for node in ast.walk(parsed(file))
         if isinstance(node, ast.ClassDef) and node.name.endswith("Error")
         for part in node.body
         if isinstance(part, ast.Assign | ast.AnnAssign) and ast.unparse(part).startswith("code")

@@ -18,6 +18,8 @@ from typing import Any
 
 import pytest
 
+from tests.parsed import parsed
+
 ROOT = Path(__file__).parent.parent
 
 LATE_IMPORTS = {
@@ -53,7 +55,7 @@ def house() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def modules(house: ModuleType) -> dict[str, object]:
-    return dict(house.modules())
+    return dict(house.modules(parsed))
 
 
 def test_no_files_import_each_other(house: ModuleType, modules: dict[str, Any]) -> None:

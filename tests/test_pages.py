@@ -7,6 +7,8 @@ import re
 from functools import cache
 from pathlib import Path
 
+from tests.parsed import parsed
+
 ROOT = Path(__file__).parent.parent
 _FOLDERS = (ROOT / "docs" / "contract", ROOT / "docs" / "internals", ROOT / "docs", ROOT / "docs" / "adr", ROOT)
 PAGES = {page.name: page for folder in _FOLDERS for page in folder.glob("*.md")}
@@ -67,7 +69,7 @@ ROLE = re.compile(r":(mod|func|class|meth|data|attr|exc):`~?([^`]+)`")
 def defined(path: Path) -> set[str]:
     """Functions, classes and constants that a file makes."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(parsed(path)):
         match node:
             case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
                 found.add(name)
@@ -168,7 +170,7 @@ def texts(*folders: str) -> str:
     found: list[str] = []
     for folder in folders:
         for path in (ROOT / folder).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            for node in ast.walk(parsed(path)):
                 if isinstance(node, ast.Constant) and isinstance(node.value, str):
                     found.append(node.value)
                 elif isinstance(node, ast.JoinedStr):
