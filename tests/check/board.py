@@ -68,6 +68,12 @@ def _block_of(size: int, gap: int) -> Bend:
     return bend
 
 
+def _choosing_otherwise(patch: pytest.MonkeyPatch) -> None:
+    """Block size, gap and padding are none of those that are usual."""
+    _block_of(8, 2)(patch)
+    _padded_with(0)(patch)
+
+
 def _always_classic(patch: pytest.MonkeyPatch) -> None:
     original = isotp.Pair.speak
     patch.setattr(isotp.Pair, "speak", lambda self, fd: original(self, fd=False))
@@ -102,6 +108,7 @@ LINK_FAULTS: dict[str, Bend] = {
     "runs again": _runs_again,
     "padding 00": _padded_with(0),
     "block size 8": _block_of(8, 0),
+    "each choice": _choosing_otherwise,
     "gap of 5 ms": _block_of(16, 5),
     "found as of an older epoch": _stale,
     "always classic": _always_classic,

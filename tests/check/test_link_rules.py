@@ -96,7 +96,7 @@ def test_a_fault_of_the_link_is_found(
 
 
 OTHER_CHOICE = pytest.mark.nightly(
-    "tests/check/test_link_rules.py::test_what_a_node_may_choose_is_told_and_not_failed, one choice of three; "
+    "tests/check/test_link_rules.py::test_what_a_node_may_choose_is_told_and_not_failed, one choice of four; "
     "tests/links/can/test_can_small_nodes.py::test_a_node_asks_for_its_own_block_size_and_gap"
 )
 
@@ -105,7 +105,8 @@ OTHER_CHOICE = pytest.mark.nightly(
     ("choice", "told"),
     [
         pytest.param("padding 00", "padding 00", marks=OTHER_CHOICE),
-        ("block size 8", "block size 8, STmin 0 ms"),
+        pytest.param("block size 8", "block size 8, STmin 0 ms", marks=OTHER_CHOICE),
+        ("each choice", "block size 8, STmin 2 ms; padding 00"),
         pytest.param("gap of 5 ms", "block size 16, STmin 5 ms", marks=OTHER_CHOICE),
     ],
 )

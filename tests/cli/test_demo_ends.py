@@ -33,13 +33,12 @@ def test_the_whole_story_as_make_demo_starts_it(tmp_path: Path) -> None:
 
 
 OTHER_SIGNAL = pytest.mark.nightly(
-    "tests/cli/test_demo_ends.py::test_an_ended_demo_takes_its_node_and_its_folder_away[2], and "
-    "tests/cli/test_signals.py::test_no_signal_handler_takes_a_lock holds what both signals share"
+    "tests/cli/test_demo_ends.py::test_an_ended_demo_takes_its_node_and_its_folder_away[15] ends by the same way"
 )
 
 
 @pytest.mark.link
-@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=OTHER_SIGNAL), signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=OTHER_SIGNAL)])
 def test_an_ended_demo_takes_its_node_and_its_folder_away(tmp_path: Path, number: signal.Signals) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "teds_provision", "demo"],
