@@ -2,7 +2,8 @@
 
 Every session reads the Security TEDS. If the node has started since its other TEDS were read, it is measured at once by
 the signed copy, and they are read again in the air time that data leave free: one node at a time on a bus, the frames
-of a reply apart from each other, and after each exchange a pause that is longer than it took.
+of a reply apart from each other, and after each exchange a pause that is longer than it took. While others on the bus
+begin, nothing is read for a while: when two hundred are switched on together, the last one's first value comes sooner.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from teds_provision.teds.image import Image
 
 GAP: Final = 1  # ms between the frames of a reply: of a bus of 500 kbit/s three quarters stay free meanwhile
 SPARING: Final = 4.0  # times as long as an exchange took nothing more is read
-FIRST: Final = 1.0  # seconds from the first value on in which nothing is read: others on the bus are still beginning
+FIRST: Final = 1.0  # seconds from the first value on in which nothing is read: others on the bus are about to begin
+PATIENCE: Final = 60.0  # seconds for which nodes that begin go first: one may begin again and again
 AGAIN: Final = 10.0  # seconds until the next try if the node did not answer, or was busy
 TRIES: Final = 5
 
@@ -39,6 +41,7 @@ class BackgroundReread:
         self._mine = False
         self._began = time.time()
         self._due = time.monotonic() + FIRST
+        self._patient_until = self._due + PATIENCE
         self._left = TRIES
 
     def step(self) -> bool:
@@ -47,7 +50,7 @@ class BackgroundReread:
         Raises BadDatasheetError if the TEDS differ from those on which the values rest; SessionLostError.
         """
         began = time.monotonic()
-        if began < self._due:
+        if began < self._due or (self._bus.beginning and began < self._patient_until):
             return True
         if not self._mine:
             self._mine = self._bus.reading.acquire(blocking=False)

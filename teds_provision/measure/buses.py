@@ -28,6 +28,8 @@ class MeasuredBus:
         self.discovery = port.discover(sightings, poll=poll)
         self.reading = threading.Lock()
         """Held while a datasheet is read behind a measurement: one node at a time."""
+        self.beginning: set[bytes] = set()
+        """Nodes that are on their way from Open to their first stream; each is put in and taken out by its thread."""
 
     @property
     def place(self) -> str:

@@ -310,6 +310,13 @@ class NodeSupervisor:
 
     def _in_session(self, bus: MeasuredBus, sighting: Sighting, standing: NodeStanding) -> None:
         self._announced = self._elsewhere = 0.0
+        bus.beginning.add(self.uuid)
+        try:
+            self._open_and_measure(bus, sighting, standing)
+        finally:
+            bus.beginning.discard(self.uuid)
+
+    def _open_and_measure(self, bus: MeasuredBus, sighting: Sighting, standing: NodeStanding) -> None:
         self._buses.presence.on_announce(sighting, self._heard_announce, self._seen_elsewhere)
         with Conversation(sighting.contact(), notice=lambda _notice: None, busy_seconds=BUSY) as node:
             if isinstance(node.contact.link, CancellableLink):
@@ -332,6 +339,7 @@ class NodeSupervisor:
             answers = False
             try:
                 self._measure(bus, trusted, sighting.address)
+                bus.beginning.discard(self.uuid)
                 standing.drives = self._driven is not None
                 standing.unsigned = trusted.unsigned or trusted.unverified
                 self._keep(bus, trusted, standing)

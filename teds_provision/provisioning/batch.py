@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Final
 
@@ -74,8 +75,10 @@ from teds_provision.teds.profile import default_folders, load_profile
 _LEAVING_SECONDS: Final = 10.0
 """Seconds in which boards that are worked on end their durable steps, once their bus is closed."""
 _TOKEN_WORKERS: Final = 1
-_SHOWN: Final = 5
 """A token takes one command at a time."""
+_SHOWN: Final = 5
+_AT_THE_BOARD: Final = ("numpy",)
+"""Libraries that the reading of a sensor needs."""
 
 
 @dataclass(frozen=True)
@@ -166,6 +169,7 @@ class BatchRun:
 
     def one(self, operator: Operator) -> ProvisionResult:
         """Provision the one node; raises what ends it."""
+        _load_ahead()
         with meet(self._station, self._links, self.node, self._reporter, before=self._station.unlock) as node:
             return self._provision(node, operator)
 
@@ -272,6 +276,7 @@ class BatchRun:
         try:
             if self.progress is not None and not self.progress.open:
                 return
+            _load_ahead()
             self._station.unlock()
             for board in self._all_at_once(operator) if self._request.everyone else self._as_they_come(operator):
                 self._note(board)
@@ -532,6 +537,23 @@ class BatchRun:
                 self.progress.not_this_board(row, board)
             else:
                 self.progress.note(row, board)
+
+
+def _load_ahead() -> threading.Thread:
+    """Load what a board needs in a thread, while the vault is opened and a board is waited for; return the thread.
+
+    Loaded at its first use, it would hold up the conversation while the sensors are claimed. What cannot be loaded
+    fails there.
+    """
+
+    def load() -> None:
+        for module in _AT_THE_BOARD:
+            with suppress(ImportError):
+                import_module(module)
+
+    thread = threading.Thread(target=load, name="loading ahead", daemon=True)
+    thread.start()
+    return thread
 
 
 def _progress(station: Station, request: ProvisionRequest, order: BuildOrder) -> Progress | None:

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import sys
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import KeyMismatchError, NotAuthenticError
+from teds_provision.errors import KeyMismatchError, NotAuthenticError, VaultLockedError
+from teds_provision.links import LinkSettings
 from teds_provision.node.hardware.board import Board as Hardware
 from teds_provision.node.node_template import create
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.provisioning import batch
 from teds_provision.provisioning.agree import agree
+from teds_provision.provisioning.batch import ProvisionRequest
 from teds_provision.provisioning.build import BuildOrder
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.identify import examine, identify
+from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.provisioning.teds_read import take_snapshot
@@ -191,3 +197,32 @@ def test_a_read_only_teds_beside_the_datasheet_is_asked_about_once_and_stays(sta
     with talk(board) as node:
         found = take_snapshot(node)
         assert [block for block in found.image if found.is_read_only(block)] == [extra]
+
+
+# -- what is not loaded in the middle of a conversation ----------------------------------------------------------------
+
+
+def test_what_a_reading_needs_is_loaded_while_the_vault_is_opened(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """numpy was loaded after the claim, for 80 ms: as long as all of a provisioning over CAN FD."""
+    assert "numpy" in batch._AT_THE_BOARD
+    monkeypatch.delitem(sys.modules, "colorsys", raising=False)
+    monkeypatch.setattr(batch, "_AT_THE_BOARD", ("no_such_module", "colorsys"))
+    threads: list[threading.Thread] = []
+    plain = batch._load_ahead
+    monkeypatch.setattr(batch, "_load_ahead", lambda: threads.append(plain()))
+
+    def unlock(_uuid: bytes | None = None) -> None:
+        assert len(threads) == 1
+        threads[0].join(60)
+        assert "colorsys" in sys.modules
+        raise VaultLockedError("It was asked for.")
+
+    monkeypatch.setattr(station, "unlock", unlock)
+    links = LinkSettings("nfc", nfc="udp:127.0.0.1:1", timeout=1.0)
+    for request in (ProvisionRequest(order=BuildOrder(ANGLE)), ProvisionRequest(order=BuildOrder(ANGLE), watch=True)):
+        threads.clear()
+        boards = batch.BatchRun(station, links, request, SilentReporter())
+        with pytest.raises(VaultLockedError):
+            list(boards.many(AcceptingOperator())) if request.watch else boards.one(AcceptingOperator())

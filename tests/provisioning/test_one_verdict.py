@@ -7,6 +7,7 @@ in ncap), a Security TEDS alone taken for a whole datasheet, a stranger's plain 
 from __future__ import annotations
 
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.errors import BadDatasheetError, NotAuthenticError
+from teds_provision.measure import background_reread
 from teds_provision.measure.background_reread import BackgroundReread
 from teds_provision.measure.verified_session import open_trusted
 from teds_provision.provisioning import readings
@@ -279,7 +281,7 @@ def test_a_board_that_was_replaced_under_its_uuid_has_no_reading(station: Statio
 
 def read_behind(station: Station, board: Board) -> list[str]:
     """The rest of a node read as the keeper does; the outcomes of its steps, the last one an error where it raised."""
-    bus = SimpleNamespace(reading=threading.Lock())
+    bus = SimpleNamespace(reading=threading.Lock(), beginning=set())
     with talk(board, over_the_bus(board)) as node:
         trusted = open_trusted(station, node, by="ncap")
         rest = BackgroundReread(station, trusted, bus, by="ncap")  # type: ignore[arg-type]
@@ -312,13 +314,37 @@ def test_a_change_that_is_found_behind_a_measurement_ends_it(station: Station, b
 
 def test_a_bus_that_another_node_is_read_on_is_waited_for(station: Station, board: Board) -> None:
     board.power_on()
-    bus = SimpleNamespace(reading=threading.Lock())
+    bus = SimpleNamespace(reading=threading.Lock(), beginning=set())
     link = over_the_bus(board)
     with talk(board, link) as node, bus.reading:
         rest = BackgroundReread(station, open_trusted(station, node, by="ncap"), bus, by="ncap")  # type: ignore[arg-type]
         rest._due, asked = 0.0, link.count
         assert rest.step()
         assert link.count == asked
+
+
+def test_nodes_that_begin_go_first_but_not_for_ever(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two hundred switched on together, the first ones were read whole while the last ones waited for the bus."""
+    now = time.monotonic()
+    monkeypatch.setattr("teds_provision.measure.background_reread.time.monotonic", lambda: now)
+    board.power_on()
+    bus = SimpleNamespace(reading=threading.Lock(), beginning={bytes(10)})
+    link = over_the_bus(board)
+    with talk(board, link) as node:
+        rest = BackgroundReread(station, open_trusted(station, node, by="ncap"), bus, by="ncap")  # type: ignore[arg-type]
+        asked = link.count
+        now += background_reread.PATIENCE
+        assert rest.step()
+        assert link.count == asked
+        bus.beginning.clear()
+        assert rest.step()
+        assert link.count == asked + 1
+        bus.beginning.add(bytes(10))
+        now += background_reread.FIRST + 1.0
+        assert rest.step()
+        assert link.count == asked + 2, "one that begins again and again is not waited for"
 
 
 def test_a_node_without_its_key_is_not_authentic_by_any_row(station: Station, board: Board) -> None:
