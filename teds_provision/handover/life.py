@@ -12,7 +12,6 @@ from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.handover.revocation import seal_revocation
 from teds_provision.protocol.handover.strict_json import is_label
 from teds_provision.provisioning.build import BuildOrder, build
-from teds_provision.provisioning.sign import known_image
 from teds_provision.station.measurements import HandedOn
 from teds_provision.station.station import Station
 from teds_provision.station.store import NodeRecord, RevocationRecord
@@ -126,7 +125,7 @@ def _calibration_of(station: Station, old: NodeRecord) -> dict[BlockId, bytes]:
 
     Raises NotFoundError, BadDataError (they cannot be built in).
     """
-    image = known_image(station, old.uuid) or Image(old.uuid, {})
+    image = station.datasheets.datasheet(old.uuid) or Image(old.uuid, {})
     blocks = {
         block: octets for block, octets in image.blocks.items() if block[1] == AccessCode.CALIBRATION and block[0]
     }

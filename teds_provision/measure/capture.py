@@ -16,9 +16,9 @@ from teds_provision.links import LinkSettings
 from teds_provision.measure.sample_series import SampleSeries, reference_for, require_still, take_samples_of
 from teds_provision.measure.sources import beside
 from teds_provision.measure.verified_session import open_trusted
-from teds_provision.provisioning.commands import at_node
 from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.provisioning.progress import Reporter, Steps
+from teds_provision.provisioning.visit import at_node
 from teds_provision.station.station import Station
 from teds_provision.teds.calibration.points import Point, points_of, with_point
 from teds_provision.teds.calibration.zero import reading_of

@@ -23,12 +23,13 @@ from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.operation.commands import ChannelState
 from teds_provision.provisioning.agree import require_session
 from teds_provision.provisioning.calibration_guard import guard
-from teds_provision.provisioning.commands import NodeVisit, at_node
+from teds_provision.provisioning.charge import Low, wait_for_charge
 from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.provisioning.progress import DONE, NOTHING, Reporter, StepResult, Steps
 from teds_provision.provisioning.sign import require_not_measured, sign
 from teds_provision.provisioning.verify_node import NodeVerification, verify_in_session, verify_node
-from teds_provision.provisioning.write import Low, wait_for_charge, write
+from teds_provision.provisioning.visit import NodeVisit, at_node
+from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.zero import offset_for, reading_of, shortest, turn_of, with_zero_offset

@@ -42,8 +42,8 @@ from teds_provision.ncap.settings import Detection, Settings, own_source
 from teds_provision.ncap.sinks import DaemonSinks
 from teds_provision.ncap.waits import USUAL, Waits
 from teds_provision.ncap.web.tokens import Tokens
-from teds_provision.provisioning.commands import locate_here, locate_measured
 from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.locate import locate_here, locate_measured
 from teds_provision.shapes.problem import Problem, problem_of
 from teds_provision.station.station import Station
 

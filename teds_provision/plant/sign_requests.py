@@ -50,12 +50,13 @@ from teds_provision.protocol.plant.signing import (
     open_request,
     seal_request,
 )
+from teds_provision.provisioning.agree import require_session
 from teds_provision.provisioning.build import own_name
-from teds_provision.provisioning.commands import at_node
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.progress import Reporter
 from teds_provision.provisioning.sign import SignResult
 from teds_provision.provisioning.teds_read import read_identity
+from teds_provision.provisioning.visit import at_node
 from teds_provision.station.plant.line import SignRequestRow
 from teds_provision.station.station import Station
 from teds_provision.station.store import Draft
@@ -382,7 +383,7 @@ def sign_by_office(station: Station, links: LinkSettings, order: OfficeOrder, re
             office = RemoteOffice(station, transport_for(station, order.files), links.timeout)
             stack.callback(office.close)
         with at_node(station, links, uuid, reporter, unlock="always") as visit:
-            visit.session()
+            require_session(station, visit.node)
             identity, image = read_identity(visit.node), Image(uuid, draft.image.unsigned_blocks())
             keys = SignedNodeKey(uuid, visit.who.point, visit.who.key_signature)
             octets = read_limited(order.calibration, 1 << 20, "calibration") if order.calibration is not None else None

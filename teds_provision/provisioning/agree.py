@@ -17,8 +17,10 @@ from teds_provision.errors import (
     NodeRefusedError,
     NodeSilentError,
     NotAuthenticError,
+    NotWhitelistedError,
     PolicyError,
 )
+from teds_provision.links import LINKS, LinkSettings
 from teds_provision.links.opening import without_source
 from teds_provision.protocol.datasheet import signature_good, station_signature_good
 from teds_provision.protocol.fingerprints import is_whole
@@ -28,7 +30,9 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.wire_agreement import AgreedKey, StationAgreement, TranscriptMismatchError, fit_to_agree
 from teds_provision.provisioning.conversation import OTHER_OWNER_REMEDY, Conversation, SessionLostError
 from teds_provision.provisioning.identify import IdentifiedNode
+from teds_provision.provisioning.progress import Reporter
 from teds_provision.provisioning.teds_read import read_block, read_identity
+from teds_provision.provisioning.visit import at_node
 from teds_provision.station.station import NodeKey, Station
 from teds_provision.station.store import KeyRecord, WhitelistEntry, utc_now
 from teds_provision.teds.codec import security
@@ -564,3 +568,51 @@ def proof_of_reset(node: Conversation, point: bytes) -> ResetReceipt:
     if not verify(point, reset_message(node.uuid, epoch, challenge), proof):
         raise NotAuthenticError("The node's reset receipt is not valid; its keys are kept here.")
     return ResetReceipt(epoch, challenge, proof)
+
+
+@dataclass(frozen=True)
+class AgreeReport:
+    """Result of ``agree``; for a dry run ``agreed`` is None, and ``plan`` describes it."""
+
+    uuid: bytes
+    agreed: AgreeResult | None
+    plan: str = ""
+    held: tuple[str, ...] = ()
+
+
+def agree_at(
+    station: Station,
+    links: LinkSettings,
+    node: str,
+    reporter: Reporter,
+    *,
+    rotate: bool = False,
+    dry_run: bool = False,
+    confirm: Callable[[str], object] | None = None,
+) -> AgreeReport:
+    """Agree on a key with the node that ``node`` names (UUID, prefix, name), or rotate it; see :func:`agree`.
+
+    ``confirm`` is asked if the key came back from a backup and the node is not tapped, and before a node is taken over
+    from another station; it raises for a no.
+    """
+    uuid = station.nodes.resolve(node)
+    try:
+        station.policy.require_whitelisted(uuid)
+    except NotWhitelistedError:  # if another owner's CA refuses a take-over, to whitelist the node is of no use
+        if dry_run or not rotate:
+            raise
+    if dry_run:
+        held = tuple(f"{record.state} key of epoch {record.epoch}" for record in station.keys.keys_of(uuid))
+        return AgreeReport(uuid, None, ("rotate" if rotate else "keep") if held else "agree on a first key", held)
+    if confirm and station.keys.restored(uuid) and rotate and not LINKS[links.via].capabilities.tapped:
+        confirm(f"Node {uuid.hex()} is {station.keys.rotation_due(uuid)}. Is it still this station's?")
+    links = replace(links, via_chosen=True)  # a first key is agreed on by a tap, unless a bus is named
+    take_over: TakeOver | None = None if confirm is None else lambda question, _refusal: confirm(question)
+    with at_node(station, links, uuid, reporter, unlock="always", writes="agree") as visit:
+        return AgreeReport(uuid, agree(station, visit.node, visit.who, rotate=rotate, take_over=take_over))
+
+
+def reset_at(station: Station, links: LinkSettings, uuid: bytes, reporter: Reporter) -> ResetReceipt:
+    """Reset a node; see :func:`reset_node`."""
+    with at_node(station, links, uuid, reporter, writes="reset") as visit:
+        return reset_node(station, visit.node, visit.who)

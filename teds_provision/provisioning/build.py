@@ -37,7 +37,7 @@ from teds_provision.provisioning.board_type import (
     topic_warnings,
 )
 from teds_provision.provisioning.calibration_guard import guard, is_calibrated, merged
-from teds_provision.provisioning.sign import known_image, known_node_keys, unsigned_security
+from teds_provision.provisioning.sign import known_node_keys, unsigned_security
 from teds_provision.provisioning.teds_read import NodeSnapshot
 from teds_provision.provisioning.verify import FreshnessFloor, verify_image
 from teds_provision.sanitize import printable
@@ -509,7 +509,7 @@ def build(
     refuses).
     """
     prepared = named_for(station, uuid, prepare(station, order, uuid))
-    has = has or known_image(station, uuid)
+    has = has or station.datasheets.datasheet(uuid)
     if has is not None and prepared.profile is not None and not order.retype:
         changes = differences(has.blocks, prepared.profile, prepared.calibrations or ())
         if changes and not is_remembered(station, uuid, order.profile, factory=False):

@@ -10,7 +10,7 @@ from typing import Final
 
 from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, PolicyError
 from teds_provision.protocol.messages.firmware import ABOUT
-from teds_provision.protocol.messages.frames import Function, Reason, security_command
+from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.station.firmware import (
@@ -50,18 +50,6 @@ def read_firmware(node: Conversation, *, once: bool = False) -> FirmwareReading 
         report = decoded_report(payload)
     node.reported_firmware = (node.open_counter if node.sealed else None, report)
     return FirmwareReading(report, node.sealed)
-
-
-def locate(node: Conversation, seconds: int) -> None:
-    """Make a node blink or beep, 0: stop; needs a session, or a node in factory state. Raises NodeRefusedError."""
-    try:
-        node.request_retry_once(security_command(Function.LOCATE, bytes([seconds])), "to blink")
-    except NodeRefusedError as refusal:
-        if refusal.reason != Reason.UNKNOWN_COMMAND:
-            raise
-        raise NodeRefusedError(
-            f"Node {node.uuid.hex()} cannot blink or beep.", reason=refusal.reason, hint="Press its button instead."
-        ) from refusal
 
 
 class FirmwareError(PolicyError):

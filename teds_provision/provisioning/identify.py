@@ -4,22 +4,37 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from teds_provision import teds
-from teds_provision.errors import KeyringUnavailableError, NodeRefusedError, NotAuthenticError, WrongPassphraseError
+from teds_provision.errors import (
+    KeyringUnavailableError,
+    NodeRefusedError,
+    NotAuthenticError,
+    PolicyError,
+    TedsProvisionError,
+    WrongPassphraseError,
+)
+from teds_provision.links import LinkSettings, Notice
 from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.keys import CHALLENGE_OCTETS, fingerprint, node_key_good, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
-from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.firmware import keep_firmware, read_firmware
+from teds_provision.provisioning.meeting import Arrival, meet_everyone, watch_nodes
+from teds_provision.provisioning.parallel import ParallelWork
+from teds_provision.provisioning.progress import Reporter
 from teds_provision.provisioning.readings import keep_shown
 from teds_provision.provisioning.teds_read import read_block
 from teds_provision.sanitize import printable
+from teds_provision.station.firmware import KnownFirmware, firmware_of
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry, utc_now
+from teds_provision.station.store.records import Assurance
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import SECURITY
@@ -208,3 +223,136 @@ def describe(node: Conversation) -> Description:
         name = printable(found) if isinstance(found, str) else name
         channels = count if isinstance(count, int) else channels
     return Description(name, channels)
+
+
+def new_whitelist_entry(station: Station, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
+    """Return the whitelist entry of an identified node, pinned to its key by tap, or by the bus of a new node.
+
+    A node that already has a key is not pinned over a bus, where any device may show any UUID; its first tap does. Over
+    the air nothing is pinned. Changes nothing. Raises PolicyError (revoked), KeyMismatchError.
+    """
+    new = who.state == NodeState.FACTORY and node.wired
+    assurance: Assurance = "tap" if node.tapped else "bus" if new else "uuid"
+    with station.reading():
+        revoked = station.policy.revocation(who.uuid)
+        if revoked is not None:
+            raise PolicyError(f"Node {who.uuid.hex()} was revoked: {revoked.why}.", hint="It was not whitelisted.")
+        station.pins.check(who.uuid, who.point)
+    return WhitelistEntry(who.uuid, who.fingerprint if node.tapped or new else None, assurance=assurance)
+
+
+def add_to_whitelist(station: Station, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
+    """Whitelist a node by :func:`new_whitelist_entry`; an entry that another process made meanwhile stays."""
+    entry = new_whitelist_entry(station, node, who)
+    with station.durable("whitelist"):
+        present = station.pins.entry(who.uuid)
+        if present is not None:
+            return present
+        station.pins.put(entry)
+        if entry.fingerprint is not None:
+            station.nodes.remember(who.uuid, point=who.point)
+        station.audit("whitelist", who.uuid, "added", fingerprint=entry.fingerprint, assurance=entry.assurance)
+    return entry
+
+
+@dataclass(frozen=True)
+class ProvenNode:
+    """A node that proved its key; ``identity`` is its plain Identify, a hint, and so is that its button was pressed."""
+
+    who: IdentifiedNode
+    identity: Identity
+    whitelisted: bool
+    channels: int
+    name: str | None
+    charging: dict[str, object] | None = None
+    ble: str | None = None
+    firmware: KnownFirmware | None = None
+    pressed: bool = False
+
+
+def identify_at(
+    station: Station,
+    links: LinkSettings,
+    reporter: Reporter,
+    *,
+    add: bool = False,
+    watch: bool = False,
+    stop: threading.Event | None = None,
+) -> Iterator[Arrival[ProvenNode]]:
+    """Identify the present node, or (``watch``) each that comes until ``stop``; ``add`` whitelists proven ones.
+
+    With ``watch`` an error ends one node only. Without it that is so if another node was identified, and it is reported
+    as a notice; else the first error is raised.
+    """
+    if add:
+        station.unlock()  # before a node is there: the vault makes a pin's MAC
+    if watch:
+        yield from watch_nodes(links, lambda node: _identified(station, node, add), reporter, stop or threading.Event())
+        return
+    first: TedsProvisionError | None = None
+    proven: list[tuple[Conversation, ProvenNode]] = []
+    with meet_everyone(links, reporter) as nodes:
+        for node, found in _side_by_side(nodes, lambda node: _identified(station, node, add)):
+            if isinstance(found, ProvenNode):
+                proven.append((node, found))
+                continue
+            first = first or found
+            if len(nodes) > 1:
+                text = f"Node {node.uuid.hex()} was not identified: {found.message}"
+                reporter.notice(Notice("unfinished", text, uuid=node.uuid))
+        # a button counts until the last node was identified, and another one pressed with it takes its mark away
+        marked = [replace(found, pressed=node.contact.pressed()) for node, found in proven]
+    yield from (Arrival(found.who.uuid, links.places[0], 0.0, found) for found in marked)
+    if first is not None and not marked:
+        raise first
+
+
+def _side_by_side(
+    nodes: list[Conversation], work: Callable[[Conversation], ProvenNode]
+) -> Iterator[tuple[Conversation, ProvenNode | TedsProvisionError]]:
+    """Yield the result of each node, in their order: as many at a time as the link allows, as a mute one takes 40 s."""
+
+    def one(node: Conversation) -> ProvenNode | TedsProvisionError:
+        try:
+            return work(node)
+        except TedsProvisionError as error:
+            return error
+
+    max_parallel = min(len(nodes), *(node.contact.link.capabilities.max_parallel for node in nodes))
+    if max_parallel < 2:
+        yield from ((node, one(node)) for node in nodes)
+        return
+    team = ParallelWork(nodes, one, at_once=max_parallel, name="node")
+    ended: dict[int, ProvenNode | TedsProvisionError] = {}
+    try:
+        for done in team.results():
+            ended[id(done.item)] = done.result()
+            while nodes and id(nodes[0]) in ended:
+                node, nodes = nodes[0], nodes[1:]
+                yield node, ended[id(node)]
+    finally:  # after a Ctrl-C there is no wait: the bus is closed next
+        team.drop_waiting()
+
+
+def _identified(station: Station, node: Conversation, add: bool) -> ProvenNode:
+    who = identify(station, node)
+    described, firmware = describe(node), read_firmware(node, once=True)
+    entry = who.whitelisted
+    if entry is None and add:
+        entry = add_to_whitelist(station, node, who)
+    known = station.nodes.get(who.uuid)
+    name = (known.name if known else None) or described.name
+    facts: dict[str, object] = {}
+    read = station.datasheets.reading(who.uuid)
+    if read is None or not read.is_datasheet:  # nothing is verified here: it fills in what is not known better
+        facts["channels"] = described.channels
+        if name is not None and station.nodes.all_named(name) in ([], [who.uuid]):
+            facts["name"] = name
+    with station.durable("identify"):
+        station.nodes.remember(who.uuid, **facts)
+        keep_firmware(station, who.uuid, firmware)
+        station.audit("identify", who.uuid, "proven", fingerprint=who.fingerprint)
+    charging = node.contact.charging.to_json() if node.contact.charging else None
+    ble = node.contact.ble.text if node.contact.ble else None
+    runs = firmware_of(station, who.uuid, firmware)
+    return ProvenNode(who, node.identity, entry is not None, described.channels, name, charging, ble, runs)

@@ -9,8 +9,8 @@ from teds_provision.errors import NotWhitelistedError, PolicyError
 from teds_provision.provisioning.adoption import FactoryDatasheet, refuse_adoption
 from teds_provision.provisioning.board_type import require_board_type
 from teds_provision.provisioning.build import no_confirmation
+from teds_provision.provisioning.charge import wait_for_charge
 from teds_provision.provisioning.identify import IdentifiedNode
-from teds_provision.provisioning.write import wait_for_charge
 from teds_provision.teds.diff import Change
 
 

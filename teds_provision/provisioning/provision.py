@@ -11,7 +11,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from teds_provision.errors import PolicyError, StoreError, TedsProvisionError
+from teds_provision.errors import StoreError, TedsProvisionError
+from teds_provision.links import LinkSettings
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning.adoption import read_factory_datasheet, require_a_reason
@@ -38,7 +39,8 @@ from teds_provision.provisioning.build import (
 from teds_provision.provisioning.calibration_guard import merged
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.provisioning.firmware import read_firmware, require_firmware
-from teds_provision.provisioning.identify import IdentifiedNode, identify
+from teds_provision.provisioning.identify import IdentifiedNode, identify, new_whitelist_entry
+from teds_provision.provisioning.meeting import meet
 from teds_provision.provisioning.operator import Operator
 from teds_provision.provisioning.progress import DONE, NOTHING, SKIPPED, Reporter, StepResult, Steps
 from teds_provision.provisioning.sign import SignResult, require_not_measured, sign
@@ -50,7 +52,6 @@ from teds_provision.station.firmware import FirmwareDemands, FirmwareReading
 from teds_provision.station.shown_units import shown_units, units_of
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry
-from teds_provision.station.store.records import Assurance
 from teds_provision.teds.calibration.formula import sentence
 from teds_provision.teds.certificate import CertificateReference
 from teds_provision.teds.image import SECURITY, Image
@@ -466,31 +467,15 @@ class _Run:
         return verified
 
 
-def new_whitelist_entry(station: Station, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
-    """Return the whitelist entry of an identified node, pinned to its key by tap, or by the bus of a new node.
-
-    A node that already has a key is not pinned over a bus, where any device may show any UUID; its first tap does. Over
-    the air nothing is pinned. Changes nothing. Raises PolicyError (revoked), KeyMismatchError.
-    """
-    new = who.state == NodeState.FACTORY and node.wired
-    assurance: Assurance = "tap" if node.tapped else "bus" if new else "uuid"
-    with station.reading():
-        revoked = station.policy.revocation(who.uuid)
-        if revoked is not None:
-            raise PolicyError(f"Node {who.uuid.hex()} was revoked: {revoked.why}.", hint="It was not whitelisted.")
-        station.pins.check(who.uuid, who.point)
-    return WhitelistEntry(who.uuid, who.fingerprint if node.tapped or new else None, assurance=assurance)
-
-
-def add_to_whitelist(station: Station, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
-    """Whitelist a node by :func:`new_whitelist_entry`; an entry that another process made meanwhile stays."""
-    entry = new_whitelist_entry(station, node, who)
-    with station.durable("whitelist"):
-        present = station.pins.entry(who.uuid)
-        if present is not None:
-            return present
-        station.pins.put(entry)
-        if entry.fingerprint is not None:
-            station.nodes.remember(who.uuid, point=who.point)
-        station.audit("whitelist", who.uuid, "added", fingerprint=entry.fingerprint, assurance=entry.assurance)
-    return entry
+def key_board_at(
+    station: Station,
+    links: LinkSettings,
+    node: str | None,
+    reporter: Reporter,
+    *,
+    operator: Operator,
+) -> bytes:
+    """Identify, whitelist and key the board that ``node`` names (None: the one that is there); return its UUID."""
+    wanted = None if node is None else station.nodes.resolve(node)
+    with meet(station, links, wanted, reporter, before=station.unlock) as there:
+        return key_board(station, there, operator=operator, reporter=reporter).uuid

@@ -14,7 +14,6 @@ from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint, node_key_good
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.wire_agreement import other_key
-from teds_provision.provisioning.sign import known_image
 from teds_provision.shapes.verdict import FRESHNESS, PAGES, SESSION, Check, Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store import RevocationRecord, WhitelistEntry
@@ -175,7 +174,7 @@ def freshness_floor_of(station: Station, uuid: bytes, identity: Identity | None)
 
     Only signed values count: any device could serve the others.
     """
-    image = known_image(station, uuid)
+    image = station.datasheets.datasheet(uuid)
     octets = image.security if image is not None else None
     try:
         shown = security.decode(octets) if octets is not None else None

@@ -6,15 +6,20 @@ from dataclasses import dataclass
 from hashlib import sha256
 
 from teds_provision.errors import LinkError, NodeRefusedError, NotAuthenticError
+from teds_provision.links import LinkSettings
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.provisioning import readings
 from teds_provision.provisioning.agree import agreed_elsewhere, proof_of_reset, session_if_keyed
 from teds_provision.provisioning.conversation import HEARD, Conversation
 from teds_provision.provisioning.firmware import keep_firmware, read_firmware
 from teds_provision.provisioning.identify import IdentifiedNode, prove
+from teds_provision.provisioning.image_file import VerifyReport, concluded, node_or_image, verify_image_alone
+from teds_provision.provisioning.progress import Reporter
 from teds_provision.provisioning.teds_read import read_block, read_identity, read_image
 from teds_provision.provisioning.verify import freshness_floor_of, possession_check, session_check, verify_image
+from teds_provision.provisioning.visit import at_node
 from teds_provision.shapes.verdict import Check, NodeVerdict, Verification
+from teds_provision.station.firmware import KnownFirmware, firmware_of
 from teds_provision.station.station import Station
 from teds_provision.station.store import utc_now
 from teds_provision.teds.codec.model import AccessCode
@@ -174,3 +179,51 @@ def provenance_check(node: Conversation, point: bytes, why: str) -> Check:
             return session_check("", f"{why}, and it did not prove that it was reset")
         return session_check("the node signed that it was reset: it no longer has the key held here", "")
     return session_check("", why)
+
+
+def verify_at(
+    station: Station,
+    links: LinkSettings,
+    what: str,
+    reporter: Reporter,
+    *,
+    accept_calibration: str | None = None,
+    accept_firmware: bool = False,
+    node: bool = False,
+) -> VerifyReport:
+    """Check the image file, or the node, that ``what`` names; with ``node`` a node's name goes first.
+
+    ``accept_firmware``: the calibration holds with the firmware that runs now. ``error``: NotAuthenticError (4),
+    UnprovenError (5), or PolicyError (6) for a calibration that would hurt.
+    """
+    found = node_or_image(station, what, node=node)
+    if isinstance(found, Image):
+        return verify_image_alone(station, found, accept_calibration)
+    firmware: KnownFirmware | None = None
+    in_session = False
+    try:
+        with at_node(station, links.after_agreeing(), found, reporter) as visit:
+            try:
+                looked = verify_at_node(station, visit.node, visit.who)
+                firmware = _firmware_at(station, visit.node, accept=accept_firmware)
+            finally:
+                in_session = visit.node.sealed
+        image, verified = looked.image, looked.verified
+    except NodeRefusedError as refusal:  # outside a session anyone may have sent it: it decides nothing
+        if in_session or not station.keys.held(found) or station.policy.tombstone(found) is not None:
+            raise
+        station.audit("verify", found, "unproven", why=refusal.message)
+        why = refusal.message.removeprefix(HEARD).rstrip(".")
+        image, verified = Image(found, {}), Verification(found, (session_check("", why),))
+    return concluded(station, image, verified, accept_calibration, firmware)
+
+
+def _firmware_at(station: Station, node: Conversation, *, accept: bool) -> KnownFirmware | None:
+    """Return a node's firmware; ``accept`` makes it the one that its calibration was made with, in a session only."""
+    reading = read_firmware(node)
+    if accept and reading is not None and reading.sealed:
+        with station.durable("verify"):
+            keep_firmware(station, node.uuid, reading, signed=True)
+            version = None if reading.report is None else reading.report.version_text
+            station.audit("firmware", node.uuid, "accepted", version=version)
+    return firmware_of(station, node.uuid, reading)

@@ -1,8 +1,6 @@
 """Step 6: stage every TEDS, commit, read back, compare (profile.md, "Writing to flash").
 
-First the charge of the node is checked, as power that fails in the middle helps neither side (operation.md section 7).
-The initial NFC message contains it in plain; over the air the session asks for it (Power, 128.18). On a wired bus nodes
-are fed by the bus, and there is no check. It is a hint: it delays a write, and decides nothing else.
+First the charge of the node is checked (``charge.py``).
 """
 
 from __future__ import annotations
@@ -11,9 +9,8 @@ import hashlib
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from types import MappingProxyType
-from typing import Final
 
 from teds_provision.errors import (
     BadDataError,
@@ -21,19 +18,27 @@ from teds_provision.errors import (
     NodeRefusedError,
     NodeSilentError,
     NotAuthenticError,
+    NotFoundError,
     PolicyError,
 )
+from teds_provision.links import LinkSettings
 from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
 from teds_provision.protocol.messages.frames import Reason, update_teds, write_teds
 from teds_provision.protocol.messages.identity import Identity, NodeState
-from teds_provision.protocol.operation.commands import POWER, PowerFlag, PowerReply
-from teds_provision.provisioning.build import profile_files_digest
+from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.board_type import differences, is_remembered, shown_by
+from teds_provision.provisioning.build import own_name, profile_files_digest, require_free_name
+from teds_provision.provisioning.charge import Low, require_charge, wait_for_charge
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.provisioning.firmware import keep_firmware, read_firmware
+from teds_provision.provisioning.image_file import read_image_file
+from teds_provision.provisioning.operator import Operator
+from teds_provision.provisioning.progress import Reporter
 from teds_provision.provisioning.readings import is_known, keep, keep_read
-from teds_provision.provisioning.sign import known_image, node_keys_of, sign
+from teds_provision.provisioning.sign import node_keys_of, sign
 from teds_provision.provisioning.teds_read import NodeSnapshot, read_block, read_identity, read_image
 from teds_provision.provisioning.verify import freshness_floor_of
+from teds_provision.provisioning.visit import at_node
 from teds_provision.station.firmware import FirmwareReading
 from teds_provision.station.station import Station
 from teds_provision.station.store import NodeRecord
@@ -41,7 +46,6 @@ from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId, Image
 
-LEAST_PERCENT: Final = 10
 WRITE_OVERHEAD = 53
 _STARTS = 3
 _LOSSES = 20
@@ -49,15 +53,6 @@ _SMALLEST_PIECE = 48
 
 Progress = Callable[[int, int], None]
 """``progress(octets written, octets to write)``."""
-Low = Callable[[str], object]
-"""Asks, with a whole sentence, before a node with a low battery is written; raises if the answer is no."""
-
-
-def wait_for_charge(question: str) -> None:
-    """Refuse, as without a question there is no answer. Raises PolicyError."""
-    raise PolicyError(
-        question.removesuffix(" Write it?"), hint="Charge it first (leave it on the reader), or add --yes."
-    )
 
 
 @dataclass(frozen=True)
@@ -103,7 +98,7 @@ def write(
             return WriteResult(0, time.monotonic() - started, has)
     identity, firmware = node.proven or read_identity(node), read_firmware(node)
     _require_newer(station, image.uuid, signed, identity, jump=jump)
-    _require_charge(node, low)
+    require_charge(node, low)
     octets = 0
     for step in range(identity.sequence + SEQUENCE_WINDOW, signed.sequence, SEQUENCE_WINDOW):
         keys = node_keys_of(image.uuid, image.blocks[SECURITY])
@@ -191,28 +186,6 @@ def _conclude(
         )
 
 
-def _require_charge(node: Conversation, low: Low) -> None:
-    percent = _percent(node)
-    if percent is not None and percent < LEAST_PERCENT:
-        low(
-            f"The battery of node {node.uuid.hex()} is at {percent} %: the write may fail halfway and have to"
-            " be repeated. Write it?"
-        )
-
-
-def _percent(node: Conversation) -> int | None:
-    """Return per cent, None if it is unknown, or if the node is fed."""
-    if node.charging is not None and node.charging.battery_percent is not None:
-        return node.charging.battery_percent
-    if node.tapped or node.wired or not node.sealed:
-        return None
-    try:
-        power = PowerReply.decode(node.request_idempotent(POWER, "to report its charge"))
-    except (NodeRefusedError, BadDataError):
-        return None  # it has no battery, or does not measure
-    return power.level if power.flags & PowerFlag.BATTERY else None
-
-
 def _again(station: Station, uuid: bytes) -> str:
     """How this station gets the image signed against the node as it is now."""
     roster = station.plant.roster
@@ -274,7 +247,7 @@ def _stage_and_commit(
 
 def _blocks_there(station: Station, image: Image, has: Image | None) -> set[BlockId]:
     """Blocks that need not be sent; the Security TEDS is always sent, for it is what is committed."""
-    has = has or known_image(station, image.uuid)
+    has = has or station.datasheets.datasheet(image.uuid)
     if has is None:
         return set()
     return {block for block in image if block != SECURITY and has.blocks.get(block) == image.blocks[block]}
@@ -317,3 +290,91 @@ def _stage(station: Station, node: Conversation, image: Image, skip: set[BlockId
             if progress is not None:
                 progress(done, total)
     return done
+
+
+@dataclass(frozen=True)
+class WriteReport:
+    """Result of ``write``; for a dry run ``written`` is None and ``image`` what would be written."""
+
+    image: Image
+    written: WriteResult | None
+
+
+def _wanted(station: Station, uuid: bytes, file: Path | None) -> tuple[Image, dict[str, object]]:
+    """Return the signed image to write to a node, and the facts to record once it is written."""
+    draft = station.datasheets.draft(uuid)
+    profile = draft.profile if draft is not None else None
+    facts: dict[str, object] = {}
+    if file is not None:
+        wanted: Image | None = read_image_file(file)
+    elif draft is not None:
+        wanted = draft.image
+        facts = {"profile": profile} if profile is not None else {}
+    else:
+        wanted = station.datasheets.datasheet(uuid)
+    if wanted is None:
+        raise NotFoundError(
+            f"Nothing has been built for node {uuid.hex()}.", hint="build and sign it first, or give --image."
+        )
+    name = own_name(station, wanted, profile)
+    if name is not None:
+        facts["name"] = name
+    record = station.nodes.get(uuid)
+    if name is not None and draft is not None and file is None and (record is None or record.name != name):
+        require_free_name(station, uuid, name)
+    if wanted.uuid != uuid:
+        raise PolicyError(f"The image is for node {wanted.uuid.hex()}, not for {uuid.hex()}.")
+    if wanted.security is None:
+        raise BadDataError("The image has no Security TEDS.", hint=f"Sign it first: teds-provision sign {uuid.hex()}")
+    return wanted, facts
+
+
+def plan_write(station: Station, node: str, file: Path | None) -> WriteReport:
+    """Return what :func:`write_at` would write, for a dry run; raises what it does before it meets the node."""
+    uuid = station.nodes.resolve(node)
+    station.policy.require_whitelisted(uuid)
+    return WriteReport(_wanted(station, uuid, file)[0], None)
+
+
+def write_at(
+    station: Station,
+    links: LinkSettings,
+    node: str,
+    reporter: Reporter,
+    *,
+    file: Path | None,
+    operator: Operator,
+    jump: bool = False,
+    retyped: bool = False,
+) -> WriteReport:
+    """Write a signed image to the node that ``node`` names: of a file, else the draft, else its last reading.
+
+    ``operator`` is asked before a node with a low battery is written, and before a board becomes one of another type
+    than it claims, unless it was ``retyped`` by an option. ``jump``: a sequence far ahead of the node's is written.
+    Raises NotFoundError (nothing built), BadDataError (not signed), PolicyError (another node's image), as ``write``
+    does.
+    """
+    uuid = station.nodes.resolve(node)
+    station.policy.require_whitelisted(uuid)
+    wanted, facts = _wanted(station, uuid, file)
+    if jump:
+        operator.jump("This uses up the node's sequence numbers up to that point, permanently. Write it?")
+    with at_node(station, links.after_agreeing(), uuid, reporter, writes="write") as visit:
+        require_session(station, visit.node)
+        if not retyped:
+            channels = {channel for channel, _ in wanted}
+            changes = differences(shown_by(visit.node, channels), wanted)
+            profile = facts.get("profile")
+            known = isinstance(profile, str) and is_remembered(station, uuid, profile, factory=False)
+            if changes and not known:
+                operator.retype(uuid, changes)
+        written = write(
+            station,
+            visit.node,
+            wanted,
+            progress=reporter.written,
+            facts=facts,
+            jump=jump,
+            low=operator.low_battery,
+        )
+        return WriteReport(wanted, written)

@@ -18,10 +18,10 @@ from teds_provision.links import Notice
 from teds_provision.links.nfc.message import NdefRecord
 from teds_provision.provisioning.agree import agree
 from teds_provision.provisioning.build import BuildOrder, build
-from teds_provision.provisioning.commands import SignOrder, sign_image
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import provision
+from teds_provision.provisioning.sign import SignOrder, sign_image
 from teds_provision.station.store import StoreLock, WhitelistEntry
 
 from ..bench import PASSPHRASE, Board, make_station, talk

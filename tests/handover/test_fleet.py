@@ -25,8 +25,8 @@ from teds_provision.handover.trust import (
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning.agree import agree, require_session
 from teds_provision.provisioning.build import BuildOrder, build
-from teds_provision.provisioning.commands import SignOrder, sign_image
 from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.sign import SignOrder, sign_image
 from teds_provision.provisioning.verify import verify_image
 from teds_provision.provisioning.verify_node import verify_at_node
 from teds_provision.provisioning.write import write

@@ -12,8 +12,8 @@ from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError, 
 from teds_provision.handover.incoming import ImportPlan, plan_import, prove_node, proven_of
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import content_digest
+from teds_provision.provisioning.address import set_address
 from teds_provision.provisioning.agree import agree, open_session
-from teds_provision.provisioning.commands import set_address
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.teds_read import read_image
 from teds_provision.provisioning.verify_node import verify_node

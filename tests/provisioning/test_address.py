@@ -6,7 +6,7 @@ import pytest
 
 from teds_provision.errors import NodeRefusedError, NodeSilentError
 from teds_provision.protocol.messages.identity import Identity
-from teds_provision.provisioning.commands import set_address
+from teds_provision.provisioning.address import set_address
 from teds_provision.station.station import Station
 from tests.bench import Board, MemoryLink, talk
 

@@ -11,9 +11,9 @@ from teds_provision.links import Contact
 from teds_provision.protocol.messages.frames import Reason, refusal
 from teds_provision.provisioning.agree import agree, require_session
 from teds_provision.provisioning.build import BuildOrder, build
-from teds_provision.provisioning.commands import SignOrder, sign_image
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.meeting import pick_single_node
+from teds_provision.provisioning.sign import SignOrder, sign_image
 from teds_provision.provisioning.teds_read import NodeSnapshot
 from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station

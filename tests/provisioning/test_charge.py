@@ -9,10 +9,10 @@ import pytest
 from teds_provision.errors import PolicyError
 from teds_provision.links.hints import Charging
 from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.charge import Low, wait_for_charge
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, provision
-from teds_provision.provisioning.write import Low, wait_for_charge
 from teds_provision.station.station import Station
 from tests.answers import Answers
 from tests.bench import Board, contact

@@ -18,7 +18,7 @@ from teds_provision.protocol.messages.firmware import ABOUT, FirmwareFlag, Firmw
 from teds_provision.protocol.messages.frames import Reply
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.tim import Tim
-from teds_provision.provisioning import commands
+from teds_provision.provisioning import identify as identify_step
 from teds_provision.provisioning.agree import agree, require_session
 from teds_provision.provisioning.build import BuildOrder
 from teds_provision.provisioning.conversation import Conversation
@@ -29,11 +29,11 @@ from teds_provision.provisioning.firmware import (
     read_firmware,
     require_good_firmware,
 )
-from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.identify import add_to_whitelist, identify
 from teds_provision.provisioning.inventory import inventory
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
-from teds_provision.provisioning.provision import ProvisionResult, add_to_whitelist, provision
+from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.provisioning.verify_node import verify_at_node
 from teds_provision.station.firmware import FirmwareDemands, FirmwareReading, firmware_of, state_of
 from teds_provision.station.station import Station
@@ -305,11 +305,11 @@ def test_it_costs_identify_one_more_round_trip(
         board = FirmwareBoard(report=report)
         link = on_bus(board)
         with met(board, link) as node:
-            commands._identified(station, node, False)
+            identify_step._identified(station, node, False)
         return link.count
 
     with_it = exchanges()
-    monkeypatch.setattr(commands, "read_firmware", lambda _node, *, once: None)
+    monkeypatch.setattr(identify_step, "read_firmware", lambda _node, *, once: None)
     assert with_it == exchanges() + 1
 
 

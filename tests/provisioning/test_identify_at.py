@@ -15,7 +15,7 @@ from teds_provision.node.can.server import CanServer
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.messages.frames import Function, Reason, refusal
-from teds_provision.provisioning.commands import identify_at
+from teds_provision.provisioning.identify import identify_at
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.station.station import Station
 from tests.pace import PATIENCE

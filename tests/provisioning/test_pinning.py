@@ -8,8 +8,7 @@ import pytest
 
 from teds_provision.errors import GarbledError, PolicyError, VaultError
 from teds_provision.provisioning import teds_read as reading
-from teds_provision.provisioning.identify import identify
-from teds_provision.provisioning.provision import add_to_whitelist
+from teds_provision.provisioning.identify import add_to_whitelist, identify
 from teds_provision.station.station import Station
 from tests.bench import Board, MemoryLink, make_station, talk
 

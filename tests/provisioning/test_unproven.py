@@ -18,12 +18,13 @@ from teds_provision.links.ports import CAN, Capabilities
 from teds_provision.protocol.messages.frames import COMMON, Function, Reason, Reply, refusal, security_command
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.provisioning.agree import proof_of_reset, require_session
-from teds_provision.provisioning.commands import NodeVisit, ReadReport, read_at, verify_at
 from teds_provision.provisioning.conversation import Conversation, refused
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.meeting import drop_duplicate_uuids, refuse_duplicate_uuids
+from teds_provision.provisioning.read import ReadReport, read_at
 from teds_provision.provisioning.verify import require_authentic
-from teds_provision.provisioning.verify_node import verify_at_node
+from teds_provision.provisioning.verify_node import verify_at, verify_at_node
+from teds_provision.provisioning.visit import NodeVisit
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store import WhitelistEntry
@@ -190,7 +191,7 @@ def test_a_refused_challenge_where_a_key_is_held_is_unproven_not_an_error(
         raise refused(Reason.BUSY, "to prove its key")
         yield
 
-    monkeypatch.setattr("teds_provision.provisioning.commands.at_node", contextmanager(refuses))
+    monkeypatch.setattr("teds_provision.provisioning.verify_node.at_node", contextmanager(refuses))
     done = verify_at(station, LinkSettings(), board.uuid.hex(), SilentReporter())
     assert (done.verified.verdict, type(done.error)) == ("unproven", UnprovenError)
 
@@ -210,7 +211,7 @@ def test_read_where_a_key_is_held_needs_a_session_or_a_proof_of_reset(
             with node:
                 yield NodeVisit(station, node, identify(station, node))
 
-        monkeypatch.setattr("teds_provision.provisioning.commands.at_node", at)
+        monkeypatch.setattr("teds_provision.provisioning.read.at_node", at)
 
     def read() -> ReadReport:
         return read_at(station, LinkSettings(), board.uuid.hex(), SilentReporter())

@@ -13,9 +13,8 @@ from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_m
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.provisioning.agree import agree, require_session
 from teds_provision.provisioning.build import build
-from teds_provision.provisioning.commands import SignOrder, sign_image
 from teds_provision.provisioning.identify import identify
-from teds_provision.provisioning.sign import known_node_keys, sign
+from teds_provision.provisioning.sign import SignOrder, known_node_keys, sign, sign_image
 from teds_provision.provisioning.teds_read import read_image
 from teds_provision.provisioning.verify import FreshnessFloor, freshness_floor_of, verify_image
 from teds_provision.provisioning.verify_node import verify_node

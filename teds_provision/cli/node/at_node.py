@@ -20,7 +20,7 @@ from teds_provision.station.store import utc_now
 
 if TYPE_CHECKING:
     from teds_provision.links import Notice
-    from teds_provision.provisioning.commands import ProvenNode
+    from teds_provision.provisioning.identify import ProvenNode
     from teds_provision.provisioning.progress import Reporter, StepResult
 
 
@@ -50,7 +50,7 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool, locating: bo
     several = len(links.places) > 1
     found: list[dict[str, Any]] = []
     reporter = reporter_for(app, several=several)
-    for arrival in provisioning.commands.identify_at(
+    for arrival in provisioning.identify.identify_at(
         app.station(), links, PressLines(app, reporter) if watch else reporter, add=add, watch=watch, stop=stop
     ):
         if arrival.error is not None:
@@ -155,7 +155,7 @@ def locate(app: App, uuid: str, seconds: int, links: LinkSettings) -> None:
 
     A node that has a key does so in a session, a node in factory state for anyone.
     """
-    (done,) = provisioning.commands.locate_at(app.station(), links, [uuid], seconds, reporter_for(app))
+    (done,) = provisioning.locate.locate_at(app.station(), links, [uuid], seconds, reporter_for(app))
     if isinstance(done, tuple):
         raise done[1]
     who = f"{done.name or 'Node'} ({done.uuid.hex()})"
@@ -181,7 +181,7 @@ def _locate_each(app: App, links: LinkSettings, found: list[dict[str, Any]], rep
         number = uuids.index(uuid.hex()) + 1
         return app.ask_text(f"Board {number} of {len(uuids)} ({uuid.hex()}) blinks. Its name", name)
 
-    for done in provisioning.commands.locate_at(app.station(), links, uuids, LOCATE_SECONDS, reporter, ask_name=ask):
+    for done in provisioning.locate.locate_at(app.station(), links, uuids, LOCATE_SECONDS, reporter, ask_name=ask):
         if isinstance(done, tuple):
             app.fail_line(done[1], uuid=done[0].hex())
         else:
@@ -213,7 +213,7 @@ def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry
     def confirm(question: str) -> None:
         app.confirm(question, yes=yes and rotate, named="--rotate")
 
-    done = provisioning.commands.agree_at(
+    done = provisioning.agree.agree_at(
         app.station(), links, uuid, reporter_for(app), rotate=rotate, dry_run=dry_run, confirm=confirm
     )
     node, agreed = done.uuid.hex(), done.agreed
@@ -245,7 +245,7 @@ def reset(app: App, uuid: str, yes: bool, dry_run: bool, links: LinkSettings) ->
         app.emit({"uuid": octets.hex(), "plan": "reset"}, f"Plan: reset {octets.hex()} to factory state.")
         return
     app.confirm(f"Reset node {octets.hex()}? Its key is erased, and its datasheet becomes unsigned.", yes=yes)
-    receipt = provisioning.commands.reset_at(station, links, octets, reporter_for(app))
+    receipt = provisioning.agree.reset_at(station, links, octets, reporter_for(app))
     app.emit(
         {
             "uuid": octets.hex(),
@@ -279,7 +279,7 @@ def _address(_ctx: click.Context, _parameter: click.Parameter, text: str) -> int
 def address(app: App, uuid: str, address: int, yes: bool, dry_run: bool, links: LinkSettings) -> None:
     """Permanently change a node's CAN address, 1 to 239: by tap, or in a session if its key is held."""
     del yes  # the old address can be given back the same way
-    done = provisioning.commands.set_address_at(app.station(), links, uuid, address, reporter_for(app), dry_run=dry_run)
+    done = provisioning.address.set_address_at(app.station(), links, uuid, address, reporter_for(app), dry_run=dry_run)
     node = done.uuid.hex()
     if done.changed is None:
         plan = f"Plan: change the CAN address of node {node} to 0x{address:02x}."

@@ -218,7 +218,7 @@ def sign(
     """
     del yes  # a signature uses up a sequence number, nothing else
     station = app.station()
-    done = provisioning.commands.sign_at(
+    done = provisioning.sign.sign_at(
         station,
         links,
         what,
@@ -291,9 +291,9 @@ def write(
         _bring_back(app, uuid, sequence, links, dry_run=dry_run)
         return
     if dry_run:
-        done = provisioning.commands.plan_write(app.station(), uuid, image)
+        done = provisioning.write.plan_write(app.station(), uuid, image)
     else:
-        done = provisioning.commands.write_at(
+        done = provisioning.write.write_at(
             app.station(),
             links,
             uuid,
@@ -313,7 +313,7 @@ def write(
 
 
 def _bring_back(app: App, uuid: str, sequence: int, links: LinkSettings, *, dry_run: bool) -> None:
-    done = provisioning.commands.restore_datasheet(
+    done = provisioning.datasheet_history.restore_datasheet(
         app.station(), links, uuid, sequence, reporter_for(app), dry_run=dry_run
     )
     node, changes = done.uuid.hex(), [change.text for change in done.changes]
@@ -358,7 +358,7 @@ def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
     If a key is held but no session can be opened, nothing is proven: the data received is shown, no file is written,
     and the exit code is 5.
     """
-    done = provisioning.commands.read_at(app.station(), links, uuid, reporter_for(app))
+    done = provisioning.read.read_at(app.station(), links, uuid, reporter_for(app))
     text = done.image.to_json()
     if done.error is not None:
         app.conclude({**json.loads(text), "verdict": "unproven"}, text.rstrip("\n"), done.error)
@@ -399,7 +399,7 @@ def list_(app: App) -> None:
 def drop(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     """Drop a node's draft; the datasheet on the node is not affected."""
     del yes  # what was built can be built again
-    done = provisioning.commands.drop_draft(app.station(), uuid, dry_run=dry_run)
+    done = provisioning.datasheet_history.drop_draft(app.station(), uuid, dry_run=dry_run)
     node = done.uuid.hex()
     if done.draft is None:
         app.emit({"uuid": node, "dropped": False}, f"Node {node} has no draft.")
@@ -417,7 +417,7 @@ draft.add_command(drop, "drop")
 @pass_app
 def history(app: App, uuid: str) -> None:
     """List a node's earlier datasheets, newest first; write UUID --from SEQUENCE restores one, signed again."""
-    node, records = provisioning.commands.history_of(app.station(), uuid)
+    node, records = provisioning.datasheet_history.history_of(app.station(), uuid)
     rows = [
         {
             "sequence": record.sequence,

@@ -163,7 +163,7 @@ def _with_firmware(
 ) -> str:
     """Key the one board, install firmware on it, and return its UUID."""
     operator = terminal_operator.TerminalOperator(app, yes=yes)
-    uuid = provisioning.commands.key_board_at(base, links, node, reporter, operator=operator)
+    uuid = provisioning.provision.key_board_at(base, links, node, reporter, operator=operator)
     update = provisioning.update
     order, onward = update.UpdateOrder(image), links.after_agreeing()
     plan = update.plan_update(base, onward, uuid, order, reporter)

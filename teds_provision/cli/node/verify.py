@@ -62,7 +62,7 @@ def verify(
     if not node and Path(what[0]).is_file():
         done = provisioning.image_file.verify_image_file(station, Path(what[0]), accept_calibration)
     else:
-        done = provisioning.commands.verify_at(
+        done = provisioning.verify_node.verify_at(
             station,
             links,
             what[0],

@@ -38,10 +38,10 @@ from teds_provision.provisioning.agree import agree
 from teds_provision.provisioning.build import BuildOrder, prepare
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.provisioning.datasheet_edit import write_sheet
-from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.identify import identify, new_whitelist_entry
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter, StepResult
-from teds_provision.provisioning.provision import ProvisionResult, new_whitelist_entry, provision
+from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.provisioning.teds_read import list_blocks
 from teds_provision.provisioning.verify import require_authentic
 from teds_provision.shapes.problem import Problem, problem_of
