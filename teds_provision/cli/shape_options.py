@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from types import NoneType
 from typing import Any, Final, Literal, TypeVar, get_args, get_origin
 
@@ -27,6 +28,11 @@ def measurement_options(*names: str, but: tuple[str, ...] = ()) -> Callable[[Fun
         return function
 
     return add
+
+
+def measurement_option(name: str, *, purpose: str) -> Callable[[Function], Function]:
+    """Add the option of one setting to a command in which it has another help text."""
+    return _option(name, measurement.HINTS[name], replace(measurement.OPTIONS[name], help=purpose))
 
 
 def _option(name: str, hint: Any, option: CommandOption) -> Callable[[Function], Function]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,12 +11,15 @@ from typing import Any, get_type_hints
 
 from teds_provision.api import answers, bodies
 from teds_provision.cli.measure.measure import measure
+from teds_provision.cli.measure.sample import set_value
+from teds_provision.cli.service import ncap
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.running.measurement_job import request_of
 from teds_provision.shapes.measurement import NAMES, OPTIONS, PUBLISHED, MeasurementMembers, MeasurementSpec
 from teds_provision.station.store import KeptMeasurement
 
 from ..bench import make_station
+from ..test_architecture import PACKAGE, parsed
 
 CHANGED: Mapping[str, Any] = {
     "group": "arm",
@@ -77,3 +81,36 @@ def test_a_body_becomes_the_settings_and_back() -> None:
 def test_the_command_has_an_option_for_each_setting_that_names_one() -> None:
     flags = {parameter.name: "/".join(parameter.opts) for parameter in measure.params if parameter.name in OPTIONS}
     assert flags == {name: option.flags.partition("/")[0] for name, option in OPTIONS.items()}
+
+
+def test_other_commands_have_the_options_of_the_settings_as_they_are() -> None:
+    """One written by hand differs from ``measure`` as soon as a bound or a default changes; the help alone may."""
+    ways = {option.flags.partition("/")[0]: name for name, option in OPTIONS.items()}
+    own = {parameter.name: parameter.to_info_dict() for parameter in measure.params}
+    found = set()
+    for command in (set_value, ncap.run, ncap.measure):
+        for parameter in command.params:
+            name = ways.get(parameter.opts[0], "")
+            if name and not parameter.multiple:
+                assert parameter.to_info_dict() | {"help": ""} == own[name] | {"help": ""}, f"{command.name} {name}"
+                found.add((command.name, name))
+    assert found == {
+        ("set", "dead_man"),
+        ("run", "actuators"),
+        ("run", "dead_man"),
+        ("run", "rate"),
+        ("measure", "rate"),
+    }
+
+
+def test_each_option_of_a_setting_is_made_from_it() -> None:
+    flags = {option.flags for option in OPTIONS.values()} - {"--channel", "--kind", "--require"}
+    found = [
+        f"{path.name}: {flag}"
+        for path in (PACKAGE / "cli").rglob("*.py")
+        for node in ast.walk(parsed(path))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "click.option" and node.args
+        for flag in [getattr(node.args[0], "value", "")]
+        if flag in flags
+    ]
+    assert found == []

@@ -15,8 +15,9 @@ import click
 
 from teds_provision import measure, provisioning
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import ChannelName, Number, WholeNumber, command, link_options, options_given
+from teds_provision.cli.options import ChannelName, Number, command, link_options, options_given
 from teds_provision.cli.rendering import print_table, reporter_for, shown, tidy
+from teds_provision.cli.shape_options import measurement_option
 from teds_provision.errors import NodeRefusedError, UsageError
 from teds_provision.links import LinkSettings
 from teds_provision.protocol import operation
@@ -207,14 +208,7 @@ def _mode(console: Console, found: OperationReply, names: dict[int, str], power:
 @click.argument("value", type=float)
 @click.option("--unit", metavar="U", help="Unit of VALUE (default: the SI unit of the datasheet).")
 @click.option("--hold", type=Number(min=0), metavar="S", help="Seconds to hold the value (default: until Ctrl-C).")
-@click.option(
-    "--dead-man",
-    type=WholeNumber(20, 10_000),
-    default=1000,
-    show_default=True,
-    metavar="MS",
-    help="Time without set points before the safe state.",
-)
+@measurement_option("dead_man", purpose="Time without set points before the safe state.")
 @link_options
 @pass_app
 def set_value(

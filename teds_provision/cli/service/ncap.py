@@ -23,8 +23,6 @@ from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import (
     COMMAND_SETTINGS,
     FileToRead,
-    Number,
-    WholeNumber,
     command,
     examples,
     exposure_options,
@@ -35,6 +33,7 @@ from teds_provision.cli.options import (
     tracing,
 )
 from teds_provision.cli.rendering import count_of, local_time, shown
+from teds_provision.cli.shape_options import measurement_option, measurement_options
 from teds_provision.errors import NotFoundError, PolicyError, TedsProvisionError, UsageError
 from teds_provision.lazy import how_to_install, late
 from teds_provision.sanitize import by_name, counted
@@ -82,7 +81,7 @@ _FILE = FileToRead(exists=True)
                                                  " datasheets, under /STATION/unverified/.")  # fmt: skip
 @click.option("--measure", metavar="all|GROUP|EXPR", help="Measure every authentic node that comes: all, a group, or "
               "type:PROFILE, name:GLOB, group:NAME, 'angle >= 360 deg', joined by commas.")  # fmt: skip
-@click.option("--rate", type=Number(min=0.001), metavar="HZ", help="With --measure: maximum samples per second.")
+@measurement_option("rate", purpose="With --measure: maximum samples per second.")
 @click.option("--frozen", is_flag=True, help="With --measure: only the nodes known at the start, as one group array.")
 @click.option("--http", metavar="HOST:PORT", help="Serve the page and the API on this address, e.g. 127.0.0.1:8351.")
 @exposure_options
@@ -96,9 +95,7 @@ _FILE = FileToRead(exists=True)
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
 @click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST.")
 @foxglove_options
-@click.option("--actuators/--no-actuators", default=True, show_default=True, help="Accept set points from ROS topics.")
-@click.option("--dead-man", type=WholeNumber(20, 10_000), default=1000, show_default=True, metavar="MS",
-              help="Time without set points before an actuator goes to its safe state.")  # fmt: skip
+@measurement_options("actuators", "dead_man")
 @click.option("--require-firmware", is_flag=True, help="Measure no nodes whose firmware their type does not accept.")
 @file_units_option
 @click.option("--trust-dcc", type=_FILE, multiple=True, metavar="CERT.pem",
@@ -355,7 +352,7 @@ def _link(link: dict[str, Any]) -> str:
     name="measure",
 )
 @click.argument("expression", metavar="EXPR")
-@click.option("--rate", type=Number(min=0.001), metavar="HZ", help="Maximum samples per second.")
+@measurement_option("rate", purpose="Maximum samples per second.")
 @click.option("--frozen", is_flag=True, help="Only the nodes that match now, as one group array; none joins or leaves.")
 @click.option("--to", "files", multiple=True, metavar="NAME", help="Record to NAME.mcap, .jsonl, .csv; repeatable.")
 @click.option("--stop", is_flag=True, help="End the measurement of EXPR or with this id; all ends every one.")
