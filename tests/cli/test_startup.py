@@ -25,6 +25,8 @@ OURS = {
     "teds_provision.lazy",
     "teds_provision.optional_rooms",
     "teds_provision.protocol",
+    "teds_provision.shapes",
+    "teds_provision.shapes.problem",
     "teds_provision.station",
     "teds_provision.vault",
     *(f"teds_provision.{name}" for room in rooms() for name in (room, f"{room}.room")),
