@@ -18,10 +18,11 @@ from pathlib import Path
 import pytest
 
 from teds_provision.optional_rooms import OPTIONAL
+from teds_provision.station.station import Station
 from tests.bench import PASSPHRASE
-from tests.cli.shell import clean_environment
+from tests.cli.shell import call, clean_environment
 from tests.pace import PATIENCE
-from tests.plant.stations import Plant
+from tests.plant.stations import Plant, ask
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parent.parent
@@ -33,12 +34,10 @@ _OF_A_ROOM = re.compile(
     re.M,
 )
 _GATE = (
-    "tests/test_architecture.py",
-    "tests/cli/test_backup.py::test_backup_and_restore_into_an_empty_home",
     "tests/ncap/test_api.py::test_status_says_what_runs",
     "tests/e2e/test_whole_runs.py::test_a_tapped_node_is_provisioned_and_a_second_run_finds_nothing_to_do[python-4]",
 )
-"""What the gate runs of the core's tests: the arrows, a command and its store, the service, a node to its verdict."""
+"""What the gate runs of the core's tests, for a few seconds of CPU: the service, and a node from tap to verdict."""
 
 
 @pytest.fixture(scope="module")
@@ -89,19 +88,34 @@ def test_the_tests_of_the_core_pass(core: Path) -> None:
 
 
 def test_options_of_a_room_are_not_offered_and_its_commands_do_not_exist(core: Path, tmp_path: Path) -> None:
-    program = ("-m", "teds_provision", "--home", tmp_path / "home", "--json")
-    for words, said in (
-        (("registry", "status"), "No such command 'registry'."),
-        (("node", "check"), "No such command 'check'."),
-        (("provision", "--job", "fifty.jws"), "No such option '--job'."),
-        (("nodes", "--plant"), "No such option '--plant'."),
-        (("demo", "--line"), "No such option '--line'."),
-        (("export-keys", "--to", "lab", "--all"), "Give --output FILE."),
-    ):
-        done = run(core, *program, *words)
-        assert (done.returncode, json.loads(done.stdout)["error"]["code"]) == (2, "usage"), done.stderr
-        assert said in json.loads(done.stdout)["error"]["message"]
-    help_text = run(core, *program, "--help").stdout
+    refused = {
+        ("registry", "status"): "No such command 'registry'.",
+        ("node", "check"): "No such command 'check'.",
+        ("provision", "--job", "fifty.jws"): "No such option '--job'.",
+        ("sign", "8d4d", "--by", "office"): "No such option '--by'.",
+        ("nodes", "--plant"): "No such option '--plant'.",
+        ("demo", "--line"): "No such option '--line'.",
+        ("export-keys", "--to", "lab", "--all"): "Give --output FILE.",
+        ("import-keys",): "Missing argument 'FILE'.",
+        ("ncap", "run", "--registry"): "No such option '--registry'.",
+    }
+    code = f"""
+import json
+from teds_provision.cli.context import App
+from teds_provision.cli.main import run
+for words in {list(refused)!r}:
+    App.current = None
+    code = run(["--home", {str(tmp_path / "home")!r}, "--json", *words])
+    assert code == 2, (code, words)
+run(["--help"])
+"""
+    done = run(core, "-c", code)
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = done.stdout.splitlines()
+    for line, said in zip(lines, refused.values(), strict=False):
+        error = json.loads(line)["error"]
+        assert (error["code"], error["message"].startswith(said)) == ("usage", True), line
+    help_text = "\n".join(lines[len(refused) :])
     assert "Create and run virtual nodes.\n" in help_text
     assert "The plant" not in help_text
 
@@ -138,18 +152,20 @@ def test_a_backup_with_the_rows_of_a_plant_comes_through_a_core_without_the_room
     plant.close()
     before = _rows(home)
     assert all(before[table] for table in ("plant", "rosters", "pages", "claims"))
-    for step in (
-        ("--home", home, "backup", tmp_path / "north.backup"),
-        ("--home", tmp_path / "restored", "restore", tmp_path / "north.backup"),
-        ("--home", tmp_path / "restored", "backup", tmp_path / "again.backup"),
-        ("--home", tmp_path / "twice", "restore", tmp_path / "again.backup"),
-    ):
-        words = ("-m", "teds_provision", "--passphrase-fd", "0", *step)
-        done = run(core, *words, given=f"{PASSPHRASE}\n")
+    assert call(home, "backup", tmp_path / "north.backup").code == 0
+    restored = tmp_path / "restored"
+    for words in (("restore", tmp_path / "north.backup"), ("backup", tmp_path / "again.backup")):
+        program = ("-m", "teds_provision", "--home", restored, "--passphrase-fd", "0")
+        done = run(core, *program, *words, given=f"{PASSPHRASE}\n")
         assert done.returncode == 0, done.stdout + done.stderr
+    assert _rows(restored) == before
+    assert call(tmp_path / "twice", "restore", tmp_path / "again.backup").code == 0
     assert _rows(tmp_path / "twice") == before
     assert not _must_look_first(home)
-    assert _must_look_first(tmp_path / "twice"), "a rule of the plant that the core keeps without the room"
+    assert _must_look_first(restored), "a rule of the plant that the core keeps without the room"
+    with Station.open(tmp_path / "twice", ask=ask) as station:
+        assert station.plant.roster is not None
+        assert station.plant.roster.name == "plant Augsburg"
 
 
 @pytest.mark.soak
