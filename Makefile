@@ -301,7 +301,7 @@ docs: $(VENV)/.dev
 # Before a release: the gate, and what proves the same at greater length.
 test-all: test bench-short .venv-mujoco/.made
 	$(BIN)/python -m pytest -n 2 --dist worksteal -rsR --hypothesis-profile=gate -m nightly
-	$(BIN)/python -m pytest tests/release tests/plant/test_returned_pages.py tests/ncap/test_by_topics.py tests/node/test_examples.py -m soak -rs
+	$(BIN)/python -m pytest tests/release tests/test_core_alone.py tests/plant/test_returned_pages.py tests/ncap/test_by_topics.py tests/node/test_examples.py -m soak -rs
 
 .venv-mujoco/.made:
 	$(PYTHON) -m venv .venv-mujoco
