@@ -25,7 +25,6 @@ from teds_provision.errors import (
 )
 from teds_provision.lazy import late
 from teds_provision.sanitize import sanitize, sanitize_json
-from teds_provision.shapes.problem import problem_of
 
 if TYPE_CHECKING:
     import json
@@ -36,12 +35,14 @@ if TYPE_CHECKING:
     from teds_provision import client
     from teds_provision.cli import console
     from teds_provision.client import Client
+    from teds_provision.shapes import problem
     from teds_provision.station.station import Station
     from teds_provision.teds.certificate import ChooseItem
 else:
     client = late("teds_provision.client")  # HTTP: only if a base station runs
     json = late("json")
     console = late("teds_provision.cli.console")  # rich
+    problem = late("teds_provision.shapes.problem")  # the form of an error as JSON
 
 _BEHIND = " [y/N]: "
 _PRINTING = threading.Lock()
@@ -136,7 +137,7 @@ class App:
             if error is not None:
                 raise error
             return
-        self.emit({**result, "error": problem_of(error)})
+        self.emit({**result, "error": problem.problem_of(error)})
         raise click.exceptions.Exit(error.exit_code)
 
     def console(self, *, stderr: bool = False) -> Console:
@@ -164,7 +165,7 @@ class App:
         self.live_line()
         known = {name: value for name, value in of.items() if value is not None}
         if self.json:
-            print(to_json({**known, "error": problem_of(error)}), flush=True)
+            print(to_json({**known, "error": problem.problem_of(error)}), flush=True)
         else:
             where = ", ".join(f"row {value}" if name == "row" else str(value) for name, value in known.items())
             at = f" ({where})" if where else ""

@@ -25,7 +25,6 @@ from teds_provision.errors import (
     TedsProvisionError,
 )
 from teds_provision.lazy import install_command, late, missing_packages, package_of
-from teds_provision.shapes.problem import Error, Problem
 
 if TYPE_CHECKING:
     import difflib
@@ -34,9 +33,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from teds_provision.cli import extending, file_kinds, shell_completion, start
+    from teds_provision.shapes import problem
 else:
     shell_completion, start = late("teds_provision.cli.shell_completion"), late("teds_provision.cli.start")
     file_kinds = late("teds_provision.cli.file_kinds")  # for errors about a file
+    problem = late("teds_provision.shapes.problem")  # the form of an error as JSON
     extending = late("teds_provision.cli.extending")  # once a command is used
     difflib, json, pathlib = late("difflib"), late("json"), late("pathlib")  # --help needs none of them
 
@@ -325,7 +326,7 @@ def _fail(arguments: list[str], exit_code: int, code: str, message: str, hint: s
         App.current.live_line()  # removes it before any other output
     if _wants(arguments, "--json"):
         with contextlib.suppress(OSError):
-            print(json.dumps(Error(error=Problem(code=code, message=message, hint=hint))), flush=True)
+            print(json.dumps(problem.Error(error=problem.Problem(code=code, message=message, hint=hint))), flush=True)
     else:
         _print_message(message if exit_code == INTERRUPTED else f"Error: {message}")
         if hint:
