@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from weakref import WeakValueDictionary
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teds_provision.teds import Sheet
-from teds_provision.teds.calibration import ChannelInterpreter, fit
+from teds_provision.teds.calibration import ChannelInterpreter, fit, vectorized
 from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.calibration.vectorized import ManyChannels
 from teds_provision.teds.units import parse_unit
@@ -118,6 +119,31 @@ def test_channels_of_8_bits_are_looked_up_each_in_its_own(raw: list[list[int]], 
         usable = last or column < 3
         np.testing.assert_array_equal(valid[:, column], alone.valid & usable)
         np.testing.assert_array_equal(value[:, column], interpreter.unit.to_si(alone.value) if usable else np.nan)
+
+
+def test_tables_are_shared_by_channels_of_one_curve_and_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vectorized, "_MOST_TABLES", 2)
+    monkeypatch.setattr(vectorized, "_TABLES", WeakValueDictionary())
+
+    def channel(top: float) -> ManyChannels:
+        first = sheet().channels[0]
+        curve = replace(first, calibration=fit([(0, 0.0), (65535, top)], "linear", channel=1))
+        many = ManyChannels.side_by_side([ChannelInterpreter(replace(sheet(), channels=(curve,)), 1)], [True])
+        assert many is not None
+        return many
+
+    one, same, other, third = channel(2), channel(2), channel(3), channel(4)
+    for many in (one, same, other, third):
+        many.calibrate_all()
+    assert one._known is not None
+    assert same._known is one._known
+    assert other._known is not None
+    assert third._known is None
+    value, _ = third.values(third.raw(b"\xff\xff"))
+    assert value[0, 0] == pytest.approx(4)
+    del other, many
+    third.calibrate_all()
+    assert third._known is not None
 
 
 def test_channels_of_other_forms_stay_alone() -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -29,6 +30,10 @@ _MOST_SEGMENTS: Final = 64
 _MOST_KNOWN: Final = 1 << 16
 """Raw values of all channels together that :meth:`ManyChannels.calibrate_all` calibrates, half a megabyte: one channel
 of 16 bits, or 256 of 8."""
+_MOST_TABLES: Final = 16
+"""Such tables in one process: those of further channels would take more memory than time they save."""
+_TABLES: Final[WeakValueDictionary[tuple[object, ...], NDArray[np.float64]]] = WeakValueDictionary()
+"""Those in use, by everything that they follow from: channels of one curve share one."""
 
 
 class ManyChannels:
@@ -82,10 +87,19 @@ class ManyChannels:
         That takes 2 ms and half a megabyte for a channel of 16 bits, so it is for a stream that has many messages.
         """
         possible = 1 << 8 * self._width
-        if self._known is None and possible * len(self._columns) <= _MOST_KNOWN:
+        if self._known is not None or possible * len(self._columns) > _MOST_KNOWN:
+            return
+        curves = (self._inner, self._curves, self._zero, self._own_scale, self._own_offset)
+        units = (self._scale, self._offset, self._same, self._most, self._floor, self._ceiling)
+        turns = (self._turns, self._turn, self._begin, self._end, self._usable)
+        parts = (None if part is None else part.tobytes() for part in (*curves, *units, *turns))
+        key = (self._width, self._curves.shape, *parts)
+        table = _TABLES.get(key)
+        if table is None and len(_TABLES) < _MOST_TABLES:
             every = np.repeat(np.arange(possible)[:, None], len(self._columns), axis=1)
-            self._places = self._columns * possible if len(self._columns) > 1 else None
-            self._known = np.ascontiguousarray(self.values(every)[0].T).ravel()
+            _TABLES[key] = table = np.ascontiguousarray(self.values(every)[0].T).ravel()
+        self._places = self._columns * possible if len(self._columns) > 1 else None
+        self._known = table
 
     @staticmethod
     def _bare(row: Floats) -> Floats | float:
