@@ -201,8 +201,8 @@ LINES = (
     Line("CAN FD 500k/2M, named by UUID", "can", (), limits.FD, "&pace=1&fd=1", aim=1.5, named=True),
     Line("CAN 500 kbit/s, slow chip", "can", (), limits.CLASSIC, "&pace=1", SLOW),
     Line("node in C: NFC Type 4, 106 kbit/s", "nfc", (), limits.TYPE4, aim=1.10, in_c=True),
-    Line("node in C: CAN 500 kbit/s, named", "can", (), limits.CLASSIC, "&pace=1", aim=1.10, named=True, in_c=True),
-    Line("node in C: CAN FD 500k/2M, named", "can", (), limits.FD, "&pace=1&fd=1", aim=1.25, named=True, in_c=True),
+    Line("node in C: CAN 500 kbit/s, named", "can", (), limits.CLASSIC, "&pace=1", aim=1.08, named=True, in_c=True),
+    Line("node in C: CAN FD 500k/2M, named", "can", (), limits.FD, "&pace=1&fd=1", aim=1.20, named=True, in_c=True),
 )
 OWN_SHARE = 0.05
 """Aim: what a node in C takes beside its P-256 and its flash, of the time of the link."""
