@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.cli.shell import clean_environment
+from tests.cli.shell import clean_environment, zygote
+from tests.zygote import FIRST_FD, Forked, forkable
 
 PATIENCE = 60.0
 STREAMS = ("stdin", "stdout", "stderr")
@@ -54,40 +55,51 @@ def on_terminal(
         fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
         # What the variables say would count more than the terminal itself.
         variables = {name: value for name, value in variables.items() if name not in ("COLUMNS", "LINES")}
-    given = ["--passphrase-fd", str(read)] if passphrase is not None else []
-    elsewhere = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    ends: dict[str, Any] = {name: theirs if name in streams else other for name, other in elsewhere.items()}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "teds_provision", "--home", str(home), *given, *map(str, words)],
-        pass_fds=(read,),
-        env=variables,
-        start_new_session=True,
-        **ends,
-    )
-    os.close(theirs)
-    os.close(read)
+    places, ends = {"screen": ours}, {"stdin": theirs if "stdin" in streams else os.open(os.devnull, os.O_RDONLY)}
+    for name, short in (("stdout", "out"), ("stderr", "err")):
+        if name in streams:
+            ends[name] = theirs
+        else:
+            places[short], ends[name] = os.pipe()
+    process = _begun(["--home", str(home), *map(str, words)], variables, ends, read if passphrase is not None else None)
+    for end in {theirs, read, *ends.values()}:
+        os.close(end)
     try:
-        seen = _conversation(ours, process, list(answers))
+        seen = _conversation(places, list(answers))
         code = process.wait(PATIENCE)
     finally:
         process.kill()
-        process.wait()
-        os.close(ours)
-        for pipe in filter(None, (process.stdout, process.stderr)):
-            pipe.close()
+        process.wait(PATIENCE)
+        for place in places.values():
+            os.close(place)
     return Shown(
         code, *(seen[name].decode(errors="replace").replace("\r\n", "\n") for name in ("screen", "out", "err"))
     )
 
 
-def _conversation(ours: int, process: subprocess.Popen[bytes], answers: list[str]) -> dict[str, bytes]:
+def _begun(
+    words: list[str], variables: dict[str, str], ends: dict[str, int], secret: int | None
+) -> Forked | subprocess.Popen[bytes]:
+    """Start the program in a session of its own: a fork if nobody can see the difference, else an interpreter."""
+    fork = forkable(variables, zygote().environment)
+    given = () if secret is None else (secret,)
+    if secret is not None:
+        words = ["--passphrase-fd", str(FIRST_FD if fork else secret), *words]
+    if fork:
+        more: dict[str, Any] = {"out": ends["stdout"], "err": ends["stderr"], "stdin": ends["stdin"], "given": given}
+        return zygote().run("teds_provision", words, variables, cwd=Path.cwd(), **more)
+    command = [sys.executable, "-m", "teds_provision", *words]
+    how: dict[str, Any] = {"pass_fds": given, "env": variables, "start_new_session": True, **ends}
+    return subprocess.Popen(command, **how)
+
+
+def _conversation(places: dict[str, int], answers: list[str]) -> dict[str, bytes]:
     """Read everything until the program has closed it all; type an answer wherever it asks."""
     seen, answered = dict.fromkeys(("screen", "out", "err"), b""), dict.fromkeys(("screen", "out", "err"), 0)
     until = time.monotonic() + PATIENCE
     with selectors.DefaultSelector() as selector:
-        for name, place in (("screen", ours), ("out", process.stdout), ("err", process.stderr)):
-            if place is not None:
-                selector.register(place, selectors.EVENT_READ, name)
+        for name, place in places.items():
+            selector.register(place, selectors.EVENT_READ, name)
         while selector.get_map():
             found = selector.select(max(0.0, until - time.monotonic()))
             assert found, ("the program says nothing more, and does not end", seen)
@@ -101,5 +113,5 @@ def _conversation(ours: int, process: subprocess.Popen[bytes], answers: list[str
                 seen[key.data] += octets
                 if answers and seen[key.data][answered[key.data] :].strip().endswith(b":"):
                     answered[key.data] = len(seen[key.data])
-                    os.write(ours, answers.pop(0).encode() + b"\n")
+                    os.write(places["screen"], answers.pop(0).encode() + b"\n")
     return seen

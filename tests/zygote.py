@@ -189,12 +189,23 @@ class Zygote:
         err: int,
         given: tuple[int, ...] = (),
         cwd: Path = ROOT,
+        stdin: int | None = None,
     ) -> Forked:
-        """Run ``python -m module words`` with its output to two files; ``given`` become descriptors 3, 4 … there."""
+        """Run ``python -m module words`` with its output to two files; ``given`` become descriptors 3, 4 … there.
+
+        With a ``stdin`` it leads a session of its own: the terminal of the tests is not its terminal.
+        """
         sys.audit("tests.zygote.run", module)  # tests/second_try.py counts the processes of a test
-        nothing = os.open(os.devnull, os.O_RDONLY)
+        nothing = os.dup(stdin) if stdin is not None else os.open(os.devnull, os.O_RDONLY)
         status, told = os.pipe()
-        facts = {"module": module, "words": words, "environment": environment, "cwd": str(cwd), "umask": _umask()}
+        facts = {
+            "module": module,
+            "words": words,
+            "environment": environment,
+            "cwd": str(cwd),
+            "umask": _umask(),
+            "session": stdin is not None,
+        }
         try:
             with self._lock:
                 socket.send_fds(self._control, [json.dumps(facts).encode()], [told, nothing, out, err, *given])
@@ -267,6 +278,7 @@ class _Request:
     environment: dict[str, str]
     cwd: str
     umask: int
+    session: bool
     files: tuple[int, ...]  # status pipe, stdin, stdout, stderr, and what else is given
 
 
@@ -317,6 +329,8 @@ def _become(request: _Request) -> None:
     os.environ.update(request.environment)
     os.chdir(request.cwd)
     os.umask(request.umask)
+    if request.session:
+        os.setsid()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if under_faults:
         ctypes.CDLL(None).faults_begin()
