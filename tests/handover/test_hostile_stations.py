@@ -63,6 +63,7 @@ def forged(
     mode: Mode = "copy",
     revoked: tuple[str, ...] = (),
     signatures: dict[str, bytes] | None = None,
+    vouches: bool = True,
 ) -> bytes:
     """A bundle that a trusted station may make by hand: its own key, and whatever content it likes."""
     now = datetime.now(UTC).replace(microsecond=0)
@@ -78,7 +79,7 @@ def forged(
         ca=sender.ca,
         nodes=nodes,
         station_signatures={
-            receiver.fingerprint: ca.sign(station_key_message(receiver.point)),
+            **({receiver.fingerprint: ca.sign(station_key_message(receiver.point))} if vouches else {}),
             **(signatures or {}),
         },
         revoked=revoked,
@@ -184,6 +185,17 @@ def test_a_bundle_vouches_for_other_stations_only_with_its_cas_signature(pair: P
     taken(pair.south, forged(pair.north, pair.south, node_of(pair.board), signatures=signatures))
     assert pair.south.identity.certificate(pair.north.ca, west.point) == good
     assert len(held(pair.south, pair.board)) == 1
+
+
+def test_a_bundle_need_not_vouch_again_for_its_receiver(pair: Pair) -> None:
+    without = forged(pair.north, pair.south, node_of(pair.board), vouches=False)
+    with pytest.raises(PolicyError, match="has no signature by CA"):
+        taken(pair.south, without)
+    taken(pair.south, forged(pair.north, pair.south, node_of(pair.board)))
+    kept = pair.south.identity.certificate(pair.north.ca, pair.south.point)
+    assert kept is not None
+    assert taken(pair.south, without).fresh
+    assert pair.south.identity.certificate(pair.north.ca, pair.south.point) == kept
 
 
 # -- M3: what a move gives away, and what its receipt deletes --------------------------------------------------------

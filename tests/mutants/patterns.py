@@ -670,6 +670,13 @@ PATTERNS = (
         "tests/links/ble/test_power_off.py",
     ),
     Pattern(
+        "a rebuilt home compares its whole chain",
+        "_own_head",
+        "connected and (not restored)",
+        "True",
+        "tests/plant/test_sync_files.py",
+    ),
+    Pattern(
         "a request comes from the page's own origin",
         "_require_origin",
         "headers['origin'].lower() not in named.origins",

@@ -15,7 +15,8 @@ from teds_provision import plant
 from teds_provision.errors import ForkError, LinkError, NotMemberError, PolicyError, StoreLockedError
 from teds_provision.plant.apply_pages import heads_digest, merged_views
 from teds_provision.plant.folder_transport import FolderTransport
-from teds_provision.plant.sync import resume
+from teds_provision.plant.sync import resume, sync
+from teds_provision.plant.transport import CarriedPage
 from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.page import PageDraft, seal_page
 from teds_provision.station.station import Station
@@ -226,6 +227,43 @@ def test_a_rebuilt_home_waits_where_somebody_has_seen_more_of_it(plants: Plant) 
     plants.sync(back)
     assert not back.plant.restored
     back.close()
+
+
+class Counting(FolderTransport):
+    """A transport that gives what it is asked for and no page more, as a registry's database does."""
+
+    def pages(self, station: str, after: int) -> Iterator[CarriedPage]:
+        return (page for page in super().pages(station, after) if page.number > after)
+
+
+def test_a_rebuilt_home_compares_its_whole_chain_with_what_is_there(plants: Plant) -> None:
+    """Another home wrote a page under its key, below those that it knows to be there: it is a copied disk."""
+    west = plants.member("west", "line", "sign")
+    pin(west)
+    plants.sync(west)
+    west.close()
+    shutil.copytree(plants.folder / "west", plants.folder / "twin")
+    other = plants.folder / "other stick"
+    shutil.copytree(plants.stick, other)
+    twin = Station.open(plants.folder / "twin", ask=ask)
+    pin(twin, bytes([9] * 10))
+    plants.sync(twin, other)
+    twin.close()
+    west = Station.open(plants.folder / "west", ask=ask)
+    for number in (1, 2, 3):
+        pin(west, bytes([number] * 10))
+        plants.sync(west)
+    joined = west.plant.joined
+    assert joined is not None
+    assert joined.acknowledged >= 4
+    shutil.copytree(other / west.fingerprint, plants.stick / west.fingerprint, dirs_exist_ok=True)
+    sync(west, Counting(plants.stick))  # what it saw there once, it does not read again
+    west.unlock()
+    west.plant.begin_restored()
+    with pytest.raises(ForkError):
+        sync(west, Counting(plants.stick))
+    assert alarms(west) == ["fork"]
+    west.close()
 
 
 def test_a_person_names_the_branch_or_the_roster_does(plants: Plant) -> None:

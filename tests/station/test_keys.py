@@ -172,6 +172,14 @@ def test_a_key_that_came_in_a_bundle_and_opens_brings_the_ca_of_its_bundle(stati
     assert (flags.next_key_id, flags.next_ca) == (None, None)
 
 
+def test_a_good_open_makes_older_keys_obsolete_and_leaves_a_newer_agreement(station: Station) -> None:
+    for key in (a_key(1, "active"), a_key(2), a_key(3), a_key(4), a_key(2, uuid=OTHER)):
+        station.keys.add(key)
+    station.keys.promote(NODE, f"{3:016x}")
+    assert [(key.epoch, key.state) for key in station.keys.keys_of(NODE)] == [(4, "pending"), (3, "active")]
+    assert numbers(station, OTHER) == [2]
+
+
 def test_a_ca_whose_key_did_not_open_is_forgotten(station: Station) -> None:
     for key in (a_key(1, "active"), a_key(2)):
         station.keys.add(key)
