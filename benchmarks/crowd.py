@@ -82,14 +82,20 @@ def provisioned(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kin
     while wire.busy_seconds == busy:
         time.sleep(0.001)
     began, passed, own = time.monotonic(), 0, 0.0
+    failures: list[str] = []
     for text in process.stdout:
-        passed += json.loads(text).get("verdict") == "authentic"
-        if passed == len(nodes.uuids):
+        line = json.loads(text)
+        passed += line.get("verdict") == "authentic"
+        if "error" in line and "uuid" in line:
+            failures.append(line["error"]["message"])
+        if passed + len(failures) == len(nodes.uuids):
             break
     took, taken = time.monotonic() - began, wire.busy_seconds - busy
     own = worked(process.pid)
     process.communicate()
     rows.tell(f"provision --all, {passed} of {len(nodes.uuids)} nodes in C, {kind}", took, "s")
+    for failure in failures:
+        print(f"  failed: {failure}")
     rows.tell("  the wire time of all frames", taken, "s")
     rows.tell("  ratio", took / taken, "×", aim=ALL_AIM)
     rows.tell("  processor time of the station", own, "s")
