@@ -145,13 +145,13 @@ def measured(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kind: 
 def main(words: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--nodes", type=int, default=200)
-    parser.add_argument("--only", default="", help="500 or FD")
+    parser.add_argument("--only", default="", help="500 (kbit/s) or FD")
     options = parser.parse_args(words)
     if MOSQUITTO is None:
         raise SystemExit("mosquitto is not installed: apt-get install mosquitto")
     rows = Rows()
     for kind, more in (("500 kbit/s", ""), ("FD 500k/2M", "&fd=1")):
-        if options.only not in kind:
+        if not kind.startswith(options.only):
             continue
         link = f"udp_multicast:239.74.163.13?port={free_port()}{more}&pace=1"
         wire = Wire(parse_spec(link).wire)
