@@ -481,7 +481,7 @@ def test_actuators_of_who_comes_are_never_claimed(desk: Desk) -> None:
 
 def test_a_node_that_this_very_process_provisions_is_measured_at_once(desk: Desk) -> None:
     """Not when everybody is asked again, half a minute later."""
-    service = Service(desk, desk.station()).start("--measure", "all")
+    service = Service(desk, desk.station()).start("--measure", "all", "--rate", 50)
 
     names = iter(("first", "second", "third"))
 

@@ -177,7 +177,7 @@ def test_a_writer_that_is_killed_gives_a_matched_node_back(lab: Lab) -> None:
 def test_who_is_renamed_leaves_or_joins_a_measurement_of_names(lab: Lab) -> None:
     left, right = lab.nodes
     station, over = lab.service.station, lab.desk.links.over("can")
-    lab.service.start("--measure", "name:arm-*")
+    lab.service.start("--measure", "name:arm-*", "--rate", 50)
     with lab.service.client() as asked:
         until(lambda: asked.node(right.uuid)["present"] and asked.node(left.uuid)["present"])
     assert lab.told() == []
