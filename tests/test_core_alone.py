@@ -171,7 +171,7 @@ def test_a_backup_with_the_rows_of_a_plant_comes_through_a_core_without_the_room
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
 def test_the_whole_suite_of_the_core_passes(core: Path) -> None:
-    usual = "not soak and not machine and not rclpy and not realtime and not needs_room"
+    usual = "not soak and not machine and not rclpy and not nightly and not realtime and not needs_room"
     words = ("-m", "pytest", "-q", "-n", "2", "--dist", "worksteal", "-p", "no:cacheprovider", "-m", usual, "tests")
     done = run(core, *words, "--hypothesis-profile", "gate", patience=3500)
     assert done.returncode == 0, done.stdout[-8000:]

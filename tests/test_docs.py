@@ -79,6 +79,7 @@ def test_links_lead_to_pages_and_headings_that_exist(page: Path) -> None:
     assert list(broken_links(page)) == []
 
 
+@pytest.mark.needs_room("plant")
 @pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
 def test_commands_that_are_shown_can_be_typed(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -21,6 +21,7 @@ def test_a_word_that_nobody_can_read_is_cut_in_the_middle() -> None:
     assert NotFoundError("y" * 512).message == "y" * 512, "paths and keys stay whole"
 
 
+@pytest.mark.needs_room("plant")
 def test_each_code_of_the_tree_has_an_exit_code_which_the_client_has_too() -> None:
     """Read from the sources: most rooms name errors of their own, and load much."""
     files = Path(teds_provision.__file__).parent.rglob("*.py")

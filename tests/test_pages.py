@@ -7,6 +7,8 @@ import re
 from functools import cache
 from pathlib import Path
 
+import pytest
+
 from tests.parsed import parsed
 
 ROOT = Path(__file__).parent.parent
@@ -114,6 +116,7 @@ def missing_in_the_glossary(text: str) -> list[str]:
     ]
 
 
+@pytest.mark.needs_room("plant")
 def test_the_glossary_names_files_that_exist_and_defines_each_word_once() -> None:
     text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
     assert missing_in_the_glossary(text) == []
@@ -192,6 +195,7 @@ def test_every_page_says_what_for_what_to_type_what_you_will_see_what_can_go_wro
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.needs_room("plant")
 def test_what_can_go_wrong_quotes_what_the_program_says() -> None:
     said = texts("teds_provision", "benchmarks", "tests/vectors")
     wrong = []

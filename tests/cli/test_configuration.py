@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 UUID = "8d4d9da65281f7000000"
 
 
+@pytest.mark.needs_room("plant")
 def test_what_follows_from_the_command_line_is_up_to_date() -> None:
     script = ROOT / "scripts" / "options.py"
     if not script.exists():

@@ -59,6 +59,7 @@ def test_provision_names_missing_packages_and_writes_nothing(tmp_path: Path) -> 
     assert (done.returncode, "jaraco.context missing" in done.stderr) == (1, True), done.stderr
 
 
+@pytest.mark.needs_room("plant")
 def test_a_package_for_labels_is_missed_before_a_board_is_built(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

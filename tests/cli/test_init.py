@@ -208,6 +208,7 @@ def test_what_the_demo_installs_is_enough_for_the_steps_that_readme_shows_after_
     assert "--editable '.[ncap]'" in said
 
 
+@pytest.mark.needs_room("plant")
 def test_every_extra_that_a_hint_names_is_one() -> None:
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     named = {

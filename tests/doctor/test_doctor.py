@@ -100,6 +100,7 @@ def test_a_machine_without_anything_has_no_failure(system: System, monkeypatch: 
     assert not system.home.exists()
 
 
+@pytest.mark.needs_room("plant")
 def test_the_registry_holds_every_check(system: System) -> None:
     list(examine(system))
     machine = ["python", "libraries", "argon2id", "libusb", "clock"]

@@ -41,6 +41,7 @@ def test_the_main_loop_is_that_of_the_blank_port() -> None:
     assert (builds.FIRMWARE / "port/template/main.c").read_text(encoding="utf-8").endswith(shown[0])
 
 
+@pytest.mark.needs_room("check")
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_file_that_it_names_is_there(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
