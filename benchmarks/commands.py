@@ -29,8 +29,8 @@ from benchmarks.provisioning import SLOW, next_node, next_nodes, nodes
 from benchmarks.verifying import fill as fill_images
 from teds_provision.links.ports import free_port
 from teds_provision.station.station import initialise
-from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import PRODUCT, THROWAWAY, SealingKey
+from teds_provision.vault.selection import forget_vaults
 
 PASSPHRASE = "correct horse battery"
 ANGLE = "magnetic-angular-position-sensor"

@@ -31,8 +31,8 @@ from teds_provision.links.ports import free_port
 from teds_provision.plant.demo.cluster import Cluster, programs, running
 from teds_provision.protocol.plant.document import open_request
 from teds_provision.station.station import initialise
-from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
+from teds_provision.vault.selection import forget_vaults
 from tests.plant.owner import ANGLE
 
 AIM = 0.9

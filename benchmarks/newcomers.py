@@ -51,7 +51,8 @@ from teds_provision.provisioning.provision import provision
 from teds_provision.station.station import Station, initialise
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
-from teds_provision.vault import forget_vaults, passphrase
+from teds_provision.vault import passphrase
+from teds_provision.vault.selection import forget_vaults
 from tests.bench import on_reader
 
 BASE = 20

@@ -30,7 +30,9 @@ from teds_provision.station.station import Station, initialise
 from teds_provision.station.store import KeyRecord, NodeRecord, WhitelistEntry, utc_now
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
-from teds_provision.vault import forget_vaults, node_key_context, passphrase
+from teds_provision.vault import passphrase
+from teds_provision.vault.base import node_key_context
+from teds_provision.vault.selection import forget_vaults
 
 PASSPHRASE = "correct horse battery"
 RECEIVER = "receiver"

@@ -1,15 +1,15 @@
-"""Rooms whose modules and names are loaded at their first use (PEP 562), so that top-level imports cost nothing.
+"""Modules that are loaded at their first use, if a command that people wait for would get slower otherwise.
 
-A room's ``__init__`` names its modules for type checkers and has them loaded late for everything else::
+:func:`late` stands for a heavy library, or for one module of ours, until something of it is asked for. :func:`lazy`
+gives the modules of a room (PEP 562): its ``__init__`` names them for type checkers and loads them late for all else::
 
     if TYPE_CHECKING:
-        from teds_provision.handover import life, trust
+        from teds_provision.measure import blocks, runner
     else:
         __getattr__ = lazy(__name__)
 
-Users write ``from teds_provision import handover`` on top and ``handover.trust.spoken(…)`` where they need it; that
-call loads the module. ``from teds_provision.handover.trust import spoken`` on top loads it at once, which is right for
-what every use of a module needs.
+Users write ``from teds_provision import measure`` on top and ``measure.blocks.Block`` where they need it; that loads
+the module. Both are exceptions, which ``tests/test_house.py`` lists: imports are on top, by name.
 
 This module is below every room and imports nothing of ours.
 """

@@ -27,6 +27,49 @@ LATE_IMPORTS = {
 }
 """Imports of our own inside functions, by file."""
 
+_LISTS = "commands that only list need no cryptography and no codec of the TEDS"
+LATE_MODULES = {
+    "cli/config_file.py": "--help reads no file",
+    "cli/context.py": "--help opens no station; a base station may not run; plain output has no rich",
+    "cli/main.py": "for one command, for completion, for errors about a file",
+    "cli/measure/measure.py": "numpy and the sinks: not for --help and not for JSON",
+    "cli/measure/record.py": "numpy and the sinks: not for --help and not for JSON",
+    "cli/node/build.py": "only in front of an operator",
+    "cli/node/provision.py": "only in front of an operator",
+    "cli/node/show.py": "cryptography: only for a handover bundle",
+    "cli/node/virtual_nodes.py": "HTTP: only for the nodes of the running base station",
+    "cli/options.py": "HTTP, Foxglove, traces: most runs use none of them",
+    "cli/service/ncap.py": "the service: only for ncap run",
+    "cli/shell_completion.py": "commands, options and files are completed without the store",
+    "cli/station/init.py": "bundles and receipts: only for the CA of another station",
+    "cli/station/log.py": "traces: only where one is merged in",
+    "doctor/links.py": "python-can, nfcpy and pyserial: only if such a link was given, or PC/SC answers",
+    "measure/sinks/ros/ros2.py": "cyclonedds: an extra",
+    "plant/commands/registry.py": "cryptography: not for --help",
+    "plant/doctor.py": "cryptography: only for a station that joined a registry",
+    "plant/verify_evidence.py": "the store, which nothing else there needs",
+    "provisioning/adoption.py": "numpy: not for a datasheet without calibration",
+    "provisioning/build.py": "numpy: not for a datasheet without calibration",
+    "provisioning/inventory.py": "cryptography: not for a list of unverified nodes",
+    "station/datasheets.py": _LISTS,
+    "station/identity.py": _LISTS,
+    "station/pins.py": _LISTS,
+    "station/plant/plant.py": _LISTS,
+    "station/policy.py": _LISTS,
+    "station/station.py": "cryptography, sockets and processes: `nodes` opens no vault",
+    "teds/calibration/files.py": "lxml: not for a calibration that is no certificate",
+    "vault/selection.py": "argon2, keyring and python-pkcs11: a station has one of them",
+    "vault/software.py": "PKCS #8: for the commands of the CA key alone",
+}
+"""Files that load a module of ours at its first use, by `late`, and what that spares a command that people wait for."""
+
+LATE_ROOMS = {
+    "check", "demo", "describe", "measure", "measure/recordings", "measure/running", "measure/sinks",
+    "measure/sinks/mcap", "node", "node/ble", "node/can", "node/firmware", "node/hardware", "node/nfc", "node/wrapped",
+    "plant", "plant/demo", "provisioning", "station/store", "teds", "teds/calibration", "teds/dcc",
+}  # fmt: skip
+"""Rooms that give their modules at the first use (PEP 562): users name a room where a module would slow --help."""
+
 _WIRED = "a part of the daemon, wired up once in daemon.py: each argument is another part or a setting"
 MANY_PARAMETERS = {
     "client.py provision": "the members of the request body, as keywords of the public client",
@@ -67,6 +110,14 @@ def test_imports_of_our_own_stand_on_top(house: ModuleType, modules: dict[str, o
     found = Counter(place.rpartition(":")[0] for place in house.late_imports(modules))
     more = [f"{file}: {count}" for file, count in found.items() if count > LATE_IMPORTS.get(file, 0)]
     assert not more, "import on top, through the room if it must load late (CONTRIBUTING.md, The house)"
+
+
+def test_modules_of_ours_are_loaded_late_only_for_a_named_reason() -> None:
+    package = ROOT / "teds_provision"
+    texts = {path.relative_to(package): path.read_text("utf-8") for path in package.rglob("*.py")}
+    late = {str(path) for path, text in texts.items() if 'late("teds_provision' in text}
+    rooms = {str(path.parent) for path, text in texts.items() if path.name == "__init__.py" and "= lazy(" in text}
+    assert (late, rooms) == (set(LATE_MODULES), LATE_ROOMS), "import on top; else give the reason here"
 
 
 def many_parameters(tree: ast.AST) -> Iterator[str]:

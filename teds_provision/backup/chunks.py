@@ -9,12 +9,18 @@ that was cut off or carried on, fail at a tag.
 from __future__ import annotations
 
 import hashlib
-from typing import BinaryIO, Final, Protocol
-
-from cryptography.exceptions import InvalidTag
-from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from typing import TYPE_CHECKING, BinaryIO, Final, Protocol
 
 from teds_provision.errors import BadDataError, NotAuthenticError
+from teds_provision.lazy import late
+
+if TYPE_CHECKING:
+    from cryptography import exceptions
+    from cryptography.hazmat.primitives.ciphers import aead
+else:
+    exceptions = late("cryptography.exceptions")
+    aead = late("cryptography.hazmat.primitives.ciphers.aead")
+
 
 CHUNK_OCTETS: Final = 1 << 20
 KEY_OCTETS: Final = 32
@@ -36,7 +42,7 @@ class ChunkWriter:
     """Seals what is written into chunks; :meth:`end` must follow. ``context`` is bound to every chunk."""
 
     def __init__(self, out: BinaryIO, key: bytes, context: bytes) -> None:
-        self._out, self._cipher, self._context = out, AESGCM(key), context
+        self._out, self._cipher, self._context = out, aead.AESGCM(key), context
         self._buffer = bytearray()
         self._index = 0
         self.digest = hashlib.sha256()
@@ -68,7 +74,7 @@ class ChunkReader:
     """
 
     def __init__(self, source: OctetSource, key: bytes, context: bytes) -> None:
-        self._source, self._cipher, self._context = source, AESGCM(key), context
+        self._source, self._cipher, self._context = source, aead.AESGCM(key), context
         self._ahead = self._plain = b""
         self._place = self._index = 0
         self._done = False
@@ -115,7 +121,7 @@ class ChunkReader:
         self._ahead = b"" if last else self._ahead[_FULL:]
         try:
             self._plain = self._cipher.decrypt(_nonce(self._index, last=last), sealed, self._context)
-        except (InvalidTag, ValueError):
+        except (exceptions.InvalidTag, ValueError):
             raise NotAuthenticError("The backup was damaged or changed.", hint="Use another copy.") from None
         self._place, self._done = 0, last
         self._index += 1

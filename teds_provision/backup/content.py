@@ -15,7 +15,7 @@ from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import fingerprint, is_point
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import KeyRecord
-from teds_provision.vault import Vault, node_key_context
+from teds_provision.vault.base import Vault, node_key_context
 
 MAX_HEAD_OCTETS: Final = 64 * 1024
 _TEXTS: Final = ("store", "station", "point", "name", "created", "keystore", "material")

@@ -28,8 +28,9 @@ from teds_provision.station.snapshot import Relation, is_damage, place, relation
 from teds_provision.station.station import Station
 from teds_provision.station.store import StoreLock
 from teds_provision.station.store.database import has_store
-from teds_provision.vault import Ask, Vault, asked_first, create_vault, open_vault
+from teds_provision.vault.base import Ask, Vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
+from teds_provision.vault.selection import asked_first, create_vault, open_vault
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, TextIO
 
 import click
 
-from teds_provision import protocol, vault
-from teds_provision import station as station_room
 from teds_provision.cli.config_file import home_of
 from teds_provision.errors import (
     LinkError,
@@ -35,10 +33,17 @@ if TYPE_CHECKING:
     from teds_provision import client
     from teds_provision.cli import console
     from teds_provision.client import Client
+    from teds_provision.protocol import fingerprints
     from teds_provision.shapes import problem
+    from teds_provision.station import label as labels
+    from teds_provision.station import station as stations
     from teds_provision.station.station import Station
     from teds_provision.teds.certificate import ChooseItem
+    from teds_provision.vault import hardening
 else:
+    # --help and usage errors open no station.
+    fingerprints, labels = late("teds_provision.protocol.fingerprints"), late("teds_provision.station.label")
+    stations, hardening = late("teds_provision.station.station"), late("teds_provision.vault.hardening")
     client = late("teds_provision.client")  # HTTP: only if a base station runs
     json = late("json")
     console = late("teds_provision.cli.console")  # rich
@@ -233,9 +238,9 @@ class App:
             answer = click.prompt(asked, default="n", show_default=False, err=True).strip()
             if answer.lower() in ("y", "yes", "n", "no"):
                 return answer.lower().startswith("y")
-            label = station_room.label.read_label(answer)
-            digits = label[1] if label is not None else protocol.fingerprints.read_fingerprint(answer)
-            if digits is not None and not protocol.fingerprints.same_key(digits, fingerprint):
+            label = labels.read_label(answer)
+            digits = label[1] if label is not None else fingerprints.read_fingerprint(answer)
+            if digits is not None and not fingerprints.same_key(digits, fingerprint):
                 print_message("These digits belong to a different key.")
                 return False
             if digits is not None:
@@ -249,7 +254,7 @@ class App:
 
     def ask_secret(self, prompt: str, confirm: bool = False) -> str:
         """Get a passphrase or PIN: from --passphrase-fd (one line, read once), else from the terminal."""
-        vault.hardening.harden()
+        hardening.harden()
         if self._passphrase_fd is not None:
             if self._passphrase is None:
                 self._passphrase = read_line(self._passphrase_fd)
@@ -274,7 +279,7 @@ class App:
 
     def station(self) -> Station:
         """Open this base station (store now, vault when a key is first needed); NotFoundError points to init."""
-        station = station_room.station.Station.open(self.home, ask=self.ask_secret, notify=self.warn)
+        station = stations.Station.open(self.home, ask=self.ask_secret, notify=self.warn)
         station.notice = self.note
         station.use_agent = not self.has_passphrase
         station.released = self._released

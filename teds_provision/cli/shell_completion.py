@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import click
 from click.shell_completion import (
@@ -20,11 +20,16 @@ from click.shell_completion import (
     add_completion_class,
 )
 
-from teds_provision import station as station_room
 from teds_provision import teds
 from teds_provision.cli.config_file import home_of
 from teds_provision.errors import TedsProvisionError
+from teds_provision.lazy import late
 from teds_provision.sanitize import printable
+
+if TYPE_CHECKING:
+    from teds_provision.station import station as stations
+else:  # commands, options and files are completed without the store
+    stations = late("teds_provision.station.station")
 
 _NODES: Final = frozenset({"uuid", "uuids", "what", "old", "new", "node", "nodes", "text", "names"})
 _MOST: Final = 50
@@ -125,12 +130,10 @@ def _home(ctx: click.Context) -> Path:
     return home_of(ctx.find_root().params.get("home"))
 
 
-def _items(
-    ctx: click.Context, found: Callable[[station_room.station.Station], Iterable[tuple[str, str]]]
-) -> list[CompletionItem]:
+def _items(ctx: click.Context, found: Callable[[stations.Station], Iterable[tuple[str, str]]]) -> list[CompletionItem]:
     """Return completions from the store, each with a description; empty without a store, and no word of two lines."""
     try:
-        station = station_room.station.Station.open(_home(ctx), ask=_nobody)
+        station = stations.Station.open(_home(ctx), ask=_nobody)
     except TedsProvisionError:
         return []
     try:

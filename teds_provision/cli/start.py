@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import doctor, measure, provisioning
 from teds_provision.cli.context import App
 from teds_provision.cli.rendering import aligned, count_of, shown
+from teds_provision.doctor import fleet
+from teds_provision.doctor.checks import System
 from teds_provision.errors import LinkError, NotFoundError, TedsProvisionError
 from teds_provision.links import LinkSettings
+from teds_provision.measure.link_survey import look, readers
+from teds_provision.provisioning.inventory import inventory, search
 from teds_provision.sanitize import sanitize
 
 if TYPE_CHECKING:
@@ -30,14 +33,14 @@ def start(app: App, ctx: click.Context) -> None:
     except NotFoundError:
         found: dict[str, Any] = {
             "station": None,
-            "links": [_link(survey) for survey in measure.link_survey.readers()],
+            "links": [_link(survey) for survey in readers()],
             "nodes": [],
             "problems": [],
             "next": "teds-provision init",
         }
     else:
         found = _of_service(app, station) or _of_links(station, _named(ctx))
-        waiting = doctor.fleet.nodes(doctor.checks.System(app.home))
+        waiting = fleet.nodes(System(app.home))
         found["problems"] += [
             {"what": finding.why, "fix": finding.fix} for finding in waiting if finding.result == "warning"
         ]
@@ -70,10 +73,10 @@ def _station(station: Station) -> dict[str, Any]:
 
 def _of_links(station: Station, named: LinkSettings) -> dict[str, Any]:
     """Ask on the links themselves: the named ones, else those of the last contacts, and present readers."""
-    known = [node["uuid"] for node in provisioning.inventory.inventory(station, provisioning.inventory.search(station))]
+    known = [node["uuid"] for node in inventory(station, search(station))]
     remembered = sorted(set(station.nodes.last_places([bytes.fromhex(uuid) for uuid in known]).values()))
     places = [place for place in named.places if named.nfc] + list(named.buses or remembered)
-    present = [*measure.link_survey.look(station, places), *([] if named.nfc else measure.link_survey.readers())]
+    present = [*look(station, places), *([] if named.nfc else readers())]
     nodes = [_node(station, link.place, address, who) for link in present for address, who in link.nodes]
     problems = [{"what": link.why, "fix": link.cure} for link in present if link.state == "down"]
     problems += [{"what": text, "fix": f"teds-provision identify --via can --can {link.place.partition(':')[2]}"}
@@ -92,7 +95,7 @@ def _link(link: LinkSurvey) -> dict[str, Any]:
 
 
 def _node(station: Station, place: str, address: int, who: Any) -> dict[str, Any]:
-    (known,) = provisioning.inventory.inventory(station, [who.uuid])
+    (known,) = inventory(station, [who.uuid])
     return {
         "uuid": who.uuid.hex(),
         "name": known["name"],

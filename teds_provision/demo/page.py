@@ -21,11 +21,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from teds_provision import client, vault
+from teds_provision import client
 from teds_provision.errors import LinkError, TedsProvisionError
 from teds_provision.links.ports import free_port
 from teds_provision.shapes.problem import problem_in
 from teds_provision.station.station import initialise
+from teds_provision.vault.passphrase import THROWAWAY
 
 RATE: Final = 50.0
 GROUP: Final = "crane"
@@ -56,7 +57,7 @@ def page_demo(say: Callable[[str], None], http: str | None = None) -> Iterator[P
         home, secret, nfc = folder / "home", secrets.token_hex(16), f"udp:127.0.0.1:{free_port()}"
         say("A base station with its own keys, in a temporary folder.")
         station, _ = initialise(
-            home, name="bench", keystore="file", ask=lambda prompt, confirm: secret, costs=vault.passphrase.THROWAWAY
+            home, name="bench", keystore="file", ask=lambda prompt, confirm: secret, costs=THROWAWAY
         )
         station.close()
         where = http or f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"

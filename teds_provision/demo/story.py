@@ -22,14 +22,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from teds_provision import provisioning, vault
+from teds_provision import provisioning
 from teds_provision.errors import LinkError, NotAuthenticError, PolicyError
 from teds_provision.handover.incoming import ImportResult, NodeProof, import_bundle, plan_import, prove_nodes
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import close
 from teds_provision.handover.trust import Candidate, add
 from teds_provision.lazy import late
-from teds_provision.links import LinkSettings, can
+from teds_provision.links import LinkSettings
+from teds_provision.links.can.port import open_port
 from teds_provision.links.ports import free_port
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.provisioning.agree import require_session
@@ -45,6 +46,7 @@ from teds_provision.provisioning.verify_node import verify_node
 from teds_provision.shapes.problem import problem_in
 from teds_provision.station.station import Station, initialise
 from teds_provision.station.store import TrustRecord
+from teds_provision.vault.passphrase import THROWAWAY
 
 if TYPE_CHECKING:
     from teds_provision.measure import blocks, held_actuator, request, runner, sinks, verified_session
@@ -188,7 +190,7 @@ def measure_group(demo: Demo, station: Station, uuids: tuple[bytes, ...]) -> Non
     file = demo.folder / "run.csv"
     station.groups.create("robot", list(uuids))
     with demo.steps.step("measure") as step:
-        port: Any = can.port.open_port(demo.can)
+        port: Any = open_port(demo.can)
         try:
             sink = sinks.open_sink(str(file))
             facts = blocks.StationFacts(station.name, group="robot", started=time.time())
@@ -301,7 +303,7 @@ def new_station(demo: Demo, name: str) -> Station:
             name=name,
             keystore="file",
             ask=lambda prompt, confirm: secret,
-            costs=vault.passphrase.THROWAWAY,
+            costs=THROWAWAY,
         )
         step.detail = f"station {name}, key {station.fingerprint[:16]}"
     demo.stack.callback(station.close)

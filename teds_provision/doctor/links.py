@@ -14,17 +14,30 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.doctor.checks import Finding, Result, System, check
 from teds_provision.errors import LinkError, NoReaderError, UsageError
-from teds_provision.links import can as can_room
-from teds_provision.links import nfc as nfc_room
+from teds_provision.lazy import late
 from teds_provision.links.ble.ble_errors import POWER_HINT
 from teds_provision.links.ble.bluez import AdapterFacts, adapters
 from teds_provision.links.ble.spec import BleSpec, parse_spec
 from teds_provision.links.nfc.usb_listing import READERS, usb_ids
 from teds_provision.links.ports import free_port
+
+if TYPE_CHECKING:
+    from teds_provision.links.can import bus as can_bus
+    from teds_provision.links.can import bus_multiplexer
+    from teds_provision.links.can import spec as can_spec
+    from teds_provision.links.nfc import pcsc_readers
+    from teds_provision.links.nfc import reader as nfc_reader
+    from teds_provision.links.nfc import tag as nfc_tag
+else:
+    # python-can, nfcpy and pyserial: only if such a link was given, or PC/SC answers
+    can_bus, can_spec = late("teds_provision.links.can.bus"), late("teds_provision.links.can.spec")
+    bus_multiplexer = late("teds_provision.links.can.bus_multiplexer")
+    nfc_reader, nfc_tag = late("teds_provision.links.nfc.reader"), late("teds_provision.links.nfc.tag")
+    pcsc_readers = late("teds_provision.links.nfc.pcsc_readers")
 
 _ARPHRD_CAN: Final = 280  # linux/if_arp.h
 _IFF_UP: Final = 1
@@ -105,7 +118,7 @@ def pcsc(system: System) -> Iterator[Finding]:
         return
 
     try:
-        found = nfc_room.pcsc_readers.contactless(nfc_room.pcsc_readers.names())
+        found = pcsc_readers.contactless(pcsc_readers.names())
     except NoReaderError as failure:
         yield Finding("pc/sc", "failed" if asked else "skipped", failure.message, failure.hint if asked else "")
         return
@@ -159,13 +172,13 @@ def nfc(system: System) -> Iterator[Finding]:
         return
 
     try:
-        reader = nfc_room.reader.open_reader(system.nfc)
+        reader = nfc_reader.open_reader(system.nfc)
     except (NoReaderError, UsageError) as failure:
         yield Finding("nfc", "failed", failure.message, failure.hint)
         return
     try:
         tag = any(reader.sense() is not None for _ in range(_SENSES))
-    except nfc_room.tag.ReaderLostError as error:
+    except nfc_tag.ReaderLostError as error:
         yield Finding(
             "nfc", "failed", f"{reader.name} opened but failed immediately: {error}.", "Unplug it, plug it in."
         )
@@ -237,10 +250,10 @@ def can_loopback(system: System) -> Iterator[Finding]:
 
 
 def _self_test(spec: str) -> tuple[bool, str, str]:
-    sent = can_room.bus.Frame(0x18DAF101, b"doctor")
-    buses: list[can_room.bus.Bus] = []
+    sent = can_bus.Frame(0x18DAF101, b"doctor")
+    buses: list[can_bus.Bus] = []
     try:
-        buses += [can_room.bus.Bus(can_room.spec.parse_spec(spec)), can_room.bus.Bus(can_room.spec.parse_spec(spec))]
+        buses += [can_bus.Bus(can_spec.parse_spec(spec)), can_bus.Bus(can_spec.parse_spec(spec))]
         buses[0].send(sent)
         arrived = buses[1].receive(2.0) == sent
     except LinkError as failure:
@@ -262,11 +275,11 @@ def can(system: System) -> Iterator[Finding]:
         return
 
     try:
-        bus = can_room.bus.Bus(can_room.spec.parse_spec(system.can))
+        bus = can_bus.Bus(can_spec.parse_spec(system.can))
     except (LinkError, UsageError) as failure:
         yield Finding("can", "failed", failure.message, failure.hint)
         return
-    rivals = can_room.bus_multiplexer.AddressConflicts(bus.spec.source)
+    rivals = bus_multiplexer.AddressConflicts(bus.spec.source)
     until = time.monotonic() + _LISTEN_SECONDS
     try:
         while (left := until - time.monotonic()) > 0:

@@ -11,12 +11,12 @@ from datetime import UTC, datetime
 from importlib import metadata
 from typing import Final
 
-from teds_provision import vault
 from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import StoreError
 from teds_provision.lazy import REQUIRED, install_command
 from teds_provision.station.station import Station
 from teds_provision.station.store.database import has_store
+from teds_provision.vault.passphrase import THROWAWAY, SealingKey
 
 _MIN_PYTHON: Final = (3, 11)
 _LIBRARIES: Final = {name: least for name, (_, least) in REQUIRED.items()} | {"ndeflib": "0.3.3"}  # nfcpy needs it
@@ -75,7 +75,7 @@ def _shadowed() -> Iterator[Finding]:
 @check("argon2id", "machine")
 def argon2id(system: System) -> Iterator[Finding]:
     """Can this OpenSSL derive keys from passphrases."""
-    vault.passphrase.SealingKey.derive("a self-test, no secret", costs=vault.passphrase.THROWAWAY)
+    SealingKey.derive("a self-test, no secret", costs=THROWAWAY)
     yield Finding("argon2id", "ok", "Passphrases work.")
 
 

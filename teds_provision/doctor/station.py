@@ -11,7 +11,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from teds_provision import vault as vault_room
 from teds_provision.doctor.checks import Finding, System, check, intact
 from teds_provision.errors import KeyringUnavailableError, NotFoundError, StoreError, VaultError
 from teds_provision.files import open_to_read
@@ -23,6 +22,10 @@ from teds_provision.station.store.database import has_store
 from teds_provision.station.store.lock import holder_of
 from teds_provision.station.store.row_sample import SAMPLED, RowSample
 from teds_provision.vault import agent
+from teds_provision.vault.file_vault import read_sealed
+from teds_provision.vault.keyring_vault import KeyringVault, inspect
+from teds_provision.vault.pkcs11_token import find_token
+from teds_provision.vault.pkcs11_uri import Pkcs11Uri
 
 _MIN_FREE: Final = 64 * 1024 * 1024
 _BACKUP_DAYS: Final = 90
@@ -134,7 +137,7 @@ def keyring(system: System) -> Iterator[Finding]:
         return
     try:
         with _quiet_logging():
-            name = vault_room.keyring_vault.inspect()
+            name = inspect()
     except VaultError as failure:
         if used == "keyring":
             yield Finding("keyring", "failed", failure.message, failure.hint)
@@ -169,9 +172,9 @@ def vault(system: System) -> Iterator[Finding]:
         yield _file_vault(system)
     elif used == "keyring":
         with Station.inspect(system.home) as opened:
-            yield Finding("vault", "ok", f"{vault_room.keyring_vault.KeyringVault.open(opened.id).description}.")
+            yield Finding("vault", "ok", f"{KeyringVault.open(opened.id).description}.")
     else:
-        token = vault_room.pkcs11_token.find_token(vault_room.pkcs11_uri.Pkcs11Uri.parse(used))
+        token = find_token(Pkcs11Uri.parse(used))
         if not (system.home / "vault-pkcs11.json").exists():
             raise VaultError("The file vault-pkcs11.json is missing.", hint="teds-provision restore FILE")
         yield Finding("vault", "ok", f"The token {token.label.strip()!r} is there.")
@@ -190,7 +193,7 @@ def unlocked(system: System) -> Iterator[Finding]:
 
 def _file_vault(system: System) -> Finding:
     with Station.inspect(system.home) as opened:
-        content = vault_room.file_vault.read_sealed(system.home / "vault.json")
+        content = read_sealed(system.home / "vault.json")
         if content.get("store") != opened.id:
             raise VaultError("vault.json belongs to another store.", hint="teds-provision restore FILE")
     memory = content.get("memory_kib")

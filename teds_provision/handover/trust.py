@@ -9,7 +9,6 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING
 
-from teds_provision import vault as vaults
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, UsageError
 from teds_provision.files import read_limited
 from teds_provision.handover.pending import OPEN, BundleNotes, signer_of
@@ -20,9 +19,11 @@ from teds_provision.station.station import Station
 from teds_provision.station.store import StoreLock, TrustRecord
 from teds_provision.station.store.database import has_store
 from teds_provision.station.store.records import TrustRole
+from teds_provision.vault.ca_file import read_ca
+from teds_provision.vault.selection import asked_first, create_vault
 
 if TYPE_CHECKING:
-    from teds_provision.vault import Ask, Vault
+    from teds_provision.vault.base import Ask, Vault
 
 
 # One CA for several stations: a station asks, the CA's keeper signs (profile.md, "Keys and trust").
@@ -126,7 +127,7 @@ def ask_for_certificate(home: Path, *, name: str | None, keystore: str | None, a
             station.ask_by(known)
             return _requested(station, name, keystore, known)
 
-        return vaults.asked_first(ask, request)
+        return asked_first(ask, request)
 
 
 def _requested(station: Station, name: str | None, keystore: str | None, ask: Ask) -> bytes:
@@ -134,7 +135,7 @@ def _requested(station: Station, name: str | None, keystore: str | None, ask: As
         if station.identity.is_complete():
             return make_request(station.name, station.vault.identity())
         if station.identity.requested is None:
-            vault, why = vaults.create_vault(station.home, station.id, keystore, ask, with_ca=False)
+            vault, why = create_vault(station.home, station.id, keystore, ask, with_ca=False)
             where = keystore if keystore and keystore.startswith("pkcs11:") else vault.kind
             station.adopt(vault)
             with station.transaction():
@@ -160,7 +161,7 @@ def adopt_certificate(home: Path, certificate: Certificate, *, ask: Ask) -> Stat
             _adopt(station, certificate)
 
     try:
-        vaults.asked_first(ask, adopt)
+        asked_first(ask, adopt)
         station.ask_by(ask)
     except BaseException:
         station.close()
@@ -174,7 +175,7 @@ def found_under(home: Path, path: Path, passphrase: str, *, name: str | None, ke
     Run again after a cut, it carries on. Raises WrongPassphraseError, VaultError (no such file), PolicyError (the home
     has a station of another CA).
     """
-    owner = SoftwareKey.from_secret(vaults.ca_file.read_ca(path, passphrase))
+    owner = SoftwareKey.from_secret(read_ca(path, passphrase))
     if has_store(home):
         with Station.inspect(home, ask=ask) as station:
             identity = station.identity
@@ -250,7 +251,7 @@ def drop_ca(station: Station) -> bool:
 
 def import_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> None:
     """Bring the CA key back; raises WrongPassphraseError, NotFoundError, VaultError, PolicyError (another CA's key)."""
-    if SoftwareKey.from_secret(vaults.ca_file.read_ca(path, passphrase)).point != station.ca:
+    if SoftwareKey.from_secret(read_ca(path, passphrase)).point != station.ca:
         raise PolicyError(f"{path} contains a CA key other than this station's ({fingerprint(station.ca)[:16]}).")
     vault.import_ca(path, passphrase)
     station.audit("ca", None, "imported", ca=fingerprint(station.ca))

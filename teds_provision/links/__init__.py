@@ -8,9 +8,6 @@ Importing this package loads neither nfcpy nor python-can.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from teds_provision.lazy import lazy
 from teds_provision.links.opening import LINKS, open_place, open_port, open_ports
 from teds_provision.links.ports import Capabilities, Contact, Link, LinkSettings, Notice, Port, Trace
 
@@ -27,8 +24,3 @@ __all__ = [
     "open_port",
     "open_ports",
 ]
-
-if TYPE_CHECKING:
-    from teds_provision.links import ble, can, nfc, streaming
-else:
-    __getattr__ = lazy(__name__)

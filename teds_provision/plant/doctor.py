@@ -8,14 +8,16 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from teds_provision.doctor.checks import Finding, System, check
-from teds_provision.lazy import install_command
-from teds_provision.protocol import plant as documents
+from teds_provision.lazy import install_command, late
 from teds_provision.sanitize import counted
 from teds_provision.station.station import Station
 from teds_provision.station.store.database import has_store
 
 if TYPE_CHECKING:
+    from teds_provision.protocol.plant import roster as rosters
     from teds_provision.protocol.plant.roster import Roster
+else:  # cryptography: only for a station that joined a registry
+    rosters = late("teds_provision.protocol.plant.roster")
 
 _SYNC = "teds-provision registry sync"
 _LATE = timedelta(days=7)
@@ -32,7 +34,7 @@ def registry(system: System) -> Iterator[Finding]:
         row = plant.held_roster()
         if record is None or row is None or not station.identity.is_complete():
             return
-        now, roster = datetime.now(UTC), documents.roster.open_roster(row.octets, station.ca)
+        now, roster = datetime.now(UTC), rosters.open_roster(row.octets, station.ca)
         yield _roster(roster, now)
         if record.url is not None and record.url.startswith("postgres") and find_spec("psycopg") is None:
             yield Finding("registry", "failed", "psycopg is missing.", install_command("teds-provision[registry]"))
@@ -72,6 +74,6 @@ def _roster(roster: Roster, now: datetime) -> Finding:
     until = f"{roster.name}: roster {roster.version} holds until {roster.expires:%Y-%m-%d}."
     if now >= roster.expires:
         return Finding("registry", "failed", f"{until} It has expired.", "Where the CA key is: registry renew")
-    if now >= roster.expires - documents.roster.WARN_BEFORE:
+    if now >= roster.expires - rosters.WARN_BEFORE:
         return Finding("registry", "warning", until, "Where the CA key is: teds-provision registry renew")
     return Finding("registry", "ok", until)

@@ -10,16 +10,25 @@ from __future__ import annotations
 import hmac
 from collections.abc import Callable
 from dataclasses import dataclass, field
-
-from cryptography.exceptions import InvalidTag
-from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.ciphers.aead import AESCCM
-from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+from typing import TYPE_CHECKING
 
 from teds_provision.errors import GarbledError, NotAuthenticError
+from teds_provision.lazy import late
 from teds_provision.protocol.keys import POINT_OCTETS, PrivateKey, SoftwareKey
 from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
 from teds_provision.protocol.wire_agreement import good_one_time, key_id
+
+if TYPE_CHECKING:
+    from cryptography import exceptions
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.ciphers import aead
+    from cryptography.hazmat.primitives.kdf import hkdf
+else:
+    exceptions = late("cryptography.exceptions")
+    aead = late("cryptography.hazmat.primitives.ciphers.aead")
+    hashes = late("cryptography.hazmat.primitives.hashes")
+    hkdf = late("cryptography.hazmat.primitives.kdf.hkdf")
+
 
 COUNTER_OCTETS = 8
 KEY_ID_OCTETS = 8
@@ -68,7 +77,7 @@ class SessionKeys:
     @classmethod
     def derive(cls, key: bytes, uuid: bytes, shared: bytes, station: bytes, node: bytes) -> SessionKeys:
         """HKDF-SHA-256(Z, salt = K, info = "TEDS1 session" ‖ 00 ‖ UUID ‖ Es ‖ En, 96 octets); ``shared`` is Z."""
-        okm = HKDF(hashes.SHA256(), 96, key, b"TEDS1 session\0" + uuid + station + node).derive(shared)
+        okm = hkdf.HKDF(hashes.SHA256(), 96, key, b"TEDS1 session\0" + uuid + station + node).derive(shared)
         tag = hmac.digest(okm[32:64], b"node open" + key_id(key) + station + node, "sha256")
         return cls(okm[:16], okm[16:32], okm[64:], tag[:TAG_OCTETS])
 
@@ -79,14 +88,14 @@ def _seal(key: bytes, counter: int, octets: bytes) -> bytes:
 
 def _seal_padded(key: bytes, counter: int, padded: bytes) -> bytes:
     nonce = bytes(9) + counter.to_bytes(4, "big")
-    return counter.to_bytes(4, "big") + AESCCM(key, tag_length=TAG_OCTETS).encrypt(nonce, padded, None)
+    return counter.to_bytes(4, "big") + aead.AESCCM(key, tag_length=TAG_OCTETS).encrypt(nonce, padded, None)
 
 
 def _decrypt(key: bytes, payload: bytes) -> bytes | None:
     """Return the padded octets if the tag is right, else None."""
     try:
-        return AESCCM(key, tag_length=TAG_OCTETS).decrypt(bytes(9) + payload[:4], payload[4:], None)
-    except (InvalidTag, ValueError):
+        return aead.AESCCM(key, tag_length=TAG_OCTETS).decrypt(bytes(9) + payload[:4], payload[4:], None)
+    except (exceptions.InvalidTag, ValueError):
         return None
 
 

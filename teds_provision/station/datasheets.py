@@ -20,14 +20,14 @@ from teds_provision.station.nodes import Nodes
 from teds_provision.station.store.database import places
 from teds_provision.station.store.records import DatasheetRecord, Draft, NodeReading, iso, utc_now
 from teds_provision.station.store.store import Store
+from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import BlockId, Image
 
 if TYPE_CHECKING:
     from teds_provision.teds import sheet
-    from teds_provision.teds.codec import security
-else:  # TEDS: a list decodes none
-    sheet, security = late("teds_provision.teds.sheet"), late("teds_provision.teds.codec.security")
+else:  # the tables of all TEDS: a list decodes none
+    sheet = late("teds_provision.teds.sheet")
 
 _BLOCK = struct.Struct(">HBI")
 _MAX_OCTETS = 64 << 20

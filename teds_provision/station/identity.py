@@ -18,7 +18,7 @@ from teds_provision.station.store.store import Store
 
 if TYPE_CHECKING:
     from teds_provision.protocol import wire_agreement
-    from teds_provision.vault import Vault
+    from teds_provision.vault.base import Vault
     from teds_provision.vault.master import MasterKeys
 else:  # the codec of the TEDS: not for commands that only list
     wire_agreement = late("teds_provision.protocol.wire_agreement")

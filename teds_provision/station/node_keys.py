@@ -27,7 +27,7 @@ from teds_provision.station.store.store import Store
 from teds_provision.vault.base import node_key_context
 
 if TYPE_CHECKING:
-    from teds_provision.vault import Vault
+    from teds_provision.vault.base import Vault
 
 MAX_PENDING = 8
 """So many keys of one node may wait for their proof at a time (issue 7 L4)."""

@@ -18,7 +18,7 @@ from teds_provision.errors import StoreChangedError
 from teds_provision.station.store.row_sample import RowSample
 
 if TYPE_CHECKING:
-    from teds_provision.vault import Vault
+    from teds_provision.vault.base import Vault
 
 MAC_OCTETS: Final = 16
 KEY_OCTETS: Final = 32

@@ -22,7 +22,7 @@ else:  # loaded with the first store: --help does not wait for it
 
 
 _COUNTED: Final = ("whitelist", "nodes", "keys", "trust")
-_DAMAGE: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+_DAMAGE: Final = (11, 26)  # SQLITE_CORRUPT, SQLITE_NOTADB (sqlite.org, rescode): for --help sqlite3 is not loaded
 
 
 class Relation(Enum):

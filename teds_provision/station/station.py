@@ -32,7 +32,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from teds_provision import vault as vaults
 from teds_provision.errors import (
     NoPassphraseError,
     NotFoundError,
@@ -41,6 +40,7 @@ from teds_provision.errors import (
     VaultError,
     VaultLockedError,
 )
+from teds_provision.lazy import late
 from teds_provision.protocol import keys
 from teds_provision.station.bulk import Bulk
 from teds_provision.station.datasheets import Datasheets
@@ -65,9 +65,12 @@ from teds_provision.vault.base import node_key_context
 
 if TYPE_CHECKING:
     from teds_provision.protocol import wire_agreement
-    from teds_provision.vault import Ask, Vault
+    from teds_provision.vault import master_socket, selection
+    from teds_provision.vault.base import Ask, Vault
     from teds_provision.vault.master import MasterKeys
-
+else:
+    # cryptography, sockets and processes: `nodes` and others open no vault
+    master_socket, selection = late("teds_provision.vault.master_socket"), late("teds_provision.vault.selection")
 
 __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", "not_initialised"]
 
@@ -223,7 +226,7 @@ class Station:
             with self._opening:  # of several threads one asks for the passphrase
                 if self._vault is None:
                     keystore = self.identity.keystore
-                    self.adopt(vaults.open_vault(self.home, self.id, keystore, self._ask, use_agent=self.use_agent))
+                    self.adopt(selection.open_vault(self.home, self.id, keystore, self._ask, use_agent=self.use_agent))
         assert self._vault is not None
         return self._vault
 
@@ -265,7 +268,9 @@ class Station:
                 if self.identity.master in vault.masters():  # handed over by the command that made it
                     return vault
                 try:
-                    opened = vaults.open_vault(self.home, self.id, self.identity.keystore, _ask_no_one, use_agent=True)
+                    opened = selection.open_vault(
+                        self.home, self.id, self.identity.keystore, _ask_no_one, use_agent=True
+                    )
                 except VaultError:
                     raise VaultLockedError(
                         "The vault's passphrase and master key were changed by another command.",
@@ -472,7 +477,7 @@ def initialise(
             if station.identity.requested is not None:
                 raise not_certified()
             more: dict[str, Any] = {} if costs is None else {"costs": costs}
-            vault, why = vaults.create_vault(home, station.id, keystore, known, notify=notify_once, **more)
+            vault, why = selection.create_vault(home, station.id, keystore, known, notify=notify_once, **more)
             key, ca = vault.identity(), vault.ca()
             if ca is None:
                 raise NotFoundError(
@@ -486,7 +491,7 @@ def initialise(
                 station.audit("init", None, "done", fingerprint=keys.fingerprint(key.point), keystore=vault.kind)
             return why
 
-    return station, vaults.asked_first(ask, make)
+    return station, selection.asked_first(ask, make)
 
 
 # A new master key: every link key in the store is wrapped again, and the old master key is deleted.
@@ -515,7 +520,7 @@ def rewrap(station: Station) -> RewrapResult:
     if identity.rewrapping != vault.masters()[-1]:
         if vault.masters()[-1] <= identity.master:  # else a run was cut before it noted the one that it had made
             vault.add_master()
-        vaults.master_socket.hand_over(station.home, vault.master_keys())  # before a row needs the new one
+        master_socket.hand_over(station.home, vault.master_keys())  # before a row needs the new one
         identity.begin_rewrapping(vault.masters()[-1])
     damaged = 0
 
@@ -533,7 +538,7 @@ def rewrap(station: Station) -> RewrapResult:
     identity.rewrap(vault)
     station.plant.rewrap(vault)
     vault.retire_masters()
-    vaults.master_socket.hand_over(station.home, vault.master_keys())
+    master_socket.hand_over(station.home, vault.master_keys())
     with station.transaction():
         identity.end_rewrapping()
         station.audit("vault", None, "rewrapped", keys=count - damaged, damaged=damaged)

@@ -12,13 +12,19 @@ import binascii
 import json
 import os
 from dataclasses import dataclass, field, replace
-from typing import Any
-
-from cryptography.exceptions import InvalidTag
-from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import UnknownMasterKeyError, VaultError
+from teds_provision.lazy import late
 from teds_provision.protocol.keys import SoftwareKey
+
+if TYPE_CHECKING:
+    from cryptography import exceptions
+    from cryptography.hazmat.primitives.ciphers import aead
+else:
+    exceptions = late("cryptography.exceptions")
+    aead = late("cryptography.hazmat.primitives.ciphers.aead")
+
 
 MASTER_OCTETS = 32
 _SECRET_OCTETS = 32
@@ -34,7 +40,7 @@ class MasterKeys:
     """Numbered master keys; the highest number wraps, all of them unwrap."""
 
     keys: dict[int, bytes] = field(repr=False)
-    _ciphers: dict[int, AESGCM] = field(init=False, default_factory=dict, repr=False, compare=False)
+    _ciphers: dict[int, aead.AESGCM] = field(init=False, default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def generate(cls) -> MasterKeys:
@@ -76,15 +82,15 @@ class MasterKeys:
             )
         try:
             return self._cipher(number).decrypt(nonce, sealed, head + context)
-        except InvalidTag:
+        except exceptions.InvalidTag:
             raise VaultError(
                 "A wrapped key in the store does not belong to this vault, node, epoch or slot.", hint=_DAMAGED
             ) from None
 
-    def _cipher(self, number: int) -> AESGCM:
+    def _cipher(self, number: int) -> aead.AESGCM:
         """Return the cipher of one master key, cached because a handover opens ten thousand keys."""
         if number not in self._ciphers:
-            self._ciphers[number] = AESGCM(self.keys[number])
+            self._ciphers[number] = aead.AESGCM(self.keys[number])
         return self._ciphers[number]
 
 

@@ -10,8 +10,8 @@ from teds_provision.backup.restore import RestoreResult, rebuild
 from teds_provision.backup.sealed_file import SealedFile
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station
-from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
+from teds_provision.vault.selection import forget_vaults
 
 from ..bench import PASSPHRASE
 

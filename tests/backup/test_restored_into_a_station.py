@@ -24,8 +24,8 @@ from teds_provision.station.store import (
     Tombstone,
     WhitelistEntry,
 )
-from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
+from teds_provision.vault.selection import forget_vaults
 from teds_provision.vault.software import SoftwareVault
 from tests.backup.backups import NEW, ONE, POINT, SEALED, TWO, add_key, ask, back_up, copy_of, keys_of, opened
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.vault import forget_vaults
+from teds_provision.vault.selection import forget_vaults
 from tests.bench import copy_home
 
 

@@ -19,7 +19,7 @@ from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import TYPE, Bundle, BundledNode, payload_of, seal_bundle
 from teds_provision.protocol.handover.strict_json import base64url, decode_base64url, dump
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
-from teds_provision.vault import forget_vaults
+from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE
 from tests.handover.desk import Pair, everything, session
 from tests.handover.victim import open_station
@@ -189,22 +189,23 @@ def test_it_asks_and_nobody_answers(homes: Homes) -> None:
 def test_what_another_command_changes_while_a_plan_is_made_is_not_overlooked(
     homes: Homes, monkeypatch: pytest.MonkeyPatch, way: str
 ) -> None:
-    from teds_provision import handover
+    from teds_provision.cli.station import handover as command
+    from teds_provision.handover.life import revoke
 
     path = homes.export("--all") if way == "import" else homes.folder / "keys.jwe"
     home = homes.south if way == "import" else homes.north
-    room, name = (handover.incoming, "plan_import") if way == "import" else (handover.outgoing, "plan_exports")
-    plan, planned = getattr(room, name), []
+    name = "plan_import" if way == "import" else "plan_exports"
+    plan, planned = getattr(command, name), []
 
     def and_another_revokes(station: object, *what: object, **more: object) -> object:
         planned.append(plan(station, *what, **more))
         if len(planned) == 1:
             other = open_station(home)
-            handover.life.revoke(other, bytes.fromhex(UUIDS[0]), "stolen")
+            revoke(other, bytes.fromhex(UUIDS[0]), "stolen")
             other.close()
         return planned[-1]
 
-    monkeypatch.setattr(room, name, and_another_revokes)
+    monkeypatch.setattr(command, name, and_another_revokes)
     words = ["import-keys", path] if way == "import" else ["export-keys", "--to", "south", "--all", "--output", path]
     done = homes.run(home, *words, "--yes")
     assert (done.code, len(planned)) == (6, 2)

@@ -24,11 +24,6 @@ OURS = {
     "teds_provision.sanitize",
     "teds_provision.lazy",
     "teds_provision.optional_rooms",
-    "teds_provision.protocol",
-    "teds_provision.shapes",
-    "teds_provision.shapes.problem",
-    "teds_provision.station",
-    "teds_provision.vault",
     *(f"teds_provision.{name}" for room in rooms() for name in (room, f"{room}.room")),
 }
 NEEDLESS = {"bz2", "difflib", "ipaddress", "json", "lzma", "pathlib", "shlex", "shutil", "tomllib", "urllib.parse"}

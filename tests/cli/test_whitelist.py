@@ -10,7 +10,7 @@ import pytest
 
 from teds_provision.station.station import Station
 from teds_provision.station.store import NodeRecord, WhitelistEntry
-from teds_provision.vault import forget_vaults
+from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, make_station
 
 from .shell import call

@@ -40,7 +40,7 @@ from teds_provision.station.store import (
 )
 from teds_provision.station.store.database import Database
 from teds_provision.teds.image import Image
-from teds_provision.vault import forget_vaults
+from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, copy_home
 from tests.places import free_bus, free_reader
 

@@ -35,7 +35,7 @@ from teds_provision.station.station import Station, initialise
 from teds_provision.station.store import WhitelistEntry
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY, Image
-from teds_provision.vault import forget_vaults
+from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, Board, MemoryLink, make_station, talk
 from tests.handover.desk import provisioned, session, trust
 

@@ -13,7 +13,7 @@ import pytest
 from teds_provision.errors import PolicyError
 from teds_provision.handover.pending import close
 from teds_provision.station.station import Station
-from teds_provision.vault import forget_vaults
+from teds_provision.vault.selection import forget_vaults
 from tests.bench import Board
 from tests.e2e.desk import Running
 from tests.handover.desk import Pair, everything, held, session

@@ -13,7 +13,7 @@ from teds_provision.handover.life import revoke
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import close
 from teds_provision.station.station import Station, initialise
-from teds_provision.vault import forget_vaults
+from teds_provision.vault.selection import forget_vaults
 from tests.handover.desk import boards, held, key_up, provisioned, session, trust
 from tests.vault.softhsm import PIN, loaded, unload
 

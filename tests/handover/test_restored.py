@@ -13,8 +13,8 @@ from teds_provision.errors import NodeSilentError, PolicyError
 from teds_provision.provisioning.agree import agree, open_session, require_session
 from teds_provision.provisioning.identify import identify
 from teds_provision.station.station import Station
-from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
+from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, Board, MemoryLink, make_station, talk
 from tests.handover.desk import held, key_up
 

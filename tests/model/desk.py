@@ -40,8 +40,8 @@ from teds_provision.station import node_keys
 from teds_provision.station.station import Station
 from teds_provision.station.store import TrustRecord, WhitelistEntry
 from teds_provision.teds.image import SECURITY
-from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
+from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, Board, make_station
 from tests.model.traces import NONE, Kind, State, Step, Trace
 from tests.pace import PATIENCE

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from teds_provision.station.node_keys import MAX_PENDING
 from teds_provision.station.station import initialise
-from teds_provision.vault import forget_vaults, passphrase
+from teds_provision.vault import passphrase
+from teds_provision.vault.selection import forget_vaults
 
 NODE = bytes(range(10))
 

@@ -16,7 +16,8 @@ from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station, initialise, rewrap
 from teds_provision.station.store import RevocationRecord, TrustRecord, WhitelistEntry
-from teds_provision.vault import forget_vaults, passphrase
+from teds_provision.vault import passphrase
+from teds_provision.vault.selection import forget_vaults
 
 NODE = bytes(range(10))
 POINT = SoftwareKey.generate().point

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.vault import forget_vaults
 from teds_provision.vault.file_vault import FileVault
 from teds_provision.vault.passphrase import THROWAWAY
+from teds_provision.vault.selection import forget_vaults
 from tests.vault.passphrase import STORE, Person
 
 

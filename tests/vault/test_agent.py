@@ -16,9 +16,10 @@ import pytest
 
 from teds_provision import files
 from teds_provision.cli.main import run as in_process
-from teds_provision.vault import agent, forget_vaults, selection
+from teds_provision.vault import agent, selection
 from teds_provision.vault.pkcs11_token import ask_pin
 from teds_provision.vault.pkcs11_uri import Pkcs11Uri
+from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import Outcome, clean_environment, spawn
 from tests.vault.softhsm import PIN, loaded, unload

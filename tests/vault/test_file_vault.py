@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import StoreError, UsageError, VaultError, WrongPassphraseError
 from teds_provision.protocol.keys import SoftwareKey, verify
-from teds_provision.vault import create_vault, open_vault
 from teds_provision.vault.file_vault import FileVault
 from teds_provision.vault.master import Material
 from teds_provision.vault.passphrase import PRODUCT, THROWAWAY, Costs, seal, unseal
+from teds_provision.vault.selection import create_vault, open_vault
 from tests.pace import costs_at_most
 from tests.passphrase_costs import product_costs
 from tests.vault.passphrase import GOOD, STORE, Person

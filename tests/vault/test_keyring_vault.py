@@ -17,9 +17,10 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import KeyringUnavailableError, VaultError
-from teds_provision.vault import create_vault, forget_vaults, keyring_vault, open_vault
+from teds_provision.vault import keyring_vault
 from teds_provision.vault.keyring_vault import KeyringVault
 from teds_provision.vault.passphrase import THROWAWAY
+from teds_provision.vault.selection import create_vault, forget_vaults, open_vault
 
 STORE = "5e" * 16
 GOOD = "four random words here"
@@ -213,7 +214,7 @@ _PRELUDE = """
 import json, sys
 from pathlib import Path
 from teds_provision.errors import TedsProvisionError
-from teds_provision.vault import create_vault, forget_vaults, open_vault
+from teds_provision.vault.selection import create_vault, forget_vaults, open_vault
 from teds_provision.vault.keyring_vault import KeyringVault
 from teds_provision.vault.passphrase import THROWAWAY
 home, store = Path(sys.argv[1]), "5e" * 16

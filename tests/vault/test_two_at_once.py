@@ -22,7 +22,8 @@ from teds_provision.cli.context import App
 from teds_provision.errors import TedsProvisionError
 from teds_provision.station.station import Station, rewrap
 from teds_provision.station.store import StoreLock
-from teds_provision.vault import agent, forget_vaults, selection
+from teds_provision.vault import agent, selection
+from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import Outcome, call
 from tests.pace import until

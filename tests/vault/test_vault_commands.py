@@ -16,11 +16,12 @@ from teds_provision.errors import VaultChangedError, VaultLockedError, WrongPass
 from teds_provision.station.station import Station, rewrap
 from teds_provision.station.store import StoreLock
 from teds_provision.station.store.database import Database
-from teds_provision.vault import agent, forget_vaults
+from teds_provision.vault import agent
 from teds_provision.vault.file_vault import FileVault
 from teds_provision.vault.master import MasterKeys
 from teds_provision.vault.master_socket import MasterSocket, hand_over
 from teds_provision.vault.passphrase import THROWAWAY
+from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import clean_environment, spawn
 from tests.vault.softhsm import PIN, loaded, unload
@@ -322,8 +323,8 @@ def test_three_processes_that_wait_for_the_store_lose_no_key(home: Path) -> None
 
 @pytest.mark.system
 def test_what_another_process_did_to_a_tokens_file_is_taken_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from teds_provision.vault import create_vault
     from teds_provision.vault.pkcs11 import Pkcs11Vault
+    from teds_provision.vault.selection import create_vault
 
     forget_vaults()
     uri, store = loaded(tmp_path, monkeypatch, ("pair",))["pair"], "77" * 16

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from teds_provision import links as links_room
 from teds_provision import measure as measure_room
 from teds_provision import provisioning, teds
 from teds_provision.cli.context import App, pass_app
@@ -33,6 +32,8 @@ from teds_provision.cli.shape_options import measurement_options
 from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings
+from teds_provision.links.opening import open_ports
+from teds_provision.links.streaming import measuring_links
 from teds_provision.sanitize import counted
 from teds_provision.shapes.measurement import OPTIONS
 from teds_provision.station.store import KeptMeasurement
@@ -265,8 +266,8 @@ def _run(
     station, stop = job.station, provisioning.meeting.IdleStop(None)
     group = job.kept.group or ""
     nodes = [uuid.hex() for uuid in uuids]
-    ports = links_room.open_ports(links)
-    streaming = list(links_room.streaming.measuring_links(ports))
+    ports = open_ports(links)
+    streaming = list(measuring_links(ports))
     try:
         with ExitStack() as stack:
             stack.enter_context(

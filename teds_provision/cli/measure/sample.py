@@ -20,7 +20,7 @@ from teds_provision.cli.rendering import print_table, reporter_for, shown, tidy
 from teds_provision.cli.shape_options import measurement_option
 from teds_provision.errors import NodeRefusedError, UsageError
 from teds_provision.links import LinkSettings
-from teds_provision.protocol import operation
+from teds_provision.protocol.operation.commands import POWER, ChannelState, PowerReply, bit_words
 from teds_provision.teds.channel import within_turn
 
 if TYPE_CHECKING:
@@ -145,13 +145,11 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
     """Show a node's operating mode, the state of each channel, and power."""
     station = app.station()
     uuid = station.nodes.resolve(node)
-    power: operation.commands.PowerReply | None = None
+    power: PowerReply | None = None
     with trusted_node(app, station, links, uuid, by="mode") as trusted:
         found = measure.verified_session.operation(trusted.node)
         try:
-            power = operation.commands.PowerReply.decode(
-                trusted.node.request(operation.commands.POWER, "to report its power")
-            )
+            power = PowerReply.decode(trusted.node.request(POWER, "to report its power"))
         except NodeRefusedError:
             power = None
         names = {channel.number: channel.name for channel in trusted.sheet.channels}
@@ -170,7 +168,7 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
 
 def words(state: int) -> list[str]:
     """State bits of a channel as words."""
-    return operation.commands.bit_words(operation.commands.ChannelState, state)
+    return bit_words(ChannelState, state)
 
 
 def _charging(station: Station, node: Conversation) -> dict[str, Any] | None:

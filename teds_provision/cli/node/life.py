@@ -6,12 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import handover, provisioning
+from teds_provision import provisioning
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.node.node_names import resolve
 from teds_provision.cli.options import command, dry_run_option, link_options, links_given, yes_option
 from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import FrozenError, LinkError, PolicyError
+from teds_provision.handover import deny, life
+from teds_provision.handover.life import hand_on, is_finished, plan_takeover, retire, take_over
 from teds_provision.links import LinkSettings
 from teds_provision.sanitize import counted
 
@@ -54,7 +56,7 @@ def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run:
     if station.policy.revocation(octets) is None:
         app.confirm(f"Revoke node {octets.hex()}? Its keys will be deleted here.", yes=yes)
     with station.lock("revoke", app.note):
-        done = handover.life.revoke(station, octets, why)
+        done = life.revoke(station, octets, why)
     result = {
         "uuid": octets.hex(),
         "fingerprint": done.entry.fingerprint,
@@ -77,7 +79,7 @@ def _lift(app: App, station: Station, uuid: bytes, *, yes: bool, dry_run: bool) 
     station.unlock()
     app.confirm(f"Lift the ban on node {uuid.hex()} ({entry.why}, {entry.created})?", yes=yes)
     with station.lock("revoke --lift", app.note):
-        handover.deny.lift(station, uuid)
+        deny.lift(station, uuid)
     app.emit(result, f"The ban on node {uuid.hex()} is lifted here. To use it, whitelist it and agree on a key.")
 
 
@@ -102,7 +104,7 @@ def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, lin
         app.emit({"uuid": octets.hex(), "plan": "decommission"}, f"Plan: reset {octets.hex()}, take it out of service.")
         return
     station.unlock(octets)
-    if handover.life.is_finished(station, octets):
+    if is_finished(station, octets):
         app.emit(
             _result(octets, None) | {"confirmed": True, "fresh": False}, "Nothing to do: it is already out of service."
         )
@@ -112,7 +114,7 @@ def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, lin
     )
     with station.lock("decommission", app.note):
         receipt = _reset(app, station, octets, links, force=force)
-        left = handover.life.retire(station, octets, receipt)
+        left = retire(station, octets, receipt)
     state = "is out of service and signed that it is in factory state" if receipt else "is out of service, unconfirmed"
     result = _result(octets, receipt) | {"fresh": True, "removed": left.to_json()}
     app.emit(result, f"Node {octets.hex()} {state}.{_handed_on(left, 'Removed from')}")
@@ -196,21 +198,21 @@ def replace(
     octets, spare = station.nodes.resolve(old), station.nodes.resolve(new)
     station.unlock(octets)
     with station.lock("replace", app.note):
-        plan = handover.life.plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
+        plan = plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
         result, text = _takeover(plan)
         result["groups"] = station.groups.of(spare if plan.done else octets)
         if dry_run:
             app.emit({**result, "plan": True}, f"Plan: {text}.")
             return
         if plan.done:
-            moved = handover.life.hand_on(station, plan)
+            moved = hand_on(station, plan)
             rest = _handed_on(moved, "Moved")
             text = "It has already taken over." if rest else "Nothing to do: it has already taken over."
             app.emit({**result, "moved": moved.to_json(), "fresh": False}, f"{text}{rest}")
             return
         app.confirm(f"{text}?", yes=yes)
         receipt = _reset(app, station, octets, links, force=True) if links_given(ctx) else None
-        warnings, moved = handover.life.take_over(station, plan, receipt)
+        warnings, moved = take_over(station, plan, receipt)
     for warning in warnings:
         app.warn(warning)
     confirmed = receipt is not None

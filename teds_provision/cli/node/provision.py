@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import click
 
-from teds_provision import firmware_image, provisioning, station, teds
+from teds_provision import firmware_image, provisioning, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.node.build import calibration_json, order_options
 from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, options_given, yes_option
@@ -25,6 +25,9 @@ from teds_provision.links import LinkSettings
 from teds_provision.provisioning.progress import Reporter, StepResult
 from teds_provision.sanitize import sanitize
 from teds_provision.shapes.problem import problem_of
+from teds_provision.station.firmware import firmware_of
+from teds_provision.station.shown_units import shown_units
+from teds_provision.station.summary import summarise
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -264,9 +267,9 @@ def _print_result(
     """
     for warning in done.warnings if warn else ():
         app.warn(warning)
-    units = station.shown_units.shown_units(app.station(), done.who.uuid)
-    summary = station.summary.summarise(done.image, units)
-    runs = station.firmware.firmware_of(app.station(), done.who.uuid, done.firmware)
+    units = shown_units(app.station(), done.who.uuid)
+    summary = summarise(done.image, units)
+    runs = firmware_of(app.station(), done.who.uuid, done.firmware)
     firmware = runs.to_json() if runs is not None else None
     result = {
         "uuid": done.who.uuid.hex(),
@@ -316,7 +319,7 @@ def _print_one_of(app: App, boards: BatchRun, board: BoardResult) -> None:
 
     With the reason of a failure.
     """
-    name = station.summary.summarise(board.done.image).name if board.done is not None else None
+    name = summarise(board.done.image).name if board.done is not None else None
     words = board.done.verified.verdict if board.result == "passed" and board.done is not None else board.result
     place = f"{boards.ended:>{len(str(boards.expected))}} of {boards.expected}"
     app.lines([sanitize(f"{place}  {board.uuid.hex()}  {name or '(no name)'}  {words}  {board.seconds:.1f} s")])

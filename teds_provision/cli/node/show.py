@@ -25,7 +25,6 @@ from teds_provision.errors import BadDataError, UsageError
 from teds_provision.files import open_to_read, read_limited
 from teds_provision.lazy import late
 from teds_provision.limits import LIMITS
-from teds_provision.protocol import handover
 from teds_provision.protocol.messages.message import Argument, Message, decode_message, looks_like_message
 from teds_provision.sanitize import sanitize
 from teds_provision.teds import convert, decode
@@ -48,12 +47,14 @@ if TYPE_CHECKING:
     from rich import table as rich_table
     from rich.console import Console
 
+    from teds_provision.protocol.handover import bundle as bundles
     from teds_provision.protocol.handover.bundle import BundleHeader
     from teds_provision.teds.dcc.items import CertificateItem
     from teds_provision.teds.dcc.shown import ShownCertificate
     from teds_provision.teds.formats import Format
     from teds_provision.teds.guard import GuardFinding
 else:
+    bundles = late("teds_provision.protocol.handover.bundle")  # cryptography: only for a handover bundle
     markup, rich_table = late("rich.markup"), late("rich.table")
 
 CHOICES = ["table", "json", "xml", "hex", "ihex", "toml", "binary", "image"]
@@ -417,7 +418,7 @@ def load(name: str, edition: Edition | None = None, trusted: tuple[bytes, ...] =
     try:
         kind = detect(octets)
         if kind == "bundle":
-            return ShownFile(name, kind, bundle=handover.bundle.peek_bundle(octets))
+            return ShownFile(name, kind, bundle=bundles.peek_bundle(octets))
         blocks = read_blocks(octets, kind, path=Path(name) if name != STDIN else None)
     except BadDataError as error:
         raise _of_file(name, kind, error) from error
@@ -439,7 +440,7 @@ def _long_bundle(name: str) -> BundleHeader | None:
         if not file.read(_HEAD_OCTETS).lstrip().startswith(b"{"):
             return None
         try:
-            return handover.bundle.peek_bundle(file)
+            return bundles.peek_bundle(file)
         except BadDataError:
             return None
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from teds_provision import node as node_room
-from teds_provision import protocol, provisioning, teds
+from teds_provision import provisioning, teds
 from teds_provision import teds as teds_room
 from teds_provision.cli.context import SOCKET, App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, Number, WholeNumber, command, examples
@@ -27,6 +27,7 @@ from teds_provision.node import ble as ble_room
 from teds_provision.node import can as can_room
 from teds_provision.node import hardware as hardware_room
 from teds_provision.node import nfc as nfc_room
+from teds_provision.protocol.keys import fingerprint
 from teds_provision.station import store as store_room
 
 if TYPE_CHECKING:
@@ -174,7 +175,7 @@ def create(
     if firmware is not None and firmware_key is not None:
         image = node_room.firmware.boot_loader.ImageSlots.create(folder, firmware, firmware_key).running
     flash = made.load()  # what lies there: the same command once more finds the node that it made
-    print_of_key = protocol.keys.fingerprint(flash.node_key)
+    print_of_key = fingerprint(flash.node_key)
     channels: list[dict[str, object]] = [
         {
             "channel": channel.number,
@@ -471,7 +472,7 @@ def _press_all(nodes: Sequence[VirtualNode]) -> None:
 
 def _say_ready(app: App, nodes: Sequence[VirtualNode], up: list[str], source: str) -> None:
     flashes = [node.tim.flash for node in nodes]
-    named = [{"uuid": flash.uuid.hex(), "fingerprint": protocol.keys.fingerprint(flash.node_key)} for flash in flashes]
+    named = [{"uuid": flash.uuid.hex(), "fingerprint": fingerprint(flash.node_key)} for flash in flashes]
     several = {"nodes": named} if len(named) > 1 else {}
     who = f"Node {named[0]['uuid']}" if len(named) == 1 else f"{len(named)} nodes"
     app.emit(

@@ -8,14 +8,26 @@ from typing import TYPE_CHECKING
 
 import click
 
-from teds_provision import backup as backup_room
-from teds_provision import handover, protocol
-from teds_provision import vault as vault_room
+from teds_provision.backup.backup import backup as back_up
+from teds_provision.backup.restore import (
+    complete_vault,
+    keystore_for,
+    merge,
+    merge_checked,
+    open_present,
+    open_vault_of,
+    rebuild,
+)
+from teds_provision.backup.sealed_file import SealedFile
 from teds_provision.cli.context import App, pass_app, read_line
 from teds_provision.cli.node.build import read_file
 from teds_provision.cli.options import FileToRead, command, dry_run_option, yes_option
 from teds_provision.errors import NotFoundError, UsageError, VaultChangedError, VaultError, WrongPassphraseError
+from teds_provision.handover.trust import spoken
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, from_pem
 from teds_provision.station import store as store_room
+from teds_provision.vault.ca_file import read_ca
+from teds_provision.vault.selection import asked_first
 
 if TYPE_CHECKING:
     from teds_provision.backup.content import Content
@@ -56,8 +68,8 @@ def backup(
     running. Does not contain config.toml, nor the keys inside a PKCS #11 token.
     """
     station = app.station()
-    point = protocol.keys.from_pem(read_file(recovery)) if recovery is not None else None
-    to = f"recovery key {protocol.keys.fingerprint(point)[:32]}" if point is not None else "a passphrase"
+    point = from_pem(read_file(recovery)) if recovery is not None else None
+    to = f"recovery key {fingerprint(point)[:32]}" if point is not None else "a passphrase"
     if dry_run:
         plan = {"backup": str(file), "to": to, "replaces": file.exists(), "dry_run": True}
         app.emit(plan, f"Plan: seal the store of {station.name} to {to}, into {file}.")
@@ -65,7 +77,7 @@ def backup(
     _require_place(app.home, file)
     if file.exists():
         app.confirm(f"{file} exists. Replace it?", yes=yes)
-    done = backup_room.backup.backup(station, file, _asker(app, backup_passphrase_fd), recovery=point, notice=app.note)
+    done = back_up(station, file, _asker(app, backup_passphrase_fd), recovery=point, notice=app.note)
     for warning in done.warnings:
         app.warn(warning)
     result = {
@@ -114,12 +126,12 @@ def restore(
     """
     content = _open(file, recovery_key, _asker(app, backup_passphrase_fd))
     app.closing(content.close)
-    present = backup_room.restore.open_present(app.home, content)
+    present = open_present(app.home, content)
     if present is not None:
         app.closing(present.close)
         _merge(app, present, content, keystore, yes=yes, dry_run=dry_run)
         return
-    wanted = backup_room.restore.keystore_for(content, keystore)
+    wanted = keystore_for(content, keystore)
     app.note(_summary(content, wanted))
     if dry_run:
         plan = {"action": "rebuild", "station": content.station, "created": content.created, "dry_run": True}
@@ -127,7 +139,7 @@ def restore(
         return
     if recovery_key is not None:  # sealing needs only the public key: the fingerprint identifies the owner
         app.confirm(f"Is this your station, and should its keys be kept in {_named(wanted)}?", yes=yes)
-    done = backup_room.restore.rebuild(app.home, content, app.ask_secret, keystore=keystore)
+    done = rebuild(app.home, content, app.ask_secret, keystore=keystore)
     if done.set_aside is not None:
         app.warn(f"The damaged store was kept as {done.set_aside}.")
     if done.rotations_due:
@@ -144,7 +156,7 @@ def _summary(content: Content, keystore: str | None) -> str:
     age = f"{days} day{'' if days == 1 else 's'} ago" if days >= 0 else "in the future: check the clocks"
     return (
         f"Backup of station {content.name}, made {content.created} ({age})\n"
-        f"  key      {handover.trust.spoken(content.station)}\n"
+        f"  key      {spoken(content.station)}\n"
         f"  keystore {_named(keystore)}"
     )
 
@@ -166,7 +178,7 @@ def _require_place(home: Path, file: Path) -> None:
 
 
 def _merge(app: App, station: Station, content: Content, keystore: str | None, *, yes: bool, dry_run: bool) -> None:
-    plan = backup_room.restore.merge(station, content, dry_run=True)
+    plan = merge(station, content, dry_run=True)
     how = plan.relation.value if plan.relation is not None else ""
     facts = station.identity.record()
     head = f"{_summary(content, facts.keystore if facts is not None else keystore)}\nIt is {how} of this station."
@@ -180,17 +192,17 @@ def _merge(app: App, station: Station, content: Content, keystore: str | None, *
 
     def work(known: Callable[[str, bool], str]) -> RestoreResult:
         with store_room.StoreLock(app.home, command="restore", notice=app.note):
-            if not yes and backup_room.restore.merge(station, content, dry_run=True).back not in (plan.back, {}):
+            if not yes and merge(station, content, dry_run=True).back not in (plan.back, {}):
                 raise VaultChangedError(
                     "Another command changed the station while you were being asked, so the list is out of date. "
                     "Nothing was changed.",
                     hint="Run it again and check the new list.",
                 )
-            vault = backup_room.restore.complete_vault(station, content, known, keystore=keystore)
-            return backup_room.restore.merge_checked(station, content, vault, known)
+            vault = complete_vault(station, content, known, keystore=keystore)
+            return merge_checked(station, content, vault, known)
 
-    backup_room.restore.open_vault_of(station, app.ask_secret)
-    done = vault_room.asked_first(app.ask_secret, work)
+    open_vault_of(station, app.ask_secret)
+    done = asked_first(app.ask_secret, work)
     _emit(app, content, done, "Restored." if done.back else "Nothing to do: the store already has everything in it.")
 
 
@@ -212,14 +224,14 @@ def _emit(app: App, content: Content, done: RestoreResult, text: str, *, dry: bo
 
 
 def _open(file: Path, recovery_key: Path | None, ask: Callable[[str, bool], str]) -> Content:
-    sealed = backup_room.sealed_file.SealedFile(file)
+    sealed = SealedFile(file)
     if not sealed.is_for_key:
         return sealed.open_with_passphrase(ask("Passphrase of the backup", False))
     if recovery_key is None:
         raise UsageError("This backup is sealed to a recovery key.", hint="Pass it with --recovery-key PEM.")
     passphrase = ask(f"Passphrase of {recovery_key}", False)
     try:
-        key = protocol.keys.SoftwareKey.from_secret(vault_room.ca_file.read_ca(recovery_key, passphrase))
+        key = SoftwareKey.from_secret(read_ca(recovery_key, passphrase))
     except WrongPassphraseError:
         raise
     except VaultError as failure:

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import doctor as doctor_room
 from teds_provision.cli.config_file import config_path
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
 from teds_provision.cli.station.config import check_values
 from teds_provision.cli.table import COMMANDS
+from teds_provision.doctor.checks import System, examine, exit_code
+from teds_provision.doctor.report import build_report
 from teds_provision.errors import BadDataError, TedsProvisionError, UsageError
 from teds_provision.files import SHARED, require_new, write_new
 from teds_provision.limits import load_toml
@@ -71,18 +72,16 @@ def doctor(
     group = root.command
     settings = partial(known_settings, group) if isinstance(group, click.Group) else None
     ask = app.ask_secret if app.has_passphrase else None
-    system = doctor_room.checks.System(
-        app.home, nfc, can, ble, full, settings=settings, ask=ask, bad_value=partial(_bad_value, app, root)
-    )
-    found = list(doctor_room.checks.examine(system))
+    system = System(app.home, nfc, can, ble, full, settings=settings, ask=ask, bad_value=partial(_bad_value, app, root))
+    found = list(examine(system))
     findings = [finding for _, finding in found]
     checks = [asdict(finding) for finding in findings]
-    code = doctor_room.checks.exit_code(found)
+    code = exit_code(found)
     counts = {word: sum(finding.result == word for finding in findings) for word in _STYLES}
     if report is None:
         _show(app, findings, {"checks": checks, **counts})
     else:
-        document = doctor_room.report.build_report(system, findings, _settings(app), with_uuids=with_uuids)
+        document = build_report(system, findings, _settings(app), with_uuids=with_uuids)
         _give_report(app, document, report, {"checks": checks, **counts})
     app.note(", ".join(f"{count} {word}" for word, count in counts.items()) + ".")
     if code:

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal, Protocol
 
 import click
 
-from teds_provision import handover as handover_room
-from teds_provision import protocol
 from teds_provision.cli import options
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
@@ -29,7 +27,16 @@ from teds_provision.cli.options import (
 from teds_provision.cli.rendering import count_of, first_lines, local_time, reporter_for
 from teds_provision.errors import BadDataError, LinkError, NotFoundError, PolicyError, TedsProvisionError
 from teds_provision.files import holds, open_to_read, read_limited, require_new, write_new
+from teds_provision.handover import pending as handover_pending
+from teds_provision.handover.incoming import ImportResult, NodeProof, import_bundle, plan_import, prove_nodes, proven_of
+from teds_provision.handover.outgoing import ExportOrder, export_all, outputs_of, plan_exports
+from teds_provision.handover.pending import close, find_handover, list_handovers, peer_name
+from teds_provision.handover.trust import spoken
 from teds_provision.links import LinkSettings
+from teds_provision.protocol.handover.bundle import MAX_BUNDLE_OCTETS
+from teds_provision.protocol.handover.jose import NO_COMPACT_JWS
+from teds_provision.protocol.handover.receipt import MAX_RECEIPT_OCTETS
+from teds_provision.protocol.keys import fingerprint
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -119,12 +126,12 @@ def export_keys(
     if carrier is not None:
         carrier.require(station)
     nodes = None if everything else tuple(station.nodes.resolve(uuid) for uuid in uuids)
-    order = handover_room.outgoing.ExportOrder(receivers, nodes, mode, expires, ca)
+    order = ExportOrder(receivers, nodes, mode, expires, ca)
     if not dry_run:
         station.unlock()  # now: nobody is asked for a passphrase while the store is held
     state = station.version()  # before the plan: what changes while it is made is not overlooked either
-    shown = handover_room.outgoing.plan_exports(station, order)
-    outputs = handover_room.outgoing.outputs_of(output, len(shown)) if output is not None else []
+    shown = plan_exports(station, order)
+    outputs = outputs_of(output, len(shown)) if output is not None else []
     if dry_run:
         result = _exported(shown, outputs, station)
         id_ = None if shown[0].earlier is None else shown[0].id
@@ -134,14 +141,14 @@ def export_keys(
     app.confirm(f"{mode.capitalize()} {_count(shown)}?", yes=yes)
     with station.lock("export-keys", app.note):
         # A person may have taken minutes to answer. What they said yes to is done, or nothing is.
-        plans = shown if station.version() == state else handover_room.outgoing.plan_exports(station, order)
+        plans = shown if station.version() == state else plan_exports(station, order)
         require_same([plan.content for plan in plans] == [plan.content for plan in shown])
         result = _exported(plans, outputs, station)
         if carrier is not None:
             more, when = carrier.send(station, plans)
             app.emit({**result, **more}, f"{_count(plans)} will leave with {when}.")
             return
-        done = handover_room.outgoing.export_all(station, plans, outputs)
+        done = export_all(station, plans, outputs)
     _print_export(app, plans, outputs, result, done)
 
 
@@ -190,13 +197,11 @@ def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
     lines += first_lines(_node_lines(chosen[:_LEAVING_SHOWN], station), _LEAVING_SHOWN, len(chosen))
     lines += [f"  not {uuid.hex()}: {why}" for uuid, why in plan.skipped]
     if plan.also_held_by:
-        names = ", ".join(handover_room.pending.peer_name(station, digits) for digits in plan.also_held_by)
+        names = ", ".join(peer_name(station, digits) for digits in plan.also_held_by)
         lines.append(f"  also held by {names} from an earlier copy, until the keys are rotated")
     lines.append("Compare by voice:")
-    lines += [
-        f"  to   {record.name}\n       {handover_room.trust.spoken(record.fingerprint)}" for record in plan.receivers
-    ]
-    lines.append(f"  from {station.name}\n       {handover_room.trust.spoken(station.fingerprint)}")
+    lines += [f"  to   {record.name}\n       {spoken(record.fingerprint)}" for record in plan.receivers]
+    lines.append(f"  from {station.name}\n       {spoken(station.fingerprint)}")
     return "\n".join([*lines, _MEANS[plan.mode]])
 
 
@@ -259,21 +264,19 @@ def import_keys(
         receipt = receipt or file.with_name(file.name + ".receipt")
         station.unlock()
         state = station.version()  # before the plan: what changes while it is made is not overlooked either
-        shown = handover_room.incoming.plan_import(station, bundle)
+        shown = plan_import(station, bundle)
         if dry_run:
             app.emit({**import_plan(shown), "receipt": None, "plan": True}, import_text(station, shown))
             return
-        if not isinstance(shown, handover_room.incoming.ImportResult):
+        if not isinstance(shown, ImportResult):
             require_new(receipt)
             app.note(import_text(station, shown))
             app.confirm(f"Import {count_of(len(shown.taken))}?", yes=yes)
         with station.lock("import-keys", app.note):
-            plan = shown if station.version() == state else handover_room.incoming.plan_import(station, bundle)
+            plan = shown if station.version() == state else plan_import(station, bundle)
             require_as_shown(plan, shown)
-            if isinstance(plan, handover_room.incoming.ImportResult):  # before, or meanwhile by another command
-                done = plan
-            else:
-                done = handover_room.incoming.import_bundle(station, plan)
+            # an ImportResult: before, or meanwhile by another command
+            done = plan if isinstance(plan, ImportResult) else import_bundle(station, plan)
             if not holds(receipt, done.receipt + b"\n"):  # the same bundle once more: its receipt may lie there
                 write_new(receipt, done.receipt + b"\n")
     outcomes: list[dict[str, Any]] = []
@@ -287,7 +290,7 @@ def import_keys(
 @contextmanager
 def _bundle_file(path: Path) -> Iterator[BinaryIO]:
     """Open a bundle, to be read from any place; one that comes through a pipe is read whole."""
-    most = protocol.handover.bundle.MAX_BUNDLE_OCTETS
+    most = MAX_BUNDLE_OCTETS
     with open_to_read(path) as file:
         whole = file if file.seekable() else BytesIO(file.read(most + 1))
         if whole.seek(0, os.SEEK_END) > most:
@@ -310,13 +313,13 @@ def _is_sealed(file: BinaryIO) -> bool:
 
 def require_as_shown(plan: ImportPlan | ImportResult, shown: ImportPlan | ImportResult) -> None:
     """Raise PolicyError if another command changed the outcome of a node; nodes imported meanwhile are fine."""
-    if not isinstance(plan, handover_room.incoming.ImportResult):
-        require_same(not isinstance(shown, handover_room.incoming.ImportResult) and plan.nodes == shown.nodes)
+    if not isinstance(plan, ImportResult):
+        require_same(not isinstance(shown, ImportResult) and plan.nodes == shown.nodes)
 
 
 def import_plan(plan: ImportPlan | ImportResult) -> dict[str, Any]:
     """Return the result as far as it is known before anything happens."""
-    if isinstance(plan, handover_room.incoming.ImportResult):
+    if isinstance(plan, ImportResult):
         return _taken_before(plan)
     bundle = plan.opened.bundle
     nodes = ((planned.node.uuid.hex(), planned.decision, planned.why) for planned in plan.nodes)
@@ -336,12 +339,10 @@ def _taken_before(done: ImportResult) -> dict[str, Any]:
 
 def import_text(station: Station, plan: ImportPlan | ImportResult) -> str:
     """Return the plan for people."""
-    if isinstance(plan, handover_room.incoming.ImportResult):
+    if isinstance(plan, ImportResult):
         return f"This bundle was imported on {plan.row.created}; there is nothing to do."
     bundle, nodes = plan.opened.bundle, plan.nodes
-    lines = [
-        f"A {bundle.mode} of {count_of(len(nodes))} from {handover_room.pending.peer_name(station, bundle.sender)}"
-    ]
+    lines = [f"A {bundle.mode} of {count_of(len(nodes))} from {peer_name(station, bundle.sender)}"]
     shown = [
         f"  {planned.decision:<8} {planned.node.uuid.hex()}  {planned.why}".rstrip()
         for planned in nodes[:_COMING_SHOWN]
@@ -351,10 +352,10 @@ def import_text(station: Station, plan: ImportPlan | ImportResult) -> str:
     lines += [f"  {planned.node.uuid.hex()}: {note}" for planned in noted for note in planned.notes]
     lines += [f"  revoked  {revocation.uuid.hex()}  {revocation.why}" for revocation in plan.denied]
     lines += [f"  its ban of {revocation.uuid.hex()} is ignored: {why}" for revocation, why in plan.passed_over]
-    own, sender = handover_room.trust.spoken(station.fingerprint), handover_room.trust.spoken(bundle.sender)
+    own, sender = spoken(station.fingerprint), spoken(bundle.sender)
     lines += [f"Compare by voice:\n  from {sender}\n  to   {own}"]
     if not plan.ca_is_known:
-        lines.append(f"The CA {protocol.keys.fingerprint(bundle.ca)[:32]} will be trusted for these nodes only.")
+        lines.append(f"The CA {fingerprint(bundle.ca)[:32]} will be trusted for these nodes only.")
     return "\n".join([*lines, _COPIED if bundle.mode == "copy" else _MOVED])
 
 
@@ -380,18 +381,16 @@ def _import_result(
 
 
 def _prove(app: App, station: Station, done: ImportResult, links: LinkSettings) -> list[dict[str, Any]]:
-    proven = handover_room.incoming.proven_of(station, done.uuids)
+    proven = proven_of(station, done.uuids)
     waiting = [uuid for uuid in done.uuids if uuid not in proven]
 
     def hold() -> AbstractContextManager[None]:
         return station.lock("import-keys", app.note)
 
-    outcomes = (
-        handover_room.incoming.prove_nodes(station, links, waiting, reporter_for(app), hold=hold) if waiting else []
-    )
+    outcomes = prove_nodes(station, links, waiting, reporter_for(app), hold=hold) if waiting else []
     return [
         {"uuid": outcome.uuid.hex(), "rotated": outcome.rotated, "why": ""}
-        if isinstance(outcome, handover_room.incoming.NodeProof)
+        if isinstance(outcome, NodeProof)
         else {"uuid": outcome.uuid.hex(), "rotated": False, "why": outcome.why}
         for outcome in outcomes
     ]
@@ -406,7 +405,7 @@ def _print_import(
     outcomes: list[dict[str, Any]],
 ) -> None:
     imported = result["imported"]
-    known = handover_room.incoming.proven_of(station, map(bytes.fromhex, imported))
+    known = proven_of(station, map(bytes.fromhex, imported))
     proven = [uuid for uuid in imported if bytes.fromhex(uuid) in known] if known else []
     pending = [uuid for uuid in imported if bytes.fromhex(uuid) not in known] if known else imported
     not_met = {outcome["uuid"]: outcome["why"] for outcome in outcomes if outcome["why"]}
@@ -451,7 +450,7 @@ def list_(app: App) -> None:
     """List every bundle sent or received."""
     from datetime import UTC, datetime
 
-    listed = handover_room.pending.list_handovers(app.station(), datetime.now(UTC))
+    listed = list_handovers(app.station(), datetime.now(UTC))
     rows = [
         {
             "id": handover.row.id,
@@ -506,10 +505,10 @@ def _close_all(
     failed: TedsProvisionError | None = None
     for path in files:
         try:
-            octets = read_limited(path, protocol.handover.receipt.MAX_RECEIPT_OCTETS, "receipt")
-            closed.append(handover_room.pending.close(station, octets))
+            octets = read_limited(path, MAX_RECEIPT_OCTETS, "receipt")
+            closed.append(close(station, octets))
         except TedsProvisionError as error:
-            if not go_on and error.message == protocol.handover.jose.NO_COMPACT_JWS:
+            if not go_on and error.message == NO_COMPACT_JWS:
                 raise BadDataError(f"{path} is not a receipt.", hint="Use the file that import-keys wrote.") from error
             if not go_on:
                 raise
@@ -532,7 +531,7 @@ def _closed(done: CloseResult) -> dict[str, Any]:
 
 def _closed_text(station: Station, done: CloseResult) -> str:
     imported, refused = done.receipt.imported, done.receipt.refused
-    text = f"Station {handover_room.pending.peer_name(station, done.receipt.sender)} imported {count_of(len(imported))}"
+    text = f"Station {peer_name(station, done.receipt.sender)} imported {count_of(len(imported))}"
     text += (
         ("; their keys are deleted here." if done.row.mode == "move" else ".") if done.fresh else " (already known)."
     )
@@ -554,13 +553,13 @@ def _closed_text(station: Station, done: CloseResult) -> str:
 def undo(app: App, id_: str, yes: bool, dry_run: bool) -> None:
     """Undo a move that has no receipt yet; each node's key is rotated at the next contact, before anything else."""
     station = app.station()
-    row = handover_room.pending.find_handover(station, id_)
+    row = find_handover(station, id_)
     if dry_run:
         app.emit({"id": row.id, "state": row.state, "plan": "undo"}, f"Plan: undo the {row.mode} {row.id}.")
         return
     app.confirm("Undo this move? The receiver may still have the keys until they are rotated.", yes=yes)
     with station.lock("handover undo", app.note):
-        done = handover_room.pending.undo(station, handover_room.pending.find_handover(station, id_))
+        done = handover_pending.undo(station, find_handover(station, id_))
     result = {"id": row.id, "state": "undone", "nodes": [uuid.hex() for uuid in done.uuids], "fresh": done.fresh}
     text = f"{count_of(len(done.uuids))} back on this station; each key is rotated at the next contact."
     app.emit(result, text if done.fresh else "Nothing to do: this move was already undone.")

@@ -8,16 +8,20 @@ from typing import TYPE_CHECKING
 
 import click
 
-from teds_provision import handover, protocol
-from teds_provision import station as station_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, command, yes_option
 from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.files import read_limited, require_new, write_new
+from teds_provision.lazy import late
+from teds_provision.protocol.keys import fingerprint, to_pem
+from teds_provision.station.station import initialise
 from teds_provision.vault import agent
 
 if TYPE_CHECKING:
+    from teds_provision.handover import trust
     from teds_provision.station.station import Station
+else:  # bundles and receipts: only for the CA of another station
+    trust = late("teds_provision.handover.trust")
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
@@ -78,28 +82,26 @@ def init(
         station = app.station()
     elif ca_file is not None:
         passphrase = app.ask_secret("Passphrase of the CA key's file")
-        handover.trust.found_under(app.home, ca_file, passphrase, name=name, keystore=keystore, ask=app.ask_secret)
+        trust.found_under(app.home, ca_file, passphrase, name=name, keystore=keystore, ask=app.ask_secret)
         why = f"with the CA key of {ca_file}"
         station = app.station()
     else:
-        station, why = station_room.station.initialise(
-            app.home, name=name, keystore=keystore, ask=app.ask_secret, notify=app.note
-        )
+        station, why = initialise(app.home, name=name, keystore=keystore, ask=app.ask_secret, notify=app.note)
         app.closing(station.close)
         _require_same(station, name, keystore)
-    ca = protocol.keys.fingerprint(station.ca)
+    ca = fingerprint(station.ca)
     app.emit(
         {
             "name": station.name,
-            "public_key": protocol.keys.to_pem(station.point),
+            "public_key": to_pem(station.point),
             "fingerprint": station.fingerprint,
-            "ca": {"public_key": protocol.keys.to_pem(station.ca), "fingerprint": ca},
+            "ca": {"public_key": to_pem(station.ca), "fingerprint": ca},
             "keystore": station.identity.keystore,
             "why": why,
         },
         f"Station  {station.name}\n  key      {station.fingerprint[:16]}\n  CA key   {ca[:16]}\n"
         f"  keystore {station.identity.keystore} ({why}){_open_for(app)}\n  home     {app.home}\n\n"
-        f"{protocol.keys.to_pem(station.point)}",
+        f"{to_pem(station.point)}",
     )
 
 
@@ -121,22 +123,22 @@ def _require_same(station: Station, name: str | None, keystore: str | None) -> N
 def _request(app: App, name: str | None, keystore: str | None, path: Path) -> None:
     if not path.exists():
         require_new(path)
-    octets = handover.trust.ask_for_certificate(app.home, name=name, keystore=keystore, ask=app.ask_secret)
-    asked = handover.trust.read_request(octets)
+    octets = trust.ask_for_certificate(app.home, name=name, keystore=keystore, ask=app.ask_secret)
+    asked = trust.read_request(octets)
     fresh = not _is_request_of(path, asked.station)
     if fresh:
         write_new(path, octets)
-    digits = protocol.keys.fingerprint(asked.station)
+    digits = fingerprint(asked.station)
     result = {
         "name": asked.name,
-        "public_key": protocol.keys.to_pem(asked.station),
+        "public_key": to_pem(asked.station),
         "fingerprint": digits,
         "request": str(path),
     }
     app.emit(
         {**result, "ca": None},
         f"Certificate request of station {asked.name}: {path}.\n"
-        f"Compare by voice:\n  {handover.trust.spoken(digits)}\n"
+        f"Compare by voice:\n  {trust.spoken(digits)}\n"
         f"On the station with the CA key: teds-provision trust ca sign {quote(path.name)}"
         f" --output {quote(path.stem + '.cert')}",
     )
@@ -147,14 +149,14 @@ def _is_request_of(path: Path, point: bytes) -> bool:
     try:
         if not path.exists():
             return False
-        return handover.trust.read_request(read_limited(path, handover.trust.MAX_OCTETS, "request")).station == point
+        return trust.read_request(read_limited(path, trust.MAX_OCTETS, "request")).station == point
     except TedsProvisionError:
         return False
 
 
 def _adopt(app: App, path: Path, yes: bool) -> None:
-    certificate = handover.trust.read_certificate(read_limited(path, handover.trust.MAX_OCTETS, "certificate"))
-    digits = protocol.keys.fingerprint(certificate.ca)
-    app.note(f"The CA that issued this certificate; compare by voice:\n  {handover.trust.spoken(digits)}")
+    certificate = trust.read_certificate(read_limited(path, trust.MAX_OCTETS, "certificate"))
+    digits = fingerprint(certificate.ca)
+    app.note(f"The CA that issued this certificate; compare by voice:\n  {trust.spoken(digits)}")
     app.confirm("Trust this CA as the owner of this station's nodes?", yes=yes)
-    handover.trust.adopt_certificate(app.home, certificate, ask=app.ask_secret).close()
+    trust.adopt_certificate(app.home, certificate, ask=app.ask_secret).close()

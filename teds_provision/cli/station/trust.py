@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from teds_provision import handover, protocol
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
     COMMAND_SETTINGS,
@@ -20,7 +19,24 @@ from teds_provision.cli.options import (
 from teds_provision.cli.rendering import count_of
 from teds_provision.errors import KeyMismatchError
 from teds_provision.files import holds, read_limited, write_new
+from teds_provision.handover import trust as handover_trust
+from teds_provision.handover.trust import (
+    MAX_OCTETS,
+    candidates_of,
+    drop_ca,
+    export_ca,
+    find_trusted,
+    import_ca,
+    plan_removal,
+    read_request,
+    require_ca,
+    sign_request,
+    spoken,
+    write_certificate,
+)
+from teds_provision.protocol import keys as protocol_keys
 from teds_provision.protocol.fingerprints import same_key
+from teds_provision.protocol.keys import to_pem
 
 if TYPE_CHECKING:
     from teds_provision.handover.trust import Candidate, Removal
@@ -90,7 +106,7 @@ def _add(app: App, station: Station, chosen: list[Candidate]) -> None:
     if fresh:
         station.unlock()  # whom this station trusts is sealed under its vault
     with station.lock("trust add", app.note):
-        added = handover.trust.add(station, chosen)
+        added = handover_trust.add(station, chosen)
     result = {"trusted": [_record(candidate.record) for candidate in chosen], "added": added}
     names = ", ".join(candidate.record.name for candidate in fresh)
     app.emit(result, f"Now trusted: {names}." if added else "Nothing to do.")
@@ -108,10 +124,10 @@ def _candidates(
     if folder is not None and (name is not None or fingerprint is not None):
         raise click.UsageError("--from DIR cannot be combined with NAME or --fingerprint.")
     if folder is not None:
-        return handover.trust.candidates_of(station, folder, role)
+        return candidates_of(station, folder, role)
     if name is None or file is None:
         raise click.UsageError("Give NAME and FILE, or --from DIR.")
-    found = handover.trust.candidate(station, name, file, role)
+    found = handover_trust.candidate(station, name, file, role)
     if fingerprint is not None and not same_key(fingerprint, found.record.fingerprint):
         raise KeyMismatchError(
             f"{file} holds the key {found.record.fingerprint[:32]}, not {fingerprint[:32]}.",
@@ -135,9 +151,9 @@ def _shown(found: list[Candidate]) -> str:
     lines = []
     for key in found:
         lines.append(f"{key.record.role} {key.record.name}  ({key.path}){'  already trusted' if key.known else ''}")
-        lines.append(f"  {handover.trust.spoken(key.record.fingerprint)}")
+        lines.append(f"  {spoken(key.record.fingerprint)}")
         if key.certificate is not None:
-            lines.append(f"  certified by the CA {protocol.keys.fingerprint(key.certificate.ca)[:32]}")
+            lines.append(f"  certified by the CA {protocol_keys.fingerprint(key.certificate.ca)[:32]}")
     return "\n".join(lines)
 
 
@@ -161,8 +177,8 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
     the nodes that keep them; bans that it issued are lifted.
     """
     station = app.station()
-    record = handover.trust.find_trusted(station, name)
-    plan = handover.trust.plan_removal(station, record)
+    record = find_trusted(station, name)
+    plan = plan_removal(station, record)
     result = {"removed": _record(record), "ends": _ends(plan)}
     text = f"{record.role} {record.name}, {record.fingerprint[:32]}"
     if dry_run:
@@ -172,14 +188,14 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
     app.confirm(f"Stop trusting the {text}?", yes=yes)
     station.unlock()
     with station.lock("trust remove", app.note):
-        done = handover.trust.remove(station, handover.trust.find_trusted(station, name))
+        done = handover_trust.remove(station, find_trusted(station, name))
     app.emit({**result, "ends": _ends(done)}, "\n".join([f"No longer trusted: {text}.", *_ended(done)]))
 
 
 def _ends(removal: Removal) -> dict[str, Any]:
     return {
         "rotations": [uuid.hex() for uuid in removal.shared],
-        "cas": [protocol.keys.fingerprint(ca) for ca in removal.cas],
+        "cas": [protocol_keys.fingerprint(ca) for ca in removal.cas],
         "nodes_under_them": removal.under,
         "bans": [uuid.hex() for uuid in removal.bans],
         "open_handovers": list(removal.open),
@@ -192,7 +208,7 @@ def _ended(removal: Removal) -> list[str]:
     if removal.shared:
         lines.append(f"  {count_of(len(removal.shared))} whose key it holds: to be rotated at the next contact")
         lines += [f"    {uuid.hex()}" for uuid in removal.shared[:20]]
-    lines += [f"  the CA {protocol.keys.fingerprint(ca)[:32]} is no longer trusted" for ca in removal.cas]
+    lines += [f"  the CA {protocol_keys.fingerprint(ca)[:32]} is no longer trusted" for ca in removal.cas]
     if removal.under:
         lines.append(f"    {count_of(removal.under)} keep it: reset and provision them again")
     lines += [f"  its ban of node {uuid.hex()} is lifted" for uuid in removal.bans]
@@ -221,7 +237,7 @@ def list_(app: App) -> None:
         else {**_record(record), "added": record.added}
         for record in records
     ]
-    own = {"name": station.name, "fingerprint": station.fingerprint, "ca": protocol.keys.fingerprint(station.ca)}
+    own = {"name": station.name, "fingerprint": station.fingerprint, "ca": protocol_keys.fingerprint(station.ca)}
     lines = [f"this station   {station.name}  {station.fingerprint[:16]}, CA {own['ca'][:16]}"]
     for record in records:
         mark = "  certified by this station's CA" if record.role == "station" and certified[record.fingerprint] else ""
@@ -251,8 +267,8 @@ def ca() -> None:
 def create(app: App) -> None:
     """Show the CA key that init created; a station certified by another CA has none."""
     station = app.station()
-    handover.trust.require_ca(station)
-    digits, pem = protocol.keys.fingerprint(station.ca), protocol.keys.to_pem(station.ca)
+    require_ca(station)
+    digits, pem = protocol_keys.fingerprint(station.ca), to_pem(station.ca)
     app.emit({"fingerprint": digits, "public_key": pem, "here": True}, f"CA key {digits[:16]}, in this vault\n\n{pem}")
 
 
@@ -269,15 +285,15 @@ def create(app: App) -> None:
 def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> None:
     """Certify the station that made REQUEST (init --request); it can then key and write this owner's nodes."""
     station = app.station()
-    wanted = handover.trust.read_request(read_limited(request, handover.trust.MAX_OCTETS, "request"))
-    digits = protocol.keys.fingerprint(wanted.station)
+    wanted = read_request(read_limited(request, MAX_OCTETS, "request"))
+    digits = protocol_keys.fingerprint(wanted.station)
     result = {
         "name": wanted.name,
         "fingerprint": digits,
-        "ca": protocol.keys.fingerprint(station.ca),
+        "ca": protocol_keys.fingerprint(station.ca),
         "certificate": str(output),
     }
-    shown = f"Station {wanted.name}\n  {handover.trust.spoken(digits)}"
+    shown = f"Station {wanted.name}\n  {spoken(digits)}"
     if dry_run:
         app.emit({**result, "plan": True}, f"Plan: certify\n{shown}")
         return
@@ -285,7 +301,7 @@ def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> Non
     app.note(shown)
     app.confirm("Certify it? Whoever holds its key can then write and rekey all of this owner's nodes.", yes=yes)
     with station.lock("trust ca sign", app.note):
-        octets = handover.trust.write_certificate(handover.trust.sign_request(station, wanted))
+        octets = write_certificate(sign_request(station, wanted))
         fresh = not holds(output, octets)
         if fresh:
             write_new(output, octets)
@@ -311,7 +327,7 @@ def export(app: App, file: Path) -> None:
     vault = station.vault
     passphrase = app.ask_secret("New passphrase for the CA key's file", confirm=True)
     with station.lock("trust ca export", app.note):
-        handover.trust.export_ca(station, vault, file, passphrase)
+        export_ca(station, vault, file, passphrase)
     app.emit({"file": str(file)}, f"The CA key is in {file}. Store it offline, then: teds-provision trust ca drop")
 
 
@@ -324,7 +340,7 @@ def drop(app: App, yes: bool) -> None:
     station.unlock()
     app.confirm("Delete the CA key from this vault? You can only restore it from its exported file.", yes=yes)
     with station.lock("trust ca drop", app.note):
-        dropped = handover.trust.drop_ca(station)
+        dropped = drop_ca(station)
     app.emit({"dropped": dropped}, "The CA key was removed from this vault." if dropped else "Nothing to do.")
 
 
@@ -337,6 +353,6 @@ def import_(app: App, file: Path) -> None:
     vault = station.vault
     passphrase = app.ask_secret("Passphrase of the CA key's file")
     with station.lock("trust ca import", app.note):
-        handover.trust.import_ca(station, vault, file, passphrase)
-    digits = protocol.keys.fingerprint(station.ca)
+        import_ca(station, vault, file, passphrase)
+    digits = protocol_keys.fingerprint(station.ca)
     app.emit({"fingerprint": digits}, f"The CA key {digits[:16]} is now in this vault.")

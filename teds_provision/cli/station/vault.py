@@ -6,12 +6,12 @@ from datetime import UTC, datetime, timedelta
 
 import click
 
-from teds_provision import station as station_room
 from teds_provision.cli.context import App, pass_app, read_line
 from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples, yes_option
 from teds_provision.cli.rendering import duration, local_time
 from teds_provision.errors import UsageError
 from teds_provision.sanitize import counted
+from teds_provision.station.station import rewrap as rewrap_store
 from teds_provision.vault import agent
 
 
@@ -92,7 +92,7 @@ def rewrap(app: App, yes: bool, dry_run: bool) -> None:
         return
     station.unlock()
     with station.lock("vault rewrap", app.note):
-        done = station_room.station.rewrap(station)
+        done = rewrap_store(station)
     if done.damaged:
         app.warn(
             f"{counted(done.damaged, 'key')} in the store cannot be decrypted with any master key;"

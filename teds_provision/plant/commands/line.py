@@ -12,7 +12,7 @@ from uuid import uuid4
 
 import click
 
-from teds_provision import plant, protocol, provisioning, teds
+from teds_provision import plant, provisioning, teds
 from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.node.build import read_file, write_file
 from teds_provision.cli.options import (
@@ -27,6 +27,10 @@ from teds_provision.cli.options import (
 from teds_provision.cli.rendering import local_time, moment, print_table
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, UsageError
 from teds_provision.files import json_files
+from teds_provision.protocol.keys import SoftwareKey, from_pem
+from teds_provision.protocol.plant.document import SIGN_REQUEST
+from teds_provision.protocol.plant.job import CalibrationRule, Job, seal_job
+from teds_provision.protocol.plant.signing import open_answer, open_request
 from teds_provision.sanitize import printable
 
 if TYPE_CHECKING:
@@ -109,10 +113,10 @@ def new(app: App, /, output: Path | None, dry_run: bool, **settings: Any) -> Non
         raise PolicyError("This station is not a keeper, so no station would accept its job.", hint="Ask a keeper.")
     drafted = _drafted(station, roster, settings)
     if dry_run:  # an invalid job is refused in a plan too
-        protocol.plant.job.seal_job(drafted, protocol.keys.SoftwareKey.generate())
+        seal_job(drafted, SoftwareKey.generate())
     else:
         station.unlock()
-        octets = protocol.plant.job.seal_job(drafted, station.credentials().key)
+        octets = seal_job(drafted, station.credentials().key)
         drafted = plant.jobs.take_job(station, octets)
         if output is not None:
             write_file(output, octets.decode())
@@ -132,7 +136,7 @@ def _drafted(station: Station, roster: Roster, settings: dict[str, Any]) -> Job:
     total = settings["count"] or len(boards)
     sign = settings["sign"]
     begins = settings["not_before"]
-    return protocol.plant.job.Job(
+    return Job(
         str(uuid4()),
         roster.registry,
         settings["title"],
@@ -170,7 +174,7 @@ def _rule(settings: dict[str, Any], boards: dict[bytes, str]) -> CalibrationRule
     if len(given) > 1:
         named = " and ".join(f"--{name.replace('_', '-')}" for name in given)
         raise UsageError("A job takes one calibration option.", hint=f"Use one of {named}.")
-    rule = protocol.plant.job.CalibrationRule
+    rule = CalibrationRule
     if settings["calibration"] is not None:
         return rule("one", plant.jobs.digest_of_file(settings["calibration"]))
     if settings["calibration_age"] is not None:
@@ -438,7 +442,7 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     station.unlock()
     post = plant.sign_requests.transport_for(station, files)
     app.closing(post.close)
-    inbox = plant.sign_requests.Inbox(station, post, protocol.plant.document.SIGN_REQUEST)
+    inbox = plant.sign_requests.Inbox(station, post, SIGN_REQUEST)
     app.closing(inbox.close)
     stop = provisioning.meeting.IdleStop(None)
     signal.signal(signal.SIGTERM, lambda *_: stop.request_stop())
@@ -484,8 +488,8 @@ def once(app: App, file: Path, output: Path, jump: bool) -> None:
             f"{file} is not a request from a member of this plant to this office.",
             hint="To create one: teds-provision sign UUID --by OFFICE --output FILE",
         )
-    request = protocol.plant.signing.open_request(octets, plant.jobs.roster_of(station).point_of)
-    answered = protocol.plant.signing.open_answer(sealed, lambda kid: station.point)
+    request = open_request(octets, plant.jobs.roster_of(station).point_of)
+    answered = open_answer(sealed, lambda kid: station.point)
     if output.suffix != ".json":
         write_file(output, sealed.decode())
     elif answered.security:
@@ -546,7 +550,7 @@ def verify(app: App, files: tuple[str, ...], ca: Path, pins: Path | None, roster
     attempt. Prints one line each, then totals; exits with the worst: 4 for an invalid file, 8 for one that cannot be
     read.
     """
-    grounds = plant.verify_evidence.EvidenceAnchors.from_files(protocol.keys.from_pem(read_file(ca)), pins, roster)
+    grounds = plant.verify_evidence.EvidenceAnchors.from_files(from_pem(read_file(ca)), pins, roster)
     names = json_files([Path(file) for file in files], "evidence")
     totals = plant.verify_evidence.EvidenceTotals()
     for lines, counted in plant.verify_evidence.verify_evidence(grounds, names, _json if app.json else _line):

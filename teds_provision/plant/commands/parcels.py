@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import handover, plant
+from teds_provision import plant
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.extending import add_examples, add_options, callback_of
 from teds_provision.cli.station.handover import import_plan, import_text, require_as_shown
 from teds_provision.errors import TedsProvisionError
+from teds_provision.handover.incoming import plan_import
 
 if TYPE_CHECKING:
     from teds_provision.handover.outgoing import ExportPlan
@@ -83,7 +84,7 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
             continue
         octets = parcels.document(row.id, "in")
         try:
-            shown = handover.incoming.plan_import(station, octets)
+            shown = plan_import(station, octets)
         except TedsProvisionError as error:
             app.warn(f"{row.id}: {error.message}")
             continue
@@ -94,7 +95,7 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
             continue
         app.confirm("Import this parcel?", yes=yes)
         with station.lock("import-keys", app.note):
-            plan = handover.incoming.plan_import(station, octets)
+            plan = plan_import(station, octets)
             require_as_shown(plan, shown)
             done = plant.parcels.import_parcel(station, row, plan)
         one["fresh"] = done.fresh

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import plant, station
+from teds_provision import plant
 from teds_provision.cli.context import App
 from teds_provision.cli.extending import add_examples, add_options, callback_of, option_of
 from teds_provision.cli.options import options_given
 from teds_provision.errors import UsageError
 from teds_provision.links import LinkSettings
+from teds_provision.station.label import require_label_packages
 
 if TYPE_CHECKING:
     from teds_provision.plant.line import LineRun
@@ -62,7 +63,7 @@ class LineOptions:
             return None
         self._check(request)
         if self.label_to is not None:
-            station.label.require_label_packages(self.label_format)
+            require_label_packages(self.label_format)
         found = plant.jobs.find_job(base, self.job) if self.job is not None else None
         label = self.label_to / f"label.{self.label_format}" if self.label_to is not None else None
         line = plant.line.LineRun(

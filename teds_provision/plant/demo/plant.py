@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision import plant, vault
+from teds_provision import plant
 from teds_provision.demo.story import PROFILE, Demo, provision_over, virtual_node
 from teds_provision.errors import NotAuthenticError
 from teds_provision.handover import trust
@@ -33,6 +33,7 @@ from teds_provision.provisioning.progress import Reporter, StepResult
 from teds_provision.provisioning.teds_read import read_image
 from teds_provision.provisioning.verify_node import verify_node
 from teds_provision.station.station import Station, initialise
+from teds_provision.vault.passphrase import THROWAWAY
 
 _DATABASE: Final = "plant"
 _ROLES: Final[dict[str, frozenset[Role]]] = {
@@ -118,9 +119,7 @@ class _Story:
     def _set_up(self) -> None:
         demo = self.demo
         with demo.steps.step("init") as step:
-            north, _ = initialise(
-                self.places / "north", name="north", keystore="file", ask=self._ask, costs=vault.passphrase.THROWAWAY
-            )
+            north, _ = initialise(self.places / "north", name="north", keystore="file", ask=self._ask, costs=THROWAWAY)
             self._keep("north", north)
             for name in _ROLES:
                 request = trust.ask_for_certificate(self.places / name, name=name, keystore="file", ask=self._ask)

@@ -14,11 +14,10 @@ import secrets
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import Any, BinaryIO
-
-from cryptography.exceptions import InvalidTag
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from teds_provision.errors import BadDataError, NotAuthenticError
+from teds_provision.lazy import late
 from teds_provision.limits import check_size
 from teds_provision.protocol.handover.jose import (
     CHANGED_CONTENT,
@@ -39,6 +38,12 @@ from teds_provision.protocol.handover.strict_json import (
     separators,
 )
 from teds_provision.protocol.keys import PrivateKey
+
+if TYPE_CHECKING:
+    from cryptography import exceptions
+else:
+    exceptions = late("cryptography.exceptions")
+
 
 PIECE = 64 * 1024
 _LONGEST_EDGE = 16384  # characters of a JWS header or signature
@@ -148,7 +153,7 @@ def unseal(
     jws.more(opener.update(text.end()))
     try:
         opener.finalize()
-    except InvalidTag as error:
+    except exceptions.InvalidTag as error:
         raise NotAuthenticError(CHANGED_CONTENT) from error
     kid, signer = check_signature(*jws.signed(), find_key, typ)
     return UnsealedPayload(kid, signer, jws.payload(), jws.sha256, envelope.sha256)

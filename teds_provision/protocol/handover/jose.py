@@ -18,18 +18,8 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
-from cryptography.exceptions import InvalidSignature, InvalidTag
-from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, encode_dss_signature
-from cryptography.hazmat.primitives.ciphers import Cipher
-from cryptography.hazmat.primitives.ciphers.aead import AESGCM
-from cryptography.hazmat.primitives.ciphers.algorithms import AES
-from cryptography.hazmat.primitives.ciphers.modes import GCM
-from cryptography.hazmat.primitives.kdf.concatkdf import ConcatKDFHash
-from cryptography.hazmat.primitives.keywrap import InvalidUnwrap, aes_key_unwrap, aes_key_wrap
-
 from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError
+from teds_provision.lazy import late
 from teds_provision.limits import check_size
 from teds_provision.protocol.handover.strict_json import (
     Base64urlWriter,
@@ -43,6 +33,25 @@ from teds_provision.protocol.handover.strict_json import (
     write_base64url,
 )
 from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey, SoftwareKey, fingerprint, public_key
+
+if TYPE_CHECKING:
+    from cryptography import exceptions
+    from cryptography.hazmat.primitives import ciphers, hashes, keywrap
+    from cryptography.hazmat.primitives.asymmetric import ec, utils
+    from cryptography.hazmat.primitives.ciphers import aead, algorithms, modes
+    from cryptography.hazmat.primitives.kdf import concatkdf
+else:
+    exceptions = late("cryptography.exceptions")
+    ec = late("cryptography.hazmat.primitives.asymmetric.ec")
+    utils = late("cryptography.hazmat.primitives.asymmetric.utils")
+    ciphers = late("cryptography.hazmat.primitives.ciphers")
+    aead = late("cryptography.hazmat.primitives.ciphers.aead")
+    algorithms = late("cryptography.hazmat.primitives.ciphers.algorithms")
+    modes = late("cryptography.hazmat.primitives.ciphers.modes")
+    hashes = late("cryptography.hazmat.primitives.hashes")
+    concatkdf = late("cryptography.hazmat.primitives.kdf.concatkdf")
+    keywrap = late("cryptography.hazmat.primitives.keywrap")
+
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.ciphers import AEADDecryptionContext
@@ -145,10 +154,10 @@ def _es256_good(point: bytes, digest: bytes, signature: bytes) -> bool:
     """RFC 7518 section 3.4: r ‖ s of 32 octets each; either s."""
     if len(signature) != SIGNATURE_OCTETS:
         return False
-    der = encode_dss_signature(int.from_bytes(signature[:32], "big"), int.from_bytes(signature[32:], "big"))
+    der = utils.encode_dss_signature(int.from_bytes(signature[:32], "big"), int.from_bytes(signature[32:], "big"))
     try:
-        public_key(point).verify(der, digest, ec.ECDSA(Prehashed(hashes.SHA256())))
-    except InvalidSignature:
+        public_key(point).verify(der, digest, ec.ECDSA(utils.Prehashed(hashes.SHA256())))
+    except exceptions.InvalidSignature:
         return False
     return True
 
@@ -167,7 +176,7 @@ class JweWriter:
         content_key, iv = os.urandom(_KEY_OCTETS), os.urandom(_IV_OCTETS)
         entries = [_recipient_entry(point, content_key) for point in recipients]
         self._head = dump({"protected": protected, "recipients": entries, "iv": encode_base64url(iv)})
-        self._cipher = Cipher(AES(content_key), GCM(iv)).encryptor()
+        self._cipher = ciphers.Cipher(algorithms.AES(content_key), modes.GCM(iv)).encryptor()
         self._cipher.authenticate_additional_data(protected.encode())
         self._text = Base64urlWriter()
 
@@ -196,7 +205,7 @@ def _recipient_entry(point: bytes, content_key: bytes) -> dict[str, object]:
     wrapping = _wrapping_key(one_time.ecdh(point), b"", b"")
     return {
         "header": {"kid": fingerprint(point), "epk": public_jwk(one_time.point)},
-        "encrypted_key": encode_base64url(aes_key_wrap(wrapping, content_key)),
+        "encrypted_key": encode_base64url(keywrap.aes_key_wrap(wrapping, content_key)),
     }
 
 
@@ -204,7 +213,7 @@ def _wrapping_key(shared: bytes, party_u: bytes, party_v: bytes) -> bytes:
     """RFC 7518 section 4.6.2: Concat KDF over Z with AlgorithmID, PartyUInfo, PartyVInfo and SuppPubInfo."""
     parts = [len(part).to_bytes(4, "big") + part for part in (KEY_ALGORITHM.encode(), party_u, party_v)]
     info = b"".join(parts) + (8 * _KEY_OCTETS).to_bytes(4, "big")
-    return ConcatKDFHash(hashes.SHA256(), _KEY_OCTETS, info).derive(shared)
+    return concatkdf.ConcatKDFHash(hashes.SHA256(), _KEY_OCTETS, info).derive(shared)
 
 
 def decrypt(octets: bytes, key: PrivateKey, *, cty: str, max_octets: int) -> bytes:
@@ -217,8 +226,8 @@ def decrypt(octets: bytes, key: PrivateKey, *, cty: str, max_octets: int) -> byt
     content_key, seal = content_key_for(document, key, cty=cty)
     ciphertext = decode_base64url(document.get("ciphertext"), "The ciphertext")
     try:
-        return AESGCM(content_key).decrypt(seal.iv, ciphertext + seal.tag, seal.additional)
-    except InvalidTag as error:
+        return aead.AESGCM(content_key).decrypt(seal.iv, ciphertext + seal.tag, seal.additional)
+    except exceptions.InvalidTag as error:
         raise NotAuthenticError(CHANGED_CONTENT) from error
 
 
@@ -232,7 +241,7 @@ class ContentSeal:
 
     def opener(self, content_key: bytes) -> AEADDecryptionContext:
         """Decrypt a piece at a time; its ``finalize`` raises InvalidTag, and before that nothing may be believed."""
-        cipher = Cipher(AES(content_key), GCM(self.iv, self.tag)).decryptor()
+        cipher = ciphers.Cipher(algorithms.AES(content_key), modes.GCM(self.iv, self.tag)).decryptor()
         cipher.authenticate_additional_data(self.additional)
         return cipher
 
@@ -323,8 +332,8 @@ def _content_key(header: Mapping[str, Any], entry: Mapping[str, Any], key: Priva
     if len(wrapped) != _WRAPPED_OCTETS:
         raise BadDataError(f"The encrypted key has {len(wrapped)} octets, not {_WRAPPED_OCTETS}.")
     try:
-        return aes_key_unwrap(_wrapping_key(key.ecdh(one_time), party_u, party_v), wrapped)
-    except InvalidUnwrap:
+        return keywrap.aes_key_unwrap(_wrapping_key(key.ecdh(one_time), party_u, party_v), wrapped)
+    except keywrap.InvalidUnwrap:
         return None
 
 

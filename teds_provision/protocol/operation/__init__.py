@@ -43,26 +43,3 @@ A node
 * ``tim.trigger(link, token, tick)`` and ``tim.drive(link, octets)`` for what comes without a reply;
 * ``tim.actuator_claimed()`` before it moves to another CAN address; ``tim.link_lost(link)`` at bus-off, as before.
 """
-
-from typing import TYPE_CHECKING
-
-from teds_provision.lazy import lazy
-
-if TYPE_CHECKING:
-    from teds_provision.protocol.operation import (
-        budget,
-        can_frames,
-        claims,
-        commands,
-        datagram,
-        driving,
-        hardware,
-        role,
-        stream_commands,
-        stream_role,
-        streams,
-        subscription,
-        timing,
-    )
-else:
-    __getattr__ = lazy(__name__)

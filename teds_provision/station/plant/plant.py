@@ -31,7 +31,7 @@ from teds_provision.station.store.store import Store
 if TYPE_CHECKING:
     from teds_provision.protocol.plant import claim, document, event, roster, signer
     from teds_provision.protocol.plant.roster import Role
-    from teds_provision.vault import Vault
+    from teds_provision.vault.base import Vault
 else:  # cryptography: not for commands that only list
     event = late("teds_provision.protocol.plant.event")
     claim, document = late("teds_provision.protocol.plant.claim"), late("teds_provision.protocol.plant.document")

@@ -12,8 +12,8 @@ import pytest
 
 from teds_provision.errors import VaultError
 from teds_provision.protocol.keys import verify
-from teds_provision.vault import create_vault, forget_vaults, open_vault
 from teds_provision.vault.pkcs11 import FILE_NAME, Pkcs11Vault
+from teds_provision.vault.selection import create_vault, forget_vaults, open_vault
 from tests.vault.softhsm import PIN, SoftHsm
 from tests.vault.token.person import Person
 
