@@ -677,6 +677,13 @@ PATTERNS = (
         "tests/plant/test_sync_files.py",
     ),
     Pattern(
+        "a Drive message is used once by the virtual node",
+        "StreamRole.drive_message",
+        "counter <= drive.last",
+        "False",
+        "tests/protocol/operation/test_driving.py",
+    ),
+    Pattern(
         "a request comes from the page's own origin",
         "_require_origin",
         "headers['origin'].lower() not in named.origins",

@@ -98,6 +98,18 @@ def test_a_drive_message_that_is_late_replayed_forged_or_too_much_moves_nothing(
     assert wheel.points == (1500, 1600)
 
 
+def test_a_drive_message_that_was_heard_moves_nothing_again_while_it_is_in_time(wheel: Wheel) -> None:
+    first, second = (wheel.message(value, value, hold=450 * MS) for value in (1500, 1700))
+    wheel.hear(first)
+    wheel.hear(second)
+    wheel.hear(first)
+    assert (wheel.points, clock(wheel.bench).last) == ((1700, 1700), 1), "an older counter"
+    wheel.bench.later(400 * MS)
+    wheel.hear(second)
+    wheel.bench.later(101 * MS)
+    assert wheel.points == (100, 100), "the last counter: it feeds no dead-man"
+
+
 @pytest.mark.parametrize("short", [4, 6])
 def test_the_shortest_dead_man_of_all_its_actuators_limits_a_drive_message(short: int) -> None:
     bench = Bench().open()
