@@ -31,6 +31,7 @@ from typing import Any
 from benchmarks.commands import PASSPHRASE, Rows, started
 from benchmarks.machine import line as machine
 from benchmarks.measure_time import CALIBRATION, TYPE
+from benchmarks.ncap import memory
 from teds_provision import client
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.pacing import classic_bits, fd_seconds
@@ -57,6 +58,7 @@ from tests.bench import on_reader
 
 BASE = 20
 FIRST, TOGETHER, CLOCK_SHARE = 1.0, 5.0, 10.0  # aims: s (p95), s, % of a bus with 200 nodes
+MEMORY, MEMORY_OF_A_NODE = 100.0, 0.15  # aims, MB
 PATIENCE = 120.0
 BITRATE, DATA_BITRATE = 500_000, 2_000_000
 MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin")
@@ -267,6 +269,7 @@ class Scene:
     boards: list[subprocess.Popen[str]]
     here: client.Client
     uuids: dict[str, bytes]
+    ncap: subprocess.Popen[str]
 
     def power(self, word: str, *names: str) -> list[str]:
         """Tell the processes of these nodes, the first twenty's or the others'; what they answer."""
@@ -341,7 +344,7 @@ def scene(rows: Rows, folder: Path, count: int, rate: float, *, fd: bool) -> Ite
         stack.callback(wire.close)
         stack.callback(topics.close)
         here = stack.enter_context(client.connect(home=home))
-        yield Scene(rows, wire, topics, boards, here, uuids)
+        yield Scene(rows, wire, topics, boards, here, uuids, ncap)
 
 
 def one_after_the_other(on: Scene, joins: int) -> None:
@@ -396,6 +399,7 @@ def many(on: Scene, count: int, seconds: float, kind: str) -> None:
     time.sleep(5.0)  # that it runs is told after its first values, where all begin at once
     states = [report["state"] for report in on.here.measurements()[0]["nodes"]]
     on.rows.tell(f"  measured of {count}", states.count("running"), "", aim=count, least=True)
+    on.rows.tell("  memory of the station", memory(on.ncap), "MB", aim=MEMORY + MEMORY_OF_A_NODE * count)
 
     def read_whole(uuid: bytes) -> bool:
         verdict = on.here.node(uuid.hex())["verdict"]
