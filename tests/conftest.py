@@ -97,7 +97,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     mark = metafunc.definition.get_closest_marker("both_nodes")
     if mark is not None and not ALL_IN_C:
         in_c = [pytest.mark.system]
-        if why := mark.kwargs.get("nightly_in_c"):
+        if (why := mark.kwargs.get("nightly_in_c")) and not metafunc.definition.get_closest_marker("nightly"):
             in_c.append(pytest.mark.nightly(f"{metafunc.definition.nodeid} holds this with the Python node; {why}"))
         metafunc.parametrize("node_kind", ["python", pytest.param("c", marks=in_c)])
 

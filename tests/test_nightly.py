@@ -25,7 +25,8 @@ def suite(request: pytest.FixtureRequest) -> list[pytest.Item]:
 
 def test_each_test_that_is_out_of_the_gate_names_one_in_it(request: pytest.FixtureRequest) -> None:
     """Of all that this run collected."""
-    assert not request.config.stash.get(REFUSED, [])
+    wrong = request.config.stash.get(REFUSED, [])
+    assert not wrong, "\n".join(wrong)
 
 
 def test_each_file_with_a_test_marked_realtime_has_the_mark_in_its_text(request: pytest.FixtureRequest) -> None:
