@@ -73,7 +73,7 @@ def _station(station: Station) -> dict[str, Any]:
 
 def _of_links(station: Station, named: LinkSettings) -> dict[str, Any]:
     """Ask on the links themselves: the named ones, else those of the last contacts, and present readers."""
-    known = [node["uuid"] for node in inventory(station, search(station))]
+    known = [node.uuid for node in inventory(station, search(station))]
     remembered = sorted(set(station.nodes.last_places([bytes.fromhex(uuid) for uuid in known]).values()))
     places = [place for place in named.places if named.nfc] + list(named.buses or remembered)
     present = [*look(station, places), *([] if named.nfc else readers())]
@@ -98,12 +98,12 @@ def _node(station: Station, place: str, address: int, who: Any) -> dict[str, Any
     (known,) = inventory(station, [who.uuid])
     return {
         "uuid": who.uuid.hex(),
-        "name": known["name"],
+        "name": known.name,
         "link": place,
         "address": address,
         "state": who.state.name.lower(),
-        "whitelisted": known["whitelisted"],
-        "verdict": known["verdict"],
+        "whitelisted": known.whitelisted,
+        "verdict": known.verdict,
     }
 
 

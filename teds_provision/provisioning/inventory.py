@@ -15,6 +15,7 @@ from teds_provision import teds
 from teds_provision.errors import NotFoundError, PolicyError
 from teds_provision.lazy import late
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.shapes.node import KnownNode
 from teds_provision.station.overview import NodeOverview, Search
 from teds_provision.station.station import Station
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from teds_provision.provisioning import readings
     from teds_provision.shapes.verdict import NodeVerdict
     from teds_provision.station import firmware
+    from teds_provision.station.firmware import KnownFirmware
     from teds_provision.teds.fits import Fit, Requirement
 else:  # cryptography: a list of unverified nodes needs none
     readings, firmware = late("teds_provision.provisioning.readings"), late("teds_provision.station.firmware")
@@ -57,13 +59,13 @@ def _exact(station: Station, text: str) -> bytes | None:
     return station.nodes.named(text)
 
 
-def inventory(station: Station, uuids: Sequence[bytes]) -> Iterator[dict[str, Any]]:
+def inventory(station: Station, uuids: Sequence[bytes]) -> Iterator[KnownNode]:
     """Describe nodes, in their order, a page at a time; ``verdict`` is judged now, from each one's row of reading."""
     return (node for node, _ in with_verdicts(station, uuids))
 
 
-def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[dict[str, Any], NodeVerdict | None]]:
-    """Yield the rows of :func:`inventory`, each with the whole verdict; None if no datasheet of the node was read."""
+def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[KnownNode, NodeVerdict | None]]:
+    """Yield the nodes of :func:`inventory`, each with the whole verdict; None if no datasheet of the node was read."""
     known = station.overview.nodes(uuids)
     demands = firmware.FirmwareDemands(station.home)
     while page := list(islice(known, PAGE)):
@@ -74,42 +76,43 @@ def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[di
         reported = station.firmware_reports.get_many(listed)
         for overview in page:
             found, record = judged.get(overview.uuid), reported.get(overview.uuid)
-            node = _described(overview, found)
-            runs = firmware.known_firmware(record, partial(demands.of, node["profile"])) if record is not None else None
-            yield node | {"firmware": runs and runs.to_json()}, found
+            profile = (overview.node or {}).get("profile")
+            runs = firmware.known_firmware(record, partial(demands.of, profile)) if record is not None else None
+            yield _described(overview, found, runs), found
 
 
-def _described(known: NodeOverview, judged: NodeVerdict | None) -> dict[str, Any]:
+def _described(known: NodeOverview, judged: NodeVerdict | None, runs: KnownFirmware | None) -> KnownNode:
     node, entry, moved, revoked = known.node or {}, known.whitelist or {}, known.moved, known.revoked
     point = node.get("point")
-    return {
-        "uuid": known.uuid.hex(),
-        "name": node.get("name") or entry.get("name"),
-        "profile": node.get("profile"),
-        "state": _state(node),
-        "epoch": node.get("epoch", 0),
-        "sequence": node.get("sequence", 0),
-        "fingerprint": hashlib.sha256(point).hexdigest() if point is not None else entry.get("fingerprint"),
-        "whitelisted": known.whitelist is not None,
-        "assurance": entry.get("assurance"),
-        "verdict": judged.verified.verdict if judged is not None else None,
-        "retired": node.get("retired"),
-        "reading": judged and judged.reading(),
-        "last_seen": node.get("last_seen"),
-        "due": node.get("due"),
-        "charging": json.loads(node["charging"]) if node.get("charging") else None,
-        "channels": node.get("channels", 0),
-        "can_address": node.get("can_address", 0),
-        "group": known.groups[0] if known.groups else None,
-        "groups": known.groups,
-        "teds_sha256": node.get("teds_sha256"),
-        "keys": known.keys,
-        "rotation_due": known.rotation,
-        "moved_to": moved and {"fingerprint": moved["to_fingerprint"], "handover": moved["handover_id"]},
-        "holders": known.holders,
-        "wrapped": known.origin.to_json() if known.origin is not None else None,
-        "revoked": revoked and {"why": revoked["why"], "since": revoked["created"]},
-    }
+    return KnownNode(
+        uuid=known.uuid.hex(),
+        name=node.get("name") or entry.get("name"),
+        profile=node.get("profile"),
+        state=_state(node),
+        epoch=node.get("epoch", 0),
+        sequence=node.get("sequence", 0),
+        fingerprint=hashlib.sha256(point).hexdigest() if point is not None else entry.get("fingerprint"),
+        whitelisted=known.whitelist is not None,
+        assurance=entry.get("assurance"),
+        verdict=judged.verified.verdict if judged is not None else None,
+        retired=node.get("retired"),
+        reading=judged.reading() if judged is not None else None,
+        last_seen=node.get("last_seen"),
+        due=node.get("due"),
+        charging=json.loads(node["charging"]) if node.get("charging") else None,
+        channels=node.get("channels", 0),
+        can_address=node.get("can_address", 0),
+        group=known.groups[0] if known.groups else None,
+        groups=known.groups,
+        teds_sha256=node.get("teds_sha256"),
+        keys=known.keys,
+        rotation_due=known.rotation,
+        moved_to=moved and {"fingerprint": moved["to_fingerprint"], "handover": moved["handover_id"]},
+        holders=known.holders,
+        wrapped=known.origin.to_json() if known.origin is not None else None,
+        revoked=revoked and {"why": revoked["why"], "since": revoked["created"]},
+        firmware=runs.to_json() if runs is not None else None,
+    )
 
 
 def _state(node: dict[str, Any]) -> str | None:

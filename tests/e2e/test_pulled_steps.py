@@ -75,9 +75,7 @@ def pull_at_each(home: Path, field: Field, path: str, lying: list[tuple[str, str
                     done = next(came)
                 assert (done.uuid.hex(), done.result) == (next_uuid, "passed"), (point, done, done.failure)
                 field.lift()
-        known = {
-            node["uuid"]: node["verdict"] for node in inventory(station, [node.uuid for node in station.nodes.all()])
-        }
+        known = {node.uuid: node.verdict for node in inventory(station, [node.uuid for node in station.nodes.all()])}
         assert known == dict.fromkeys(dict(lying), "authentic")
     finally:
         run.stop.set()

@@ -128,7 +128,7 @@ def test_a_node_out_of_service_is_listed_with_its_verdict_and_with_why_it_is_out
     provisioned(pair.north, pair.board)
     retire(pair.north, pair.board.uuid, None)
     (listed,) = inventory(pair.north, [pair.board.uuid])
-    assert (listed["verdict"], listed["retired"]) == ("authentic", "decommissioned, unconfirmed")
+    assert (listed.verdict, listed.retired) == ("authentic", "decommissioned, unconfirmed")
 
 
 def test_a_node_that_does_not_answer_is_unconfirmed_and_can_be_tried_again(pair: Pair) -> None:

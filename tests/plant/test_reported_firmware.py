@@ -228,11 +228,12 @@ def test_a_key_that_is_handed_over_brings_no_firmware(plants: Plant) -> None:
     assert south.keys.held(board.uuid)
     assert south.firmware_reports.get(board.uuid) is None
     (known,) = inventory(south, [board.uuid])
-    assert known["firmware"] is None
+    assert known.firmware is None
     assert version(south, board) == ("1.2.0", "north")
     look(south, board)
     (known,) = inventory(south, [board.uuid])
-    assert (known["firmware"]["version"], known["firmware"]["from"], known["firmware"]["changed"]) == (
+    assert known.firmware is not None
+    assert (known.firmware["version"], known.firmware["from"], known.firmware["changed"]) == (
         "1.2.0",
         "session",
         False,

@@ -136,7 +136,7 @@ def test_a_board_that_does_not_report_works_as_before(station: Station, octets: 
     assert done.verified.verdict == "authentic"
     assert done.firmware == FirmwareReading(None, sealed=True)
     (known,) = inventory(station, [board.uuid])
-    assert known["firmware"] == {
+    assert known.firmware == {
         "text": None, "version": None, "build": None, "image": None,
         "state": "unjudged", "from": "session", "changed": False,
     }  # fmt: skip

@@ -78,8 +78,8 @@ def shown(station: Station, board: Board) -> tuple[str | None, str | None]:
     judged = readings.verdict_of(station, board.uuid)
     (listed,) = inventory(station, [board.uuid])
     word = None if judged is None else judged.verified.verdict
-    assert listed["verdict"] == word
-    assert listed["reading"] == (judged and {"from": judged.origin, "at": judged.at, "by": judged.by})
+    assert listed.verdict == word
+    assert listed.reading == (judged and {"from": judged.origin, "at": judged.at, "by": judged.by})
     return word, judged and judged.origin
 
 

@@ -101,7 +101,7 @@ def nodes(
     if not app.json and form in (None, "table"):  # what scripts read stays in the order of UUIDs
         names = {record.uuid: record.name for record in station.nodes.all()}
         found = sorted(found, key=lambda uuid: by_name(names.get(uuid), uuid.hex()))
-    described = _with_views(station, inventory(station, found))
+    described = _with_views(station, (node.to_json() for node in inventory(station, found)))
     if app.json or form == "json":
         print_json_list("nodes", described)
     elif form == "csv":

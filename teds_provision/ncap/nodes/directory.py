@@ -16,12 +16,14 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from typing import Any, Final
 
+from teds_provision.api.answers import Node
 from teds_provision.api.operations import MOST_NODES
 from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.provisioning.inventory import with_verdicts
 from teds_provision.sanitize import by_name
+from teds_provision.shapes.node import KnownNode
 from teds_provision.shapes.problem import Problem
 from teds_provision.shapes.verdict import NodeVerdict
 from teds_provision.station.overview import Search
@@ -34,6 +36,9 @@ _log = logging.getLogger(__name__)
 _order: Final = lru_cache(maxsize=32_768)(by_name)
 """Sort keys of ten thousand nodes, for each page of a list, cost half a second."""
 _READ_NOW: Final = "read now"
+_ADDED: Final = frozenset({"mode", "virtual", "wrapped", "unverified", "channels"})
+_BLANK: Final[dict[str, Any]] = dict.fromkeys(name for name in Node.__annotations__ if name not in _ADDED)
+"""Members of the API's node in their order; what takes other locks is added last."""
 MOST_GONE: Final = 200
 """Number of nodes that left and are not in the store, kept to be shown: in transparent mode they can be invented."""
 
@@ -69,7 +74,7 @@ class NodeDirectory:
         self.virtual: Callable[[str], bool] = lambda _uuid: False
         self._lock, self._reading = threading.RLock(), threading.Lock()
         self._seen: dict[str, NodePresence] = {}
-        self._rows: dict[str, dict[str, Any]] = {}
+        self._rows: dict[str, KnownNode] = {}
         self._judged: dict[str, NodeVerdict | None] = {}  # as the store and today's trust have it, beside each row
         self._channels: dict[str, tuple[str, list[dict[str, Any]]]] = {}
         self._shown_in: dict[str, Mapping[int, str]] = {}  # the display units with which the channels were decoded
@@ -93,8 +98,8 @@ class NodeDirectory:
             every = self._station.overview.find(Search()) if uuids is None else map(bytes.fromhex, dict.fromkeys(uuids))
             wanted = list(every)
             found = list(with_verdicts(self._station, wanted))
-            rows = {row["uuid"]: row for row, _ in found}
-            judged = {row["uuid"]: verdict for row, verdict in found}
+            rows = {node.uuid: node for node, _ in found}
+            judged = {node.uuid: verdict for node, verdict in found}
             with self._lock:
                 self.changes += 1
                 if uuids is None:
@@ -106,7 +111,7 @@ class NodeDirectory:
     def _sheet(self, uuid: str) -> list[dict[str, Any]]:
         """Return the channels of a node's last datasheet; decoded once for each datasheet."""
         with self._lock:
-            digest = self._rows.get(uuid, {}).get("teds_sha256") or ""
+            digest = self._stored(uuid).teds_sha256 or ""
             known = self._channels.get(uuid)
         if known is not None and known[0] in (digest, _READ_NOW):
             return known[1]
@@ -124,7 +129,7 @@ class NodeDirectory:
     def follow_profiles(self) -> list[str]:
         """Show channels in the display units that their profiles name now; return the nodes with other ones."""
         with self._lock:
-            known = {uuid: (self._rows.get(uuid, {}).get("profile"), units) for uuid, units in self._shown_in.items()}
+            known = {uuid: (self._stored(uuid).profile, units) for uuid, units in self._shown_in.items()}
         home = self._station.home
         now = {profile: units_of_profile(profile, home) for profile in {profile for profile, _ in known.values()}}
         changed = [uuid for uuid, (profile, units) in known.items() if now[profile] != units]
@@ -223,7 +228,7 @@ class NodeDirectory:
     def name(self, uuid: str) -> str:
         """Return the name of a node in the store, "" if it has none."""
         with self._lock:
-            return self._rows.get(uuid, {}).get("name") or ""
+            return self._stored(uuid).name or ""
 
     def called(self, uuid: str) -> tuple[str, bool]:
         """Return the name under which a node is published, and whether it is the node's own, unverified claim."""
@@ -292,44 +297,43 @@ class NodeDirectory:
         channels = self._sheet(uuid)
         with self._lock:
             seen = self._seen.get(uuid) or NodePresence()
-            row = self._rows.get(uuid, {})
-            out = {
-                "uuid": uuid,
-                "name": row.get("name"),
-                "profile": row.get("profile"),
-                "link": seen.place or None,
-                "via": seen.place.partition(":")[0] or None,
-                "address": seen.address,
-                "present": seen.present,
-                "last_seen": _moment(seen.seen) or row.get("last_seen"),
-                "tapped": seen.tapped or None,
-                "state": row.get("state") or seen.says,
-                "whitelisted": row.get("whitelisted", False),
-                "fingerprint": row.get("fingerprint"),
-                "epoch": row.get("epoch", 0),
-                "sequence": row.get("sequence", 0),
-                "due": row.get("due"),
-                **self._verdicts(uuid, seen),
-                "verified": _moment(seen.looked),
-                "retired": row.get("retired"),
-                "problem": seen.problem,
-                "busy": seen.busy or None,
-                "group": row.get("group"),
-                "groups": row.get("groups", []),
-                "measurement": seen.measurement,
-                "measuring": seen.report,
-                "power": seen.power,
-                "firmware": row.get("firmware") or seen.firmware,
-            }
+            known = self._stored(uuid)
+            stored = known.published()
+            wrapped = stored.pop("wrapped")
+            out = (
+                _BLANK
+                | stored
+                | {
+                    "link": seen.place or None,
+                    "via": seen.place.partition(":")[0] or None,
+                    "address": seen.address,
+                    "present": seen.present,
+                    "last_seen": _moment(seen.seen) or known.last_seen,
+                    "tapped": seen.tapped or None,
+                    "state": known.state or seen.says,
+                    **self._verdicts(uuid, seen),
+                    "verified": _moment(seen.looked),
+                    "problem": seen.problem,
+                    "busy": seen.busy or None,
+                    "measurement": seen.measurement,
+                    "measuring": seen.report,
+                    "power": seen.power,
+                    "firmware": known.firmware or seen.firmware,
+                }
+            )
         called, unverified = self.called(uuid)
         out["unverified"] = unverified
         if unverified:  # what it calls itself, marked
             out["name"] = out["name"] or called or None
         out["virtual"] = self.virtual(uuid)
-        out["wrapped"] = self._origins.get(uuid) or row.get("wrapped")
+        out["wrapped"] = self._origins.get(uuid) or wrapped
         out["mode"] = "measuring" if seen.measurement else "idle" if seen.present else None
         out["channels"] = [{**channel, **self._now(uuid, channel["number"])} for channel in channels]
         return out
+
+    def _stored(self, uuid: str) -> KnownNode:
+        """Return a node as the store has it; with its UUID alone if it is only on a link."""
+        return self._rows.get(uuid) or KnownNode(uuid=uuid)
 
     def _verdicts(self, uuid: str, seen: NodePresence) -> dict[str, Any]:
         """Return the verdict on a node, from its reading; and beside it what it sent outside a session.
