@@ -37,7 +37,7 @@ LATE_MODULES = {
     "cli/node/build.py": "only in front of an operator",
     "cli/node/provision.py": "only in front of an operator",
     "cli/node/show.py": "cryptography: only for a handover bundle",
-    "cli/node/virtual_nodes.py": "HTTP: only for the nodes of the running base station",
+    "cli/node/virtual_nodes.py": "HTTP, links and hardware: only for nodes that run",
     "cli/options.py": "HTTP, Foxglove, traces: most runs use none of them",
     "cli/service/ncap.py": "the service: only for ncap run",
     "cli/shell_completion.py": "commands, options and files are completed without the store",
