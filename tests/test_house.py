@@ -184,3 +184,63 @@ def test_json_of_strangers_is_decoded_in_one_place(modules: dict[str, Any]) -> N
         if "object_pairs_hook" in (getattr(node, "arg", ""), getattr(node, "value", ""))
     }
     assert own == {"teds_provision.json_decoder"}
+
+
+def rooms_named(tree: ast.Module, rooms: set[str]) -> dict[str, str]:
+    """Return the names that stand for a room in this file, with its dotted name."""
+    found: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            dotted = {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {name: room for name, room in dotted.items() if room in rooms}
+    return found
+
+
+def loaded_at_run_time(tree: ast.AST) -> Iterator[str]:
+    """Yield what a file imports when it runs: nothing of ``if TYPE_CHECKING``."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            yield from loaded_at_run_time(ast.Module(node.orelse, []))
+            continue
+        if isinstance(node, ast.ImportFrom) and node.module:
+            yield from (node.module, *(f"{node.module}.{alias.name}" for alias in node.names))
+        yield from loaded_at_run_time(node)
+
+
+def test_a_module_that_is_reached_through_its_room_is_imported() -> None:
+    """``can.server`` works without an import if something else loaded it first, or if the room loads late."""
+    package = ROOT / "teds_provision"
+    files = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in package.rglob("*.py")}
+    rooms = {name.removesuffix(".__init__") for name in files if name.endswith(".__init__")}
+    late = {room for room in rooms if room.partition(".")[2].replace(".", "/") in LATE_ROOMS}
+    missing = []
+    for path in files.values():
+        tree = parsed(path)
+        named = rooms_named(tree, rooms)
+        loaded = {*loaded_at_run_time(tree)}
+        for node in ast.walk(tree) if named else ():
+            first, *rest = dotted_names(node)
+            room = named.get(first, "")
+            for part in rest if room else ():
+                module = f"{room}.{part}"
+                if module not in files and module not in rooms:
+                    break
+                if room not in late and module not in loaded | set(loaded_at_run_time(parsed_room(files, room))):
+                    missing.append(f"{path.relative_to(ROOT)}:{node.lineno} needs {module}")
+                room = module
+    assert not missing
+
+
+def dotted_names(node: ast.AST) -> list[str]:
+    """Return the parts of ``a.b.c``; one empty part for anything else."""
+    parts: list[str] = []
+    while isinstance(node, ast.Attribute):
+        parts.append(node.attr)
+        node = node.value
+    return [node.id, *reversed(parts)] if parts and isinstance(node, ast.Name) else [""]
+
+
+def parsed_room(files: dict[str, Path], room: str) -> ast.Module:
+    """Return the ``__init__`` of a room, parsed; nothing for a module."""
+    path = files.get(f"{room}.__init__")
+    return parsed(path) if path is not None else ast.Module([], [])
