@@ -588,7 +588,7 @@ class Plant(TypedDict):
 
 
 class PlantClaims(TypedDict):
-    """The stations' claims about one node; ``holders`` by key id."""
+    """The stations' claims about one node."""
 
     uuid: Uuid
     name: str | None

@@ -410,7 +410,7 @@ def _command_at(arguments: Sequence[str]) -> int | None:
 
 
 def _options(command: click.Command | None, words: Sequence[str]) -> tuple[set[str], set[str]]:
-    """Options of a command (and of the command within it that is called), and those of them that take a value."""
+    """Return the options of a command and of the command within it that is called, and those that take a value."""
     own: set[str] = set()
     valued: set[str] = set()
     while command is not None:

@@ -42,7 +42,7 @@ from teds_provision.provisioning.progress import Reporter, StepResult, Steps
 from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.provisioning.teds_read import read_image
 from teds_provision.provisioning.verify import require_authentic
-from teds_provision.provisioning.verify_node import verify_node
+from teds_provision.provisioning.verify_node import judge_and_keep
 from teds_provision.shapes.problem import problem_in
 from teds_provision.station.station import Station, initialise
 from teds_provision.station.store import TrustRecord
@@ -98,7 +98,7 @@ def verify_from(demo: Demo, station: Station, what: str) -> None:
         with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node:
             who = identify(station, node)
             held = require_session(station, node)
-            verified = verify_node(station, node, read_image(node), who.point).verified
+            verified = judge_and_keep(station, node, read_image(node), who.point).verified
         if verified.verdict != "authentic":
             raise NotAuthenticError(f"The demo's node is {verified.verdict} as seen from {station.name}.")
         step.detail = f"{station.name} finds it {verified.verdict}, key epoch {held.record.epoch}"

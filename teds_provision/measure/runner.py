@@ -118,9 +118,9 @@ class Measurement:
             NodeSupervisor(self.station, self.buses, uuid, self.request, self._host, events, self._common_start)
             for uuid in self.uuids
         ]
-        for keeper in self.supervisors:
-            if keeper.uuid not in self.lent:
-                keeper.start()
+        for supervisor in self.supervisors:
+            if supervisor.uuid not in self.lent:
+                supervisor.start()
         try:
             self.ready.set()
             self._loop(stop, duration)
@@ -340,9 +340,11 @@ class Measurement:
         self.watcher.facts(facts)
 
     def _new_grid(self, uuid: str) -> Grid:
-        """Of one node, or of all of them ("")."""
-        keepers = [supervisor for supervisor in self.supervisors if uuid in ("", supervisor.uuid.hex())]
-        spans = [heard.receiver.plan.span for keeper in keepers for heard in list(keeper.streams.running.values())]
+        """Return a grid for the streams of one node, or of all of them (``""``)."""
+        chosen = [supervisor for supervisor in self.supervisors if uuid in ("", supervisor.uuid.hex())]
+        spans = [
+            heard.receiver.plan.span for supervisor in chosen for heard in list(supervisor.streams.running.values())
+        ]
         patience = max(spans, default=0) / 1e9 + 2 * BEAT
         known = [facts for _, facts in sorted(self._known.items()) if facts.kind != "actuator"]
         sensors = [facts for facts in known if uuid in ("", facts.uuid)]

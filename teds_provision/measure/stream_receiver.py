@@ -135,7 +135,7 @@ class ReceivedStream:
             self.deliver(block)
 
     def ending(self) -> int:
-        """End the measurement now: return how many messages of the run are wanted, including the one being filled."""
+        """Return how many messages of the run are wanted if the measurement ends now, with the one being filled."""
         with self.mapping:
             return self.receiver.begun(self.clock.tick_at(time.monotonic_ns()))
 

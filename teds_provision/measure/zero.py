@@ -27,7 +27,7 @@ from teds_provision.provisioning.charge import Low, wait_for_charge
 from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.provisioning.progress import DONE, NOTHING, Reporter, StepResult, Steps
 from teds_provision.provisioning.sign import require_not_measured, sign
-from teds_provision.provisioning.verify_node import NodeVerification, verify_in_session, verify_node
+from teds_provision.provisioning.verify_node import NodeVerification, judge_and_keep, verify_in_session
 from teds_provision.provisioning.visit import NodeVisit, at_node
 from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station
@@ -220,7 +220,7 @@ class _ZeroRun:
             step.result = DONE if written.octets else NOTHING
             step.detail = f"{written.octets} octets"
         with self.steps.step("verify") as step:
-            judged = verify_node(station, node, written.on_node, who.point, by=_NAME, c=node.open_counter)
+            judged = judge_and_keep(station, node, written.on_node, who.point, by=_NAME, c=node.open_counter)
             step.take_verdict(judged.verified.verdict)
             trusted = trusted_from(station, node, NodeVerification(written.on_node, judged))
             channel, own = _adjustable(trusted, found.channel.number)

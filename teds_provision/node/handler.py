@@ -58,7 +58,7 @@ class MeasuringHandler(Protocol):
     ) -> bytes:
         """As NodeHandler.request, for a frame whose last part came by CAN FD or not, at the tick ``received``.
 
-        ``mtu`` and ``hears`` are those of a BLE connection; see Port.
+        ``mtu`` and ``hears`` are those of a BLE connection; see SessionPort.
         """
 
     def reply_left(self, link: str) -> None:

@@ -94,7 +94,7 @@ class FolderTransport:
             self._write(folder / parcel.id, parcel.octets)
 
     def drop(self, parcel: str, to: str) -> None:
-        """Throw a parcel away."""
+        """Delete the copy of a parcel that is addressed to ``to``."""
         try:
             (self._folder / "to" / to / parcel).unlink(missing_ok=True)
         except OSError as error:

@@ -309,8 +309,8 @@ def by_office(
     """Have the office sign, and keep the draft meanwhile; an earlier signature, and the node's, is not requested again.
 
     ``on_node``: the node's Security TEDS if its other TEDS are those of the image. An earlier request for the very same
-    datasheet is repeated unchanged, so that no second one is made. Raises OfficeSilentError (5), Refused (6),
-    NotAuthenticError (the answer is not the office's, or signs something else).
+    datasheet is repeated unchanged, so that no second one is made. Raises OfficeSilentError (5), OfficeRefusedError
+    (6), NotAuthenticError (the answer is not the office's, or signs something else).
     """
     roster = roster_of(station)
     if on_node is not None and _says_the_same(station, roster, keys, wanted, on_node):
@@ -456,7 +456,7 @@ def _taken(
 ) -> SignResult:
     """Return the image with the office's signature.
 
-    Raises Refused, NotAuthenticError (not its answer, or something else).
+    Raises OfficeRefusedError, NotAuthenticError (not its answer, or something else).
     """
     office = roster.point_of(wanted.office)
     answer = open_answer(octets, lambda kid: office if kid == wanted.office else None)

@@ -50,7 +50,7 @@ _ROOM: Final = 20_000
 
 @dataclass
 class SyncResult:
-    """Result of a sync: pages out and in, sentences for people, stations that were behind."""
+    """Result of a sync: pages and parcels out and in, remarks for people, rosters taken."""
 
     pushed: int = 0
     fetched: int = 0
@@ -74,7 +74,7 @@ def alone(station: Station) -> Iterator[None]:
 
 
 def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncResult:
-    """Bring this station and what carries to the same state, as far as signatures go.
+    """Bring this station and the transport to the same state, as far as signatures go.
 
     ``connected``: it is what the station joined by; how far its database came is remembered. Raises LinkError,
     NotMemberError, ForkError, PolicyError.
@@ -165,7 +165,7 @@ def own_chain(station: Station) -> Chain:
 
 
 def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResult, *, connected: bool) -> None:
-    """Check the pages under this station's key before anything is added to them; the order is the contract's."""
+    """Check the pages under this station's key before any is added, in the order of contract/plant.md, section 6."""
     chain, joined = own_chain(station), station.plant.joined
     assert joined is not None
     restored = station.plant.restored
@@ -175,7 +175,7 @@ def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResul
     found = appended + returned.own(station, post.returned, roster, {page.hash for page in appended})
     new = [page for page in found if (page.number, page.hash) not in known]
     if new and restored and _follows(chain, new):
-        adopt(station, roster, new)
+        take_back(station, roster, new)
         station.plant.alarms.end_about("fork", station.fingerprint)
         back = "1 page that this station wrote before its backup is"
         if len(new) > 1:
@@ -266,7 +266,7 @@ def _follows(chain: Chain, new: Sequence[Page]) -> bool:
     return True
 
 
-def adopt(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
+def take_back(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
     """Take back pages that this station wrote: their events wait no more, their content is known again."""
     with station.transaction():
         take_pages(station, roster, sorted(pages, key=lambda page: page.number))
@@ -369,7 +369,7 @@ def resume(station: Station, post: Transport) -> int:
                 counted = [(n, hash) for n, hash, _ in station.plant.pages.names(chain.chain) if n <= chain.counted[0]]
                 lost = [place for place in counted if place not in theirs and place[0] >= new[0].number]
                 station.plant.pages.put_chain(replace(chain, accepted=(newest.number, newest.hash)))
-                adopt(station, roster, new)
+                take_back(station, roster, new)
                 _report_again(station, chain, lost, new)
             station.plant.alarms.end_about("fork", station.fingerprint)
             station.plant.end_restored()

@@ -130,7 +130,7 @@ class JudgedEvidence:
         return self.evidence.verdict if self.good else "not authentic"
 
     def to_json(self) -> dict[str, Any]:
-        """One line of the result."""
+        """Return the members of one line of the result."""
         members: dict[str, Any] = {"file": str(self.path), "good": self.good, "faults": list(self.faults)}
         if self.evidence is not None:
             facts = self.evidence.facts

@@ -47,7 +47,7 @@ class PrivateKey(Protocol):
         """Return the same signature, of a message whose SHA-256 the caller made piece by piece."""
 
     def ecdh(self, peer: bytes) -> bytes:
-        """x-coordinate (32 octets) of the ECC CDH with the 65-octet point ``peer``."""
+        """Return the x-coordinate (32 octets) of the ECC CDH with the 65-octet point ``peer``."""
 
 
 class SoftwareKey:

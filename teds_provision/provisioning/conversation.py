@@ -335,8 +335,6 @@ class Conversation:
             self._notice(Notice("retry", "The node is busy with another station", until - time.monotonic()))
             time.sleep(BUSY_PAUSE)
 
-    # The messages are encoded once more for the trace, so these look whether there is one.
-
 
 def _carry(link: Link, frame: bytes, within: float | None) -> bytes:
     if within is not None and isinstance(link, DeadlineLink):
@@ -345,4 +343,4 @@ def _carry(link: Link, frame: bytes, within: float | None) -> bytes:
 
 
 def _nothing() -> None:
-    """Do nothing: this conversation holds no lock."""
+    """Do nothing: there is no second port to close."""

@@ -20,7 +20,7 @@ from teds_provision.provisioning.progress import DONE, NOTHING, Reporter, StepRe
 from teds_provision.provisioning.sign import known_node_keys, require_not_measured, sign
 from teds_provision.provisioning.teds_read import NodeSnapshot, take_snapshot
 from teds_provision.provisioning.verify import require_authentic
-from teds_provision.provisioning.verify_node import verify_node
+from teds_provision.provisioning.verify_node import judge_and_keep
 from teds_provision.provisioning.write import write
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
@@ -171,7 +171,7 @@ def write_sheet(
         step.result = DONE if written.octets else NOTHING
         step.detail = f"{written.octets} octets" if written.octets else ""
     with steps.step("verify") as step:
-        verified = verify_node(station, node, written.on_node, keys.key, by="write").verified
+        verified = judge_and_keep(station, node, written.on_node, keys.key, by="write").verified
         step.take_verdict(verified.verdict)
     require_authentic(verified)
     return SheetEditResult(plan, tuple(steps.done), verified)

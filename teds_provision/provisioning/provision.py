@@ -45,7 +45,7 @@ from teds_provision.provisioning.operator import Operator
 from teds_provision.provisioning.progress import DONE, NOTHING, SKIPPED, Reporter, StepResult, Steps
 from teds_provision.provisioning.sign import SignResult, require_not_measured, sign
 from teds_provision.provisioning.teds_read import NodeSnapshot, take_snapshot
-from teds_provision.provisioning.verify_node import verify_at_node, verify_node
+from teds_provision.provisioning.verify_node import judge_and_keep, verify_at_node
 from teds_provision.provisioning.write import WriteResult, write
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.firmware import FirmwareDemands, FirmwareReading
@@ -462,7 +462,7 @@ class _Run:
 
     def _verify(self, who: IdentifiedNode, written: WriteResult) -> Verification:
         with self.steps.step("verify") as step:
-            verified = verify_node(self.station, self.node, written.on_node, who.point, by="provision").verified
+            verified = judge_and_keep(self.station, self.node, written.on_node, who.point, by="provision").verified
             step.take_verdict(verified.verdict)
         return verified
 

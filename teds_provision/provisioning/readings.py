@@ -81,8 +81,8 @@ def judge_reading(
 ) -> tuple[NodeReading, NodeVerdict]:
     """Return the row of a reading and the verdict on it; nothing is kept yet. See :func:`keep_read`."""
     checks, signers = static_checks(image, known)
-    octets = [*checks, *more]
-    row = NodeReading(image.uuid, utc_now(), by, c, True, _packed(image), *signers, _written(octets))
+    own = [*checks, *more]
+    row = NodeReading(image.uuid, utc_now(), by, c, True, _packed(image), *signers, _written(own))
     return row, _judged(station, row, keyed=is_keyed(station, image.uuid))
 
 

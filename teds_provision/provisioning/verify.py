@@ -220,7 +220,7 @@ def _proofs(image: Image) -> _SecurityFields:
 
 
 def _all_proofs(images: Sequence[Image]) -> list[_SecurityFields]:
-    """Return the same of many images: all are read, then the signatures of all nodes checked, then of all stations."""
+    """Return the fields of many images: read all, then check the signatures of all nodes, then of all stations."""
     read = [_shown(image) for image in images]
     signed = [
         security.tbs(image.uuid, image.blocks[SECURITY]) if isinstance(shown, SecurityTeds) and shown.signed else None
@@ -248,7 +248,7 @@ def _shown(image: Image) -> _Shown:
 
 def _checks(station: TrustSource, image: Image, proofs: _SecurityFields, known: FreshnessFloor | None) -> list[Check]:
     return judge(
-        station, image.uuid, _octets(image, proofs, known), Signers.from_security_teds(proofs.shown), image.security
+        station, image.uuid, _own_checks(image, proofs, known), Signers.from_security_teds(proofs.shown), image.security
     )
 
 
@@ -315,7 +315,7 @@ ABOUT_THE_REST: Final = frozenset({"form", "signed TEDS", "every TEDS is signed"
 """Checks of other TEDS than the Security TEDS."""
 
 
-def _octets(image: Image, proofs: _SecurityFields, known: FreshnessFloor | None) -> list[Check]:
+def _own_checks(image: Image, proofs: _SecurityFields, known: FreshnessFloor | None) -> list[Check]:
     return [*_by_itself(image, proofs), *_not_older(proofs.shown, known)]
 
 

@@ -58,7 +58,7 @@ def verify_at_node(station: Station, node: Conversation, who: IdentifiedNode) ->
             raise
         node.forget()
         why, image = _why(refusal), read_image(node)
-    return NodeVerification(image, verify_node(station, node, image, who.point, why=why, c=c))
+    return NodeVerification(image, judge_and_keep(station, node, image, who.point, why=why, c=c))
 
 
 def verify_in_session(station: Station, node: Conversation, *, by: str) -> NodeVerification:
@@ -103,7 +103,7 @@ def _why(refusal: NodeRefusedError) -> str:
     return refusal.message.removeprefix(HEARD).rstrip(".")
 
 
-def verify_node(
+def judge_and_keep(
     station: Station,
     node: Conversation,
     image: Image,

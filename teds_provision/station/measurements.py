@@ -271,7 +271,7 @@ class Measurements:
         return UsageLock(self._home / FOLDER / f"{uuid.hex()}.lock", command=what, shared=True)
 
     def source(self, bus: str, source: int, *, command: str = "", shared: bool = False) -> UsageLock:
-        """Return the usage lock of a source address on a bus, to be entered by ``with``, which raises Taken (7).
+        """Return the usage lock of a source address on a bus; ``with`` enters it and raises UsageLockTakenError (7).
 
         A session belongs to a pair of addresses, and a second Open on it ends the first (operation.md section 6).
         ``bus`` is ``CanSpec.wire``. A user with one short session after another takes it ``shared``.

@@ -16,7 +16,7 @@ from teds_provision.provisioning.address import set_address
 from teds_provision.provisioning.agree import agree, open_session
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.teds_read import read_image
-from teds_provision.provisioning.verify_node import verify_node
+from teds_provision.provisioning.verify_node import judge_and_keep
 from teds_provision.station.store import RevocationRecord
 from tests.bench import MemoryLink, make_station, talk
 from tests.handover.desk import Pair, held, node_key_id, provisioned, session, trust
@@ -75,7 +75,7 @@ def test_a_moved_node_can_still_be_verified_by_its_former_station(pair: Pair) ->
     pair.export("move")
     with talk(pair.board) as node:
         who = identify(pair.north, node)
-        assert verify_node(pair.north, node, read_image(node), who.point).verified.verdict == "authentic"
+        assert judge_and_keep(pair.north, node, read_image(node), who.point).verified.verdict == "authentic"
 
 
 def test_the_receiver_of_a_move_rotates_at_its_first_contact(pair: Pair) -> None:

@@ -29,7 +29,7 @@ from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.sign import known_node_keys
 from teds_provision.provisioning.teds_read import read_image
 from teds_provision.provisioning.verify import possession_check
-from teds_provision.provisioning.verify_node import NodeVerification, verify_at_node, verify_in_session, verify_node
+from teds_provision.provisioning.verify_node import NodeVerification, judge_and_keep, verify_at_node, verify_in_session
 from teds_provision.station.station import Station
 from teds_provision.station.store import NodeReading, RevocationRecord, utc_now
 from teds_provision.teds.codec.frame import frame, unframe
@@ -219,7 +219,7 @@ def test_what_is_said_in_no_session_changes_no_row(station: Station, board: Boar
     changed_in_flash(board)
     with talk(board) as node:
         who = identify(station, node)
-        plain = verify_node(station, node, read_image(node), who.point, why="the node does not open a session")
+        plain = judge_and_keep(station, node, read_image(node), who.point, why="the node does not open a session")
     assert plain.verified.verdict == "unproven"
     assert plain.origin == "plain"
     assert station.datasheets.reading(board.uuid) == before

@@ -17,7 +17,7 @@ from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.sign import SignOrder, known_node_keys, sign, sign_image
 from teds_provision.provisioning.teds_read import read_image
 from teds_provision.provisioning.verify import FreshnessFloor, freshness_floor_of, verify_image
-from teds_provision.provisioning.verify_node import verify_node
+from teds_provision.provisioning.verify_node import judge_and_keep
 from teds_provision.provisioning.write import write
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
@@ -169,7 +169,7 @@ def on_node(station: Station, board: Board) -> Verification:
     with talk(board) as node:
         who = identify(station, node)
         require_session(station, node)
-        return verify_node(station, node, read_image(node), who.point).verified
+        return judge_and_keep(station, node, read_image(node), who.point).verified
 
 
 def test_a_provisioned_node_is_authentic(station: Station, board: Board, image: Image) -> None:

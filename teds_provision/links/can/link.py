@@ -178,7 +178,7 @@ class CanLink:
             return None
 
     def begin(self, octets: int) -> bytes:
-        """Return the frame by which the node answers the first frame of a request of so many octets."""
+        """Send the first frame of a request of so many octets; return the frame by which the node answers it."""
         bus, transaction = self._bus(), self._number()
         with bus.address_pair(self.address, self._source).exchange(transaction) as line:
             head, _ = first_frame(bytes([transaction]).ljust(octets, b"\0"), fd=bus.spec.fd)

@@ -314,7 +314,7 @@ class NfcLink:
 
     @property
     def announced(self) -> dict[str, int]:
-        """Content of the node's service record; see ``Announces``."""
+        """Content of the node's service record; see ``AnnouncingLink``."""
         service = self.visit.service
         return {"WT_INT": service.wt_int, "N_wait": service.n_wait, "maxNdef": service.max_ndef}
 

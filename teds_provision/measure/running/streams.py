@@ -159,11 +159,11 @@ class NodeStreams:
             monotone,
             raw_only=UNSIGNED if trusted.unsigned else "",
         )
-        heard = ReceivedStream(receiver, pieces, interpreter, self.clock, self.mapping, self._deliver)
-        heard.heard += ahead
-        self.running[number] = heard
+        stream = ReceivedStream(receiver, pieces, interpreter, self.clock, self.mapping, self._deliver)
+        stream.heard += ahead
+        self.running[number] = stream
         self.totals.setdefault(number, StreamTotals(plan.layout.channels, plan.subscribe.period / 1e9))
-        bus.receiver.register(address, number, heard)
+        bus.receiver.register(address, number, stream)
 
     def stop(self, bus: MeasuredBus, trusted: VerifiedSession | None, address: int) -> None:
         """Stop each in order, so that its counter shows what was lost at the end.

@@ -72,7 +72,7 @@ def answer_error(request: Request, error: Exception) -> Response:
 
 
 def answer_refusal(_request: Request, refusal: Exception) -> Response:
-    """Return a Refusal from within a route (a body that is too long, or does not match its schema)."""
+    """Return the answer to a RequestRefusedError of a route (a body is too long or does not match its schema)."""
     assert isinstance(refusal, RequestRefusedError)
     return JSONResponse(Error(error=problem_of(refusal)), refusal.status)
 

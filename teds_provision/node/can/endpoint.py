@@ -1,4 +1,4 @@
-"""One node's seat on a CAN bus: a line for each base station, its answer to everyone, its Announces.
+"""One node on a CAN bus: a StationState for each base station, its answer to everyone, its Announces.
 
 Nothing here is thread-safe: the server of the bus calls it under its lock; only :meth:`StationState.answer` and
 :meth:`StationState.begin_anew` run in the line's turns.

@@ -31,7 +31,7 @@ from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.meeting import meet
 from teds_provision.provisioning.progress import Reporter, StepResult
 from teds_provision.provisioning.teds_read import read_image
-from teds_provision.provisioning.verify_node import verify_node
+from teds_provision.provisioning.verify_node import judge_and_keep
 from teds_provision.station.station import Station, initialise
 from teds_provision.vault.passphrase import THROWAWAY
 
@@ -169,7 +169,7 @@ class _Story:
             with meet(south, demo.over("can"), demo.uuid, demo.reporter) as node:
                 who = identify(south, node)
                 session_if_keyed(south, node)
-                verified = verify_node(south, node, read_image(node), who.point).verified
+                verified = judge_and_keep(south, node, read_image(node), who.point).verified
             wrong = next((check.why for check in verified.checks if check.result == "failed"), "")
             step.detail = f"south finds it {verified.verdict}{f': {wrong}' if wrong else ''}"
         return verified.verdict

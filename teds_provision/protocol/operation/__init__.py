@@ -5,31 +5,34 @@ leases in s, dead-men in ms. Data sets are raw octets as in ModLenth and DatMode
 
 Contents
 --------
-================  ====================================================================================================
-``commands``      payloads of claims and values: ``Operate`` ``idle`` ``Operation`` ``read_data_set`` ``write_data_set``
-                  ``sample`` ``Sampled`` ``set_values`` ``run_self_test`` ``Power``
-``stream_commands``  payloads of streams and time: ``Subscribe`` ``Subscribed`` ``stop`` ``drive`` ``Driven`` ``CLOCK``
-                  ``Clock`` ``Arm``; builders give a ``Command`` for ``Conversation.request``
-``datagram``      data and Drive messages: run keys, ``Sealer``, ``Layout``, the test pattern
-``can_frames``    identifiers and cutting on CAN and BLE: ``cut`` ``Assembly`` ``data_address`` ``trigger_station``
-``budget``        the node's budget in ppm, the load of a CAN bus
-``subscription``  station: ``Plan`` (Subscribe and the check of its reply), ``Receiver`` (opens messages, counts)
-``timing``        station: ``ClockSample`` (offset, bound, dishonest clocks), ``Token`` (trigger)
-``driving``       station: ``Driver`` (Drive messages)
-``hardware``      node: the interface of the firmware below (``Hardware``, ``Port``)
-``claims``        node: claims, leases, dead-men, safe states
-``streams``       node: streams, their budget, messages being filled and sent
-``role``          node: every command of operation.md inside a session; used by ``Tim``
-================  ====================================================================================================
+===================  =================================================================================================
+``commands``         payloads of claims and values: ``OperateCommand`` ``idle`` ``OperationReply`` ``read_data_set``
+                     ``write_data_set`` ``sample`` ``SampleReply`` ``set_values`` ``run_self_test`` ``PowerReply``
+``stream_commands``  payloads of streams and time: ``SubscribeCommand`` ``SubscribeReply`` ``stop`` ``drive``
+                     ``DriveReply`` ``CLOCK`` ``ClockReply`` ``ArmCommand``; builders give a ``Command`` for
+                     ``Conversation.request``
+``datagram``         data and Drive messages: run keys, ``DatagramSealer``, ``Layout``, the test pattern
+``can_frames``       identifiers and cutting on CAN and BLE: ``cut`` ``StreamAssembly`` ``data_address``
+                     ``trigger_station``
+``budget``           the node's budget in ppm, the load of a CAN bus
+``subscription``     station: ``StreamPlan`` (Subscribe and the check of its reply), ``Receiver`` (opens messages)
+``timing``           station: ``ClockSample`` (offset, bound, dishonest clocks), ``TriggerToken``
+``driving``          station: ``Driver`` (Drive messages)
+``hardware``         node: the interface of the firmware below (``Hardware``, ``SessionPort``)
+``claims``           node: claims, leases, dead-men, safe states
+``streams``          node: streams, their budget, messages being filled and sent
+``stream_role``      node: the commands of streams, Drive, clock and trigger
+``role``             node: every command of operation.md inside a session; used by ``Tim``
+===================  =================================================================================================
 
 A station, in order
 -------------------
->>> plan = Plan.of(0, ((1, 2),), n=25, period=1_000_000)          # stream 0: channel 1 of 2 octets, 1 kHz
->>> subscribed = plan.accept(conversation.send(plan.command(), "to subscribe"), now)
->>> receiver = Receiver(plan, subscribed, session.message_key)    # k_m: StationSession.message_key
->>> assembly = Assembly(plan.length, fd=False)                     # one for each (node, stream)
->>> octets = assembly.take(address.segment, frame.data)           # address = data_address(identifier)
->>> message = receiver.take(octets, clock_sample.tick(time.monotonic_ns()))   # Message, or None: see receiver.counts
+>>> plan = StreamPlan.for_channels(0, ((1, 2),), n=25, period=1_000_000)   # stream 0: channel 1 of 2 octets, 1 kHz
+>>> reply = plan.accept(conversation.request(plan.command(), "to subscribe"), now)
+>>> receiver = Receiver(plan, reply, session.message_key)          # k_m: StationSession.message_key
+>>> assembly = StreamAssembly(plan.length, fd=False)               # one for each (node, stream)
+>>> octets = assembly.add_segment(address.segment, frame.data)     # address = data_address(identifier)
+>>> message = receiver.open_message(octets, clock_sample.tick(time.monotonic_ns()))   # None: see receiver.counts
 
 A node
 ------

@@ -21,8 +21,9 @@ _ID_OCTETS = 16
 class Store(Database):
     """The file of one station: its identifier, its audit log, transactions and statements.
 
-    Every method is durable when it returns, and all of them raise StoreError (or StoreLockedError) if the file fails.
-    Several processes may have it open; a command that changes it holds a StoreLock.
+    A method is durable when it returns; in a transaction, when the outermost one ends (``Connection.transaction``).
+    All of them raise StoreError (or StoreLockedError) if the file fails. Several processes may have it open; a command
+    that changes it holds a StoreLock.
     """
 
     id: str

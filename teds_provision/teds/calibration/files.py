@@ -188,7 +188,7 @@ def _header(table: CsvTable, number: int, cells: list[str]) -> _Columns | None:
 
 
 def _name_and_unit(cell: str) -> tuple[str, str | None]:
-    """``Torque [N·m]`` or ``Torque (N·m)``: the name in small letters, and the unit."""
+    """Return the name in small letters and the unit of ``Torque [N·m]`` or ``Torque (N·m)``."""
     match = _UNIT.match(cell)
     return (match[1].lower(), match[2] or match[3]) if match else ("", None)
 

@@ -223,9 +223,9 @@ class ChannelInterpreter:
         return np.where((above <= high) | (above - high <= low + turn - above), above, above - turn)
 
     def beyond(self, value: float, written: WrittenUnit | None = None) -> str:
-        """Return why a value may not be set, as a sentence in the unit ``told``; "" if the datasheet's limits allow it.
+        """Return why a value may not be set, as a sentence in the unit ``written``; "" if the limits allow it.
 
-        ``value`` is in :attr:`unit`; without ``told`` the sentence is in the display unit.
+        ``value`` is in :attr:`unit`; without ``written`` the sentence is in the display unit.
         """
         low, high = self.limits
         if math.isfinite(value) and low - ROUNDING * abs(low) <= value <= high + ROUNDING * abs(high):
