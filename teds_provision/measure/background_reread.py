@@ -67,7 +67,7 @@ class BackgroundReread:
             GarbledError,
             NodeRefusedError,
             BadDataError,
-        ):  # its data still come, or the keeper finds that they do not
+        ):  # its data still come, or the supervisor finds that they do not
             self.close()
             self._steps, self._due = read_in_between(self._verified.node, gap=GAP), began + AGAIN
             self._left -= 1

@@ -163,7 +163,7 @@ class Measurement:
     def _until(self, now: float, duration: float | None) -> float:
         """When ``duration`` seconds of data are over: they count from the first values."""
         left = self._common_start.seconds_left
-        if duration is None or left is None or not any(keeper.ever_ran for keeper in self.supervisors):
+        if duration is None or left is None or not any(supervisor.ever_ran for supervisor in self.supervisors):
             return math.inf
         self.began()
         # A stream that may begin when its node likes begins a moment after Subscribe.
@@ -171,7 +171,7 @@ class Measurement:
         return max(now + left, *first) + duration
 
     def _all_done(self) -> bool:
-        return not self._open and not self.lent and all(keeper.done.is_set() for keeper in self.supervisors)
+        return not self._open and not self.lent and all(supervisor.done.is_set() for supervisor in self.supervisors)
 
     def _gave_up(self) -> bool:
         """Return True if no node ever ran and each has had its time."""
@@ -180,8 +180,8 @@ class Measurement:
         )
 
     def _look(self) -> None:
-        for keeper in self.supervisors:
-            self._report(keeper.report())
+        for supervisor in self.supervisors:
+            self._report(supervisor.report())
         for sink in self.sinks:
             if self._is_news(sink):
                 self.watcher.sink(sink)
@@ -240,12 +240,12 @@ class Measurement:
         The node's other exchanges wait meanwhile: be brief. ``streaming``: only once its streams run. Raises no error
         by itself.
         """
-        keeper = self._keeper(uuid)
-        if keeper is None:
+        supervisor = self._supervisor_of(uuid)
+        if supervisor is None:
             yield None
             return
-        with keeper.turn:
-            yield keeper.verified if keeper.state == "running" or not streaming else None
+        with supervisor.turn:
+            yield supervisor.verified if supervisor.state == "running" or not streaming else None
 
     @property
     def _open(self) -> bool:
@@ -257,50 +257,50 @@ class Measurement:
 
         Its counts go on from their last values.
         """
-        keeper = self._keeper(uuid)
-        if keeper is None:
-            keeper = NodeSupervisor(
+        supervisor = self._supervisor_of(uuid)
+        if supervisor is None:
+            supervisor = NodeSupervisor(
                 self.station, self.buses, uuid, self.request, self._host, self._events, self._common_start
             )
-            self.supervisors = [*self.supervisors, keeper]
+            self.supervisors = [*self.supervisors, supervisor]
         if not self._ending:
-            keeper.start()
-        return keeper
+            supervisor.start()
+        return supervisor
 
     def leave(self, uuid: bytes, why: str) -> None:
         """End one node in order; its counts stay."""
-        keeper = self._keeper(uuid)
-        if keeper is not None and keeper.begun:
-            keeper.stop(why)
-            keeper.join(ENDING)
+        supervisor = self._supervisor_of(uuid)
+        if supervisor is not None and supervisor.begun:
+            supervisor.stop(why)
+            supervisor.join(ENDING)
 
     def suspend_node(self, uuid: bytes, why: str, seconds: float) -> bool:
         """End one node in order while a command works on it; False if that took longer."""
         self.lent.add(uuid)
-        keeper = self._keeper(uuid)
-        if keeper is None or not keeper.begun:
+        supervisor = self._supervisor_of(uuid)
+        if supervisor is None or not supervisor.begun:
             return True
-        keeper.stop(why, comes_back=True)
-        return keeper.done.wait(seconds)
+        supervisor.stop(why, comes_back=True)
+        return supervisor.done.wait(seconds)
 
     def resume_node(self, uuid: bytes) -> None:
         """Measure a node again that was let go."""
-        keeper = self._keeper(uuid)
-        if keeper is None or uuid not in self.lent:
+        supervisor = self._supervisor_of(uuid)
+        if supervisor is None or uuid not in self.lent:
             return
         self.buses.expect([uuid])
         if not self._ending:
-            keeper.start()
+            supervisor.start()
         self.lent.discard(uuid)
 
-    def _keeper(self, uuid: bytes) -> NodeSupervisor | None:
+    def _supervisor_of(self, uuid: bytes) -> NodeSupervisor | None:
         return next((supervisor for supervisor in self.supervisors if supervisor.uuid == uuid), None)
 
     def command(self, command: SetPointCommand) -> None:
         """Pass on a set point that came by a sink."""
-        for keeper in self.supervisors:
-            if keeper.uuid.hex() == command.uuid:
-                keeper.command(command)
+        for supervisor in self.supervisors:
+            if supervisor.uuid.hex() == command.uuid:
+                supervisor.command(command)
 
     # -- from the threads of nodes and bus ---------------------------------------------------------------------------
 
@@ -362,12 +362,12 @@ class Measurement:
 
     def _end(self) -> None:
         self._ending = True
-        for keeper in self.supervisors:
-            keeper.give_room_up()
-            keeper.stop()
+        for supervisor in self.supervisors:
+            supervisor.give_room_up()
+            supervisor.stop()
         end = time.monotonic() + ENDING
-        for keeper in self.supervisors:
-            keeper.join(max(0.1, end - time.monotonic()))
+        for supervisor in self.supervisors:
+            supervisor.join(max(0.1, end - time.monotonic()))
         with suppress(TedsProvisionError):
             self._rows()
         for sink in self.sinks:
@@ -375,35 +375,35 @@ class Measurement:
         self._look()
 
     def _note_who_never_came(self) -> None:
-        for keeper in self.supervisors:
-            if not keeper.ever_ran and keeper.error is None:
-                keeper.error = NoNodeError(
-                    f"Node {keeper.uuid.hex()} did not answer before the measurement ended.",
+        for supervisor in self.supervisors:
+            if not supervisor.ever_ran and supervisor.error is None:
+                supervisor.error = NoNodeError(
+                    f"Node {supervisor.uuid.hex()} did not answer before the measurement ended.",
                     hint="Check its power, the bit rate and the address.",
                 )
 
     def _ended(self) -> MeasurementEnd:
-        nodes = [_summary(keeper) for keeper in self.supervisors]
-        errors = [keeper.error for keeper in self.supervisors if keeper.error is not None]
+        nodes = [_summary(supervisor) for supervisor in self.supervisors]
+        errors = [supervisor.error for supervisor in self.supervisors if supervisor.error is not None]
         errors += [error for sink in self.sinks if (error := _as_error(sink)) is not None]
         worst = min(errors, key=_rank) if errors else None
         files = [name for sink in self.sinks for name in sink.files]
         sinks = [
             {"sink": sink.name, "written": sink.stats.written, "dropped": sink.stats.dropped} for sink in self.sinks
         ]
-        totals = [totals for keeper in self.supervisors for totals in keeper.streams.totals.values()]
+        totals = [totals for supervisor in self.supervisors for totals in supervisor.streams.totals.values()]
         rates = [rate for each in totals if (rate := each.lower_rate) is not None]
         return MeasurementEnd(nodes, files, worst, self._common_start.spread, sinks, min(rates, default=None))
 
 
-def _summary(keeper: NodeSupervisor) -> dict[str, Any]:
+def _summary(supervisor: NodeSupervisor) -> dict[str, Any]:
     """Return a node of the ``end`` event of ``measure --json``."""
     streams = [
-        asdict(totals) | {"channels": list(totals.channels)} for _, totals in sorted(keeper.streams.totals.items())
+        asdict(totals) | {"channels": list(totals.channels)} for _, totals in sorted(supervisor.streams.totals.items())
     ]
-    node: dict[str, Any] = {"uuid": keeper.uuid.hex(), "streams": streams}
-    if keeper.error is not None:
-        node["error"] = failure_of(keeper.error)
+    node: dict[str, Any] = {"uuid": supervisor.uuid.hex(), "streams": streams}
+    if supervisor.error is not None:
+        node["error"] = failure_of(supervisor.error)
     return node
 
 

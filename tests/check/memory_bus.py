@@ -98,7 +98,7 @@ class MemoryServer(CanServer):
         self._workers = _AtOnce()  # type: ignore[assignment]
         tapped: Callable[[], bool] = lambda: bus.board.tim.identity().state == NodeState.FACTORY  # noqa: E731
         self._endpoints = [CanEndpoint(self._handler, tapped, self._workers, self._out, self._handler)]  # type: ignore[arg-type]
-        self._seat_of = {id(self._handler): self._endpoints[0]}
+        self._endpoint_of = {id(self._handler): self._endpoints[0]}
         self._addresses = self._seated()
         self.own, self.fd = bus.source, False
 

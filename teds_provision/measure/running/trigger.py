@@ -23,22 +23,22 @@ HELD_BACK = 10_000_000  # ns: a controller may hold a frame back while others wi
 # sees it late. The bounds alone are below a millisecond, and would turn away nodes that tell the truth as they know it.
 
 
-def pull(common_start: CommonStart, keepers: Sequence[NodeSupervisor], note: Callable[[str], None]) -> None:
+def pull(common_start: CommonStart, supervisors: Sequence[NodeSupervisor], note: Callable[[str], None]) -> None:
     """Arm every node, send a frame on each bus, read each node's mark: it must meet the time of sending."""
     common_start.triggered()
     token = TriggerToken.draw()
-    armed = _arm(token, keepers, note)
-    ports = {keeper.bus.place: keeper.bus.port for keeper, _ in armed if keeper.bus is not None}
+    armed = _arm(token, supervisors, note)
+    ports = {supervisor.bus.place: supervisor.bus.port for supervisor, _ in armed if supervisor.bus is not None}
     sent = {place: _send(port, token) for place, port in ports.items()}
-    for keeper, trusted in armed:
-        between = sent.get(keeper.bus.place) if keeper.bus is not None else None
+    for supervisor, trusted in armed:
+        between = sent.get(supervisor.bus.place) if supervisor.bus is not None else None
         if between is None:
             continue
-        mark = _mark(keeper, trusted, *between, note)
+        mark = _mark(supervisor, trusted, *between, note)
         if mark is None:
             continue
-        common_start.begun(keeper.uuid, keeper.streams.clock, mark)
-        for heard in list(keeper.streams.running.values()):
+        common_start.begun(supervisor.uuid, supervisor.streams.clock, mark)
+        for heard in list(supervisor.streams.running.values()):
             heard.begin(mark + START_AFTER_MARK)
 
 
@@ -49,40 +49,40 @@ def _send(port: MeasuringLink, token: TriggerToken) -> tuple[int, int] | None:
 
 
 def _arm(
-    token: TriggerToken, keepers: Sequence[NodeSupervisor], note: Callable[[str], None]
+    token: TriggerToken, supervisors: Sequence[NodeSupervisor], note: Callable[[str], None]
 ) -> list[tuple[NodeSupervisor, VerifiedSession]]:
     """Return the nodes that wait for the trigger now."""
     armed = []
-    for keeper in keepers:
-        trusted = keeper.verified
-        if trusted is None or not keeper.ever_ran:
+    for supervisor in supervisors:
+        trusted = supervisor.verified
+        if trusted is None or not supervisor.ever_ran:
             continue
         try:
-            with keeper.turn:
+            with supervisor.turn:
                 trusted.node.request(token.arm(Action.START, TRIGGER_LIFE).command(), "to wait for the trigger")
-            armed.append((keeper, trusted))
+            armed.append((supervisor, trusted))
         except (TedsProvisionError, SessionLostError) as error:
-            note(f"Node {keeper.uuid.hex()} did not accept the trigger: {error}")
+            note(f"Node {supervisor.uuid.hex()} did not accept the trigger: {error}")
     return armed
 
 
 def _mark(
-    keeper: NodeSupervisor, trusted: VerifiedSession, before: int, after: int, note: Callable[[str], None]
+    supervisor: NodeSupervisor, trusted: VerifiedSession, before: int, after: int, note: Callable[[str], None]
 ) -> int | None:
     """Return the tick at which the node saw the trigger, which went out between two times (monotonic ns).
 
     None if it does not report one, or reports a moment at which the frame was not on the bus; such a node is stopped.
     """
     try:
-        with keeper.turn:
-            mark = keeper.streams.tell_time(trusted).mark
+        with supervisor.turn:
+            mark = supervisor.streams.tell_time(trusted).mark
     except (TedsProvisionError, SessionLostError) as error:
-        note(f"Node {keeper.uuid.hex()} did not report when it saw the trigger: {error}")
+        note(f"Node {supervisor.uuid.hex()} did not report when it saw the trigger: {error}")
         return None
-    with keeper.streams.mapping:
-        low, high = keeper.streams.clock.ticks_at(before).low, keeper.streams.clock.ticks_at(after).high
+    with supervisor.streams.mapping:
+        low, high = supervisor.streams.clock.ticks_at(before).low, supervisor.streams.clock.ticks_at(after).high
     if not mark or not mark_is_honest(mark, TickBounds(low, high)):
-        note(f"Node {keeper.uuid.hex()} reported a different time for the trigger, so it was not started.")
-        keeper.stop()
+        note(f"Node {supervisor.uuid.hex()} reported a different time for the trigger, so it was not started.")
+        supervisor.stop()
         return None
     return mark

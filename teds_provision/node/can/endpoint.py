@@ -1,7 +1,7 @@
 """One node on a CAN bus: a StationState for each base station, its answer to everyone, its Announces.
 
 Nothing here is thread-safe: the server of the bus calls it under its lock; only :meth:`StationState.answer` and
-:meth:`StationState.begin_anew` run in the line's turns.
+:meth:`StationState.begin_anew` run in the turns of its station.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class StationState:
     still sends.
     """
 
-    def __init__(self, seat: CanEndpoint, station: int, turns: JobQueue) -> None:
-        self.endpoint, self.station, self.turns = seat, station, turns
+    def __init__(self, endpoint: CanEndpoint, station: int, turns: JobQueue) -> None:
+        self.endpoint, self.station, self.turns = endpoint, station, turns
         self.name = link_name(station)
         self.pairs: dict[int, Pair] = {}
         self.waiting = 0
@@ -72,13 +72,13 @@ class StationState:
 
     def answer(self, request: EndpointRequest) -> bytes:
         """Run a request and return transaction ‖ reply; raises what the node raises."""
-        seat, body = self.endpoint, request.body
+        endpoint, body = self.endpoint, request.body
 
         def run(frame: bytes) -> bytes:
-            tapped = seat.counts_as_tapped()
-            if seat.measuring is None:
-                return seat.handler.request(self.name, frame, tapped=tapped)
-            return seat.measuring.request_received(
+            tapped = endpoint.counts_as_tapped()
+            if endpoint.measuring is None:
+                return endpoint.handler.request(self.name, frame, tapped=tapped)
+            return endpoint.measuring.request_received(
                 self.name, frame, tapped=tapped, fd=request.fd, received=request.received
             )
 
@@ -104,7 +104,7 @@ class CanEndpoint:
         self.uuid, self.max_message = identity.uuid, identity.max_message
         self.claim = AddressClaim(uuid_crc(identity.uuid))
         self._presses = ButtonPresses()
-        self.lines: dict[int, StationState] = {}
+        self.stations: dict[int, StationState] = {}
         self.spoken_from: set[int] = set()
 
     def announce(self) -> None:
@@ -124,42 +124,42 @@ class CanEndpoint:
 
     def pair(self, station: int, own: int) -> tuple[StationState, Pair]:
         """Return the pair of ``own`` and ``station``, made if there is none yet."""
-        line = self.lines.get(station)
-        if line is None:
-            line = self.lines[station] = StationState(self, station, self._workers.turns())
-        pair = line.pairs.get(own)
+        state = self.stations.get(station)
+        if state is None:
+            state = self.stations[station] = StationState(self, station, self._workers.turns())
+        pair = state.pairs.get(own)
         if pair is None:
-            if line.pairs:
-                line.turns.put(line.begin_anew)
-            line.pairs = {at: old for at, old in line.pairs.items() if old.sending}
-            pair = line.pairs[own] = Pair(own, station, lambda frame: self._send(self, frame))
-        return line, pair
+            if state.pairs:
+                state.turns.put(state.begin_anew)
+            state.pairs = {at: old for at, old in state.pairs.items() if old.sending}
+            pair = state.pairs[own] = Pair(own, station, lambda frame: self._send(self, frame))
+        return state, pair
 
-    def reply_left(self, line: StationState) -> None:
+    def reply_left(self, state: StationState) -> None:
         """Handle that the reply on this link is sent, or was abandoned: data may follow."""
-        line.reply_left()
+        state.reply_left()
         if self.measuring is not None:
-            self.measuring.reply_left(line.name)
+            self.measuring.reply_left(state.name)
 
     def move(self, address: int) -> None:
         """Have another address from now on, because another node claimed this one: sessions of the old one end."""
         self.handler.take_can_address(address)
         self.address = address
-        for line in self.lines.values():
-            if line.pairs:
-                line.pairs.clear()
-                line.turns.put(line.begin_anew)
+        for state in self.stations.values():
+            if state.pairs:
+                state.pairs.clear()
+                state.turns.put(state.begin_anew)
 
     def restart(self) -> None:
         """Begin again as after a start of the board: at the durable address, without sessions."""
         self.address = self.handler.can_address()
         self.claim = AddressClaim(self.claim.crc)
         self._presses = ButtonPresses()
-        self.lose_lines()
+        self.lose_stations()
 
-    def lose_lines(self) -> None:
+    def lose_stations(self) -> None:
         """Drop sessions and stored replies: the bus is gone."""
-        lines, self.lines = self.lines, {}
-        for line in lines.values():
-            line.gone = True
-            line.turns.put(line.begin_anew)
+        stations, self.stations = self.stations, {}
+        for state in stations.values():
+            state.gone = True
+            state.turns.put(state.begin_anew)

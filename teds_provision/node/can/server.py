@@ -37,14 +37,20 @@ class EndpointTable:
 
     def __init__(
         self,
-        seats: Sequence[CanEndpoint],
+        endpoints: Sequence[CanEndpoint],
         at_time: Callable[[float, Callable[[], None]], None],
         moved: Callable[[CanEndpoint], None],
         notify: Callable[[str], None],
         *,
         echoes: bool,
     ) -> None:
-        self._endpoints, self._at_time, self._moved, self._notify, self._echoes = seats, at_time, moved, notify, echoes
+        self._endpoints, self._at_time, self._moved, self._notify, self._echoes = (
+            endpoints,
+            at_time,
+            moved,
+            notify,
+            echoes,
+        )
         self._known: set[int] = set()
         self._at: dict[int, list[CanEndpoint]] = {}
         self._moves_due: dict[CanEndpoint, float] = {}
@@ -57,83 +63,83 @@ class EndpointTable:
     def find(self) -> None:
         """Rebuild the table of addresses."""
         self._at = {}
-        for seat in self._endpoints:
-            self._at.setdefault(seat.address, []).append(seat)
+        for endpoint in self._endpoints:
+            self._at.setdefault(endpoint.address, []).append(endpoint)
 
     def heard(self, source: int) -> None:
         """Record that an address is in use: a frame came from it."""
         if 1 <= source <= LAST_NODE and source not in self._known:
             self._known.add(source)
-            for seat in self._endpoints:
-                seat.claim.hear(source)
+            for endpoint in self._endpoints:
+                endpoint.claim.hear(source)
 
-    def speaks(self, seat: CanEndpoint, identifier: int) -> None:
+    def speaks(self, endpoint: CanEndpoint, identifier: int) -> None:
         """Pass a leaving frame of an endpoint to the others of this process, which hear it as one of the bus."""
         source = identifier & 0xFF
-        if source not in seat.spoken_from:
-            seat.spoken_from.add(source)
+        if source not in endpoint.spoken_from:
+            endpoint.spoken_from.add(source)
             for other in self._endpoints:
-                if other is not seat:
+                if other is not endpoint:
                     other.claim.hear(source)
 
     def announce_all(self) -> None:
         """Schedule every endpoint's Announce after its random wait: the bus is there."""
-        for seat in self._endpoints:
-            seat.claim.start(time.monotonic())
-            self._announce_when_due(seat)
+        for endpoint in self._endpoints:
+            endpoint.claim.start(time.monotonic())
+            self._announce_when_due(endpoint)
 
     def announced(self, frame: Frame, speaker: CanEndpoint | None) -> None:
         """Handle an Announce from the bus or from a node of this process (``speaker``)."""
         announce = Announce.decode(frame.identifier, frame.data)
         if announce is None:
             return
-        for seat in list(self.at(announce.address)):
-            own = self._echoes and announce.crc == seat.claim.crc  # given back by a controller that does so
-            if seat is not speaker and not (speaker is None and own):
-                self._contested(seat, announce)
+        for endpoint in list(self.at(announce.address)):
+            own = self._echoes and announce.crc == endpoint.claim.crc  # given back by a controller that does so
+            if endpoint is not speaker and not (speaker is None and own):
+                self._contested(endpoint, announce)
 
-    def announce_again(self, seat: CanEndpoint) -> None:
+    def announce_again(self, endpoint: CanEndpoint) -> None:
         """Schedule the Announce of an endpoint that has started again, maybe at another address."""
         self.find()
-        seat.claim.start(time.monotonic())
-        self._announce_when_due(seat)
+        endpoint.claim.start(time.monotonic())
+        self._announce_when_due(endpoint)
 
-    def _announce_when_due(self, seat: CanEndpoint) -> None:
-        due = seat.claim.due(time.monotonic())
+    def _announce_when_due(self, endpoint: CanEndpoint) -> None:
+        due = endpoint.claim.due(time.monotonic())
         if due is None:
             return
 
         def announce() -> None:
-            if seat.claim.due(due) == due:
-                seat.announce()
+            if endpoint.claim.due(due) == due:
+                endpoint.announce()
 
         self._at_time(due, announce)
 
-    def _contested(self, seat: CanEndpoint, announce: Announce) -> None:
-        now, before, reported = time.monotonic(), seat.address, seat.claim.conflict
-        address = seat.claim.handle_announce(announce, before, now, pinned=seat.handler.actuator_claimed())
-        if (due := seat.claim.move_due) is not None and due != self._moves_due.get(seat):
-            self._moves_due[seat] = due
-            self._at_time(due, functools.partial(self._give_up_address, seat, due))
-        if seat.claim.conflict and not reported:
+    def _contested(self, endpoint: CanEndpoint, announce: Announce) -> None:
+        now, before, reported = time.monotonic(), endpoint.address, endpoint.claim.conflict
+        address = endpoint.claim.handle_announce(announce, before, now, pinned=endpoint.handler.actuator_claimed())
+        if (due := endpoint.claim.move_due) is not None and due != self._moves_due.get(endpoint):
+            self._moves_due[endpoint] = due
+            self._at_time(due, functools.partial(self._give_up_address, endpoint, due))
+        if endpoint.claim.conflict and not reported:
             self._notify(
-                f"Another node announces the UUID {seat.uuid.hex()} (or one of equal CRC-32) "
+                f"Another node announces the UUID {endpoint.uuid.hex()} (or one of equal CRC-32) "
                 f"from the CAN address 0x{before:02x}: disconnect one of them."
             )
-        self._go(seat, address)
+        self._go(endpoint, address)
 
-    def _give_up_address(self, seat: CanEndpoint, due: float) -> None:
+    def _give_up_address(self, endpoint: CanEndpoint, due: float) -> None:
         """Make the move that had to wait, unless the node has left that address meanwhile."""
-        if seat.claim.move_due == due:
-            pinned = seat.handler.actuator_claimed()
-            self._go(seat, seat.claim.move(seat.address, time.monotonic(), pinned=pinned))
+        if endpoint.claim.move_due == due:
+            pinned = endpoint.handler.actuator_claimed()
+            self._go(endpoint, endpoint.claim.move(endpoint.address, time.monotonic(), pinned=pinned))
 
-    def _go(self, seat: CanEndpoint, address: int) -> None:
-        if address != seat.address:
-            self._moved(seat)
-            seat.move(address)
+    def _go(self, endpoint: CanEndpoint, address: int) -> None:
+        if address != endpoint.address:
+            self._moved(endpoint)
+            endpoint.move(address)
             self.find()
-        self._announce_when_due(seat)
+        self._announce_when_due(endpoint)
 
 
 _SPREAD_SECONDS: Final = 0.05
@@ -173,7 +179,7 @@ class CanServer:
         self._bus: Bus | None = None
         self._workers: WorkerPool | None = None
         self._endpoints: list[CanEndpoint] = []
-        self._seat_of: dict[int, CanEndpoint] = {}
+        self._endpoint_of: dict[int, CanEndpoint] = {}
         self._addresses = self._seated()
         self._active: set[tuple[CanEndpoint, Pair]] = set()
         self._pushing: set[tuple[CanEndpoint, Pair]] = set()
@@ -208,7 +214,7 @@ class CanServer:
         self._endpoints = [
             CanEndpoint(node, tapped, self._workers, self._out, more) for node, tapped, more in self._nodes
         ]
-        self._seat_of = {id(seat.handler): seat for seat in self._endpoints}
+        self._endpoint_of = {id(endpoint.handler): endpoint for endpoint in self._endpoints}
         self._addresses = self._seated()
         self._addresses.announce_all()
         self._wake, woken = socket.socketpair()
@@ -216,7 +222,7 @@ class CanServer:
         self._thread.start()
 
     def stop(self) -> None:
-        """Close the bus and end every line; never raises."""
+        """Close the bus and end the state of every station; never raises."""
         self._stop.set()
         if self._thread is not None and self._wake is not None:
             self._wake.close()  # which the loop notices at once
@@ -225,9 +231,9 @@ class CanServer:
         if self._workers is not None:
             self._workers.end()
             self._workers = None
-        for seat in self._endpoints:
-            for line in seat.lines.values():
-                line.begin_anew()
+        for endpoint in self._endpoints:
+            for state in endpoint.stations.values():
+                state.begin_anew()
         self._endpoints = []
         self._addresses = self._seated()
         if self._bus is not None:
@@ -238,10 +244,10 @@ class CanServer:
         echoes = bool(dict(self._spec.options).get("receive_own_messages"))
         return EndpointTable(self._endpoints, self._at_time, self._moves, self._notify, echoes=echoes)
 
-    def _moves(self, seat: CanEndpoint) -> None:
+    def _moves(self, endpoint: CanEndpoint) -> None:
         """End what is under way from an endpoint's old address."""
         for pairs in (self._active, self._pushing):
-            pairs.difference_update([entry for entry in pairs if entry[0] is seat])
+            pairs.difference_update([entry for entry in pairs if entry[0] is endpoint])
 
     def send_data(self, handler: NodeHandler, identifier: int, data: bytes, *, fd: bool) -> None:
         """Put a data frame of a node on the bus; raises LinkError if that is lost.
@@ -249,28 +255,28 @@ class CanServer:
         The bus may take its time over it: frames of others are received meanwhile.
         """
         with self._lock:
-            seat, bus = self._seat_of.get(id(handler)), self._bus
-            if seat is None or bus is None or self._stop.is_set():
+            endpoint, bus = self._endpoint_of.get(id(handler)), self._bus
+            if endpoint is None or bus is None or self._stop.is_set():
                 return
-            self._addresses.speaks(seat, identifier)
+            self._addresses.speaks(endpoint, identifier)
         with self._sending:
             bus.send(Frame(identifier, data, fd))
 
     def restarted(self, handler: NodeHandler) -> None:
         """Begin again with a node that has restarted."""
         with self._lock:
-            seat = self._seat_of.get(id(handler))
-            if seat is None or self._stop.is_set():
+            endpoint = self._endpoint_of.get(id(handler))
+            if endpoint is None or self._stop.is_set():
                 return
-            self._moves(seat)
-            seat.restart()
-            self._addresses.announce_again(seat)
+            self._moves(endpoint)
+            endpoint.restart()
+            self._addresses.announce_again(endpoint)
 
     def announce_press(self, handler: NodeHandler) -> None:
         """Announce at once that a node's button was pressed."""
         with self._lock:
-            if (seat := self._seat_of.get(id(handler))) is not None:
-                self._at_time(time.monotonic(), seat.announce_press)
+            if (endpoint := self._endpoint_of.get(id(handler))) is not None:
+                self._at_time(time.monotonic(), endpoint.announce_press)
 
     # -- the loop --------------------------------------------------------------------------------------------------
 
@@ -282,7 +288,7 @@ class CanServer:
                     self._serve_one(woken)
                 except LinkError:
                     with self._lock:
-                        self._lose_lines()
+                        self._lose_stations()
                     if time.monotonic() - came_back > 2 * _LAST_REOPEN:
                         reopen = _FIRST_REOPEN
                     self._reopen(reopen)
@@ -317,36 +323,36 @@ class CanServer:
         look_round = now - self._looked >= _LOOK_ROUND
         if look_round:
             self._looked = now
-        for seat, pair in list(self._active if look_round else self._pushing):
+        for endpoint, pair in list(self._active if look_round else self._pushing):
             if look_round or pair.due_in(1.0) <= 0:
                 pair.run()
-                self._note(seat, pair)
+                self._note(endpoint, pair)
 
-    def _note(self, seat: CanEndpoint, pair: Pair) -> None:
+    def _note(self, endpoint: CanEndpoint, pair: Pair) -> None:
         """Look after a pair while a message of either side is under way, and closely while we send."""
         for pairs, belongs in (
             (self._active, pair.sending or pair.receiving),
             (self._pushing, pair.sending and not pair.waits_for_flow),
         ):
             if belongs:
-                pairs.add((seat, pair))
+                pairs.add((endpoint, pair))
             else:
-                pairs.discard((seat, pair))
-        line = seat.lines.get(pair.peer)
-        if line is not None and line.replying is pair and not pair.sending:
-            seat.reply_left(line)
+                pairs.discard((endpoint, pair))
+        state = endpoint.stations.get(pair.peer)
+        if state is not None and state.replying is pair and not pair.sending:
+            endpoint.reply_left(state)
 
     def _at_time(self, due: float, job: Callable[[], None]) -> None:
         heapq.heappush(self._later, (due, next(self._number), job))
 
-    def _out(self, seat: CanEndpoint, frame: Frame) -> None:
+    def _out(self, endpoint: CanEndpoint, frame: Frame) -> None:
         """Put a node's frame on the bus."""
         assert self._bus is not None
         with self._sending:
             self._bus.send(frame)
-        self._addresses.speaks(seat, frame.identifier)
+        self._addresses.speaks(endpoint, frame.identifier)
         if is_announce(frame.identifier):
-            self._addresses.announced(frame, seat)
+            self._addresses.announced(frame, endpoint)
 
     # -- frames ----------------------------------------------------------------------------------------------------
 
@@ -362,91 +368,91 @@ class CanServer:
         if frame.identifier & 0x1FFFFF00 == FUNCTIONAL:
             body = read_single(frame.data)
             if body is not None and body[1:] == IDENTIFY.encode():  # nothing else that is asked of everyone is answered
-                for seat in self._endpoints:
-                    self._everyone(seat, station, body[:1], fd=frame.fd)
+                for endpoint in self._endpoints:
+                    self._everyone(endpoint, station, body[:1], fd=frame.fd)
             return
         ends = addresses(frame.identifier)
         if ends is None:
             self._measuring_frame(station, frame)
             return
         own = ends[0]
-        for seat in self._addresses.at(own):
-            line, pair = seat.pair(station, own)
-            self._request(seat, line, pair, frame)
+        for endpoint in self._addresses.at(own):
+            state, pair = endpoint.pair(station, own)
+            self._request(endpoint, state, pair, frame)
         if frame.data and frame.data[0] >> 4 == _FLOW_CONTROL:
             # A reply that is still leaving from the address before 128.10 needs its flow control.
-            for seat, pair in list(self._active):
-                if pair.own == own and pair.peer == station and seat.address != own and pair.sending:
+            for endpoint, pair in list(self._active):
+                if pair.own == own and pair.peer == station and endpoint.address != own and pair.sending:
                     pair.handle_frame(frame)
-                    self._note(seat, pair)
+                    self._note(endpoint, pair)
 
-    def _request(self, seat: CanEndpoint, line: StationState, pair: Pair, frame: Frame) -> None:
+    def _request(self, endpoint: CanEndpoint, state: StationState, pair: Pair, frame: Frame) -> None:
         begun = Reassembly.begin(pair.peer, frame)
-        if begun is not None and begun.length > seat.max_message + 1:  # refused in place of a flow control
+        if begun is not None and begun.length > endpoint.max_message + 1:  # refused in place of a flow control
             answer = single(bytes(begun.octets[:1]) + refusal(Reason.TOO_LARGE).encode(), fd=frame.fd)
-            self._out(seat, Frame(physical_id(pair.peer, pair.own), answer, frame.fd))
+            self._out(endpoint, Frame(physical_id(pair.peer, pair.own), answer, frame.fd))
             return
         pair.handle_frame(frame)
         while (body := pair.received()) is not None:
             if pair.waits_for_flow:
                 pair.stop_sending()  # a station that repeats its request has not taken that answer
-            received = seat.measuring.tick(frame.at) if seat.measuring is not None else 0
-            line.put(functools.partial(self._run_request, line, pair, EndpointRequest(body, frame.fd, received)))
-        self._note(seat, pair)
+            received = endpoint.measuring.tick(frame.at) if endpoint.measuring is not None else 0
+            state.put(functools.partial(self._run_request, state, pair, EndpointRequest(body, frame.fd, received)))
+        self._note(endpoint, pair)
 
     def _measuring_frame(self, station: int, frame: Frame) -> None:
         """Handle a trigger, whose tick is that of its arrival for every node, or a Drive frame."""
         if trigger_station(frame.identifier) == station:
-            nodes = [seat.measuring for seat in self._endpoints if seat.measuring is not None]
+            nodes = [endpoint.measuring for endpoint in self._endpoints if endpoint.measuring is not None]
             for node, tick in [(node, node.tick(frame.at)) for node in nodes]:
                 node.trigger(link_name(station), frame.data, tick)
         elif (address := drive_address(frame.identifier)) is not None:
-            for seat in self._addresses.at(address.node):
-                if seat.measuring is not None:
-                    seat.measuring.drive(link_name(station), frame.data)
+            for endpoint in self._addresses.at(address.node):
+                if endpoint.measuring is not None:
+                    endpoint.measuring.drive(link_name(station), frame.data)
 
-    def _run_request(self, line: StationState, pair: Pair, request: EndpointRequest) -> None:
+    def _run_request(self, state: StationState, pair: Pair, request: EndpointRequest) -> None:
         """Run one request in the turn of its node and send the reply from the address that was asked."""
         try:
-            reply = line.answer(request)
+            reply = state.answer(request)
         except TedsProvisionError:
             return  # a node in trouble (its flash file is gone) is silent
         finally:
             with self._lock:
-                line.waiting -= 1
+                state.waiting -= 1
         with self._lock:
-            if line.endpoint.address != line.endpoint.handler.can_address():  # 128.10
-                line.endpoint.address = line.endpoint.handler.can_address()
-                line.endpoint.claim.relocated()
+            if state.endpoint.address != state.endpoint.handler.can_address():  # 128.10
+                state.endpoint.address = state.endpoint.handler.can_address()
+                state.endpoint.claim.relocated()
                 self._addresses.find()
-            if self._stop.is_set() or line.gone or line.pairs.get(pair.own) is not pair:
+            if self._stop.is_set() or state.gone or state.pairs.get(pair.own) is not pair:
                 return  # lost meanwhile
-            self._end_answer_to_everyone(line, pair)
+            self._end_answer_to_everyone(state, pair)
             try:
                 pair.send(reply)
             except LinkError:
                 return  # the reading thread meets the same failure and deals with it
-            line.replying = pair
-            self._note(line.endpoint, pair)
+            state.replying = pair
+            self._note(state.endpoint, pair)
 
     # -- everyone --------------------------------------------------------------------------------------------------
 
-    def _everyone(self, seat: CanEndpoint, station: int, transaction: bytes, *, fd: bool) -> None:
+    def _everyone(self, endpoint: CanEndpoint, station: int, transaction: bytes, *, fd: bool) -> None:
         """Answer a functional Identify after a random wait; a newer one of the same station takes its place."""
-        own = seat.address
-        line, _ = seat.pair(station, own)
-        number = self._everyone_due[line] = next(self._number)
+        own = endpoint.address
+        state, _ = endpoint.pair(station, own)
+        number = self._everyone_due[state] = next(self._number)
 
         def answer() -> None:
-            if self._everyone_due.get(line) != number or line.gone or seat.address != own:
+            if self._everyone_due.get(state) != number or state.gone or endpoint.address != own:
                 return
-            if line.replying is not None:
+            if state.replying is not None:
                 # A reply ends within N_Bs even if its station was killed. Answers queued behind it would be late for
                 # good: each would wait for the one before, and the station drops what answers an older question.
                 self._at_time(time.monotonic() + _SPREAD_SECONDS, answer)
                 return
-            del self._everyone_due[line]
-            self._answer_everyone(seat, station, own, transaction, fd=fd)
+            del self._everyone_due[state]
+            self._answer_everyone(endpoint, station, own, transaction, fd=fd)
 
         self._at_time(time.monotonic() + self._spread(), answer)
 
@@ -454,28 +460,28 @@ class CanServer:
         """Seconds to wait before an answer to everyone."""
         return random.uniform(0, _SPREAD_SECONDS)
 
-    def _answer_everyone(self, seat: CanEndpoint, station: int, own: int, transaction: bytes, *, fd: bool) -> None:
-        """Send the answer; the stored reply stays, and no reply of this line is under way."""
-        line, pair = seat.pair(station, own)
-        self._end_answer_to_everyone(line, pair)
+    def _answer_everyone(self, endpoint: CanEndpoint, station: int, own: int, transaction: bytes, *, fd: bool) -> None:
+        """Send the answer; the stored reply stays, and no reply of this station is under way."""
+        state, pair = endpoint.pair(station, own)
+        self._end_answer_to_everyone(state, pair)
         pair.speak(fd=fd)
-        pair.send(transaction + Reply(True, seat.handler.identify()).encode())
-        self._note(seat, pair)
+        pair.send(transaction + Reply(True, endpoint.handler.identify()).encode())
+        self._note(endpoint, pair)
 
-    def _end_answer_to_everyone(self, line: StationState, pair: Pair) -> None:
+    def _end_answer_to_everyone(self, state: StationState, pair: Pair) -> None:
         """Abandon a broadcast answer without flow control; a reply to this station alone is kept."""
-        if pair.waits_for_flow and line.replying is not pair:
+        if pair.waits_for_flow and state.replying is not pair:
             pair.stop_sending()
 
     # -- losses ----------------------------------------------------------------------------------------------------
 
-    def _lose_lines(self) -> None:
+    def _lose_stations(self) -> None:
         self._active.clear()
         self._pushing.clear()
         self._later.clear()
         self._everyone_due.clear()
-        for seat in self._endpoints:
-            seat.lose_lines()
+        for endpoint in self._endpoints:
+            endpoint.lose_stations()
 
     def _reopen(self, seconds: float) -> None:
         if self._bus is not None:
