@@ -48,6 +48,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copytree(ROOT / part, folder / part)  # what is compiled as well
     for part in ("include", "src"):  # the rules read the C library, too
         shutil.copytree(ROOT / "firmware" / part, folder / "firmware" / part)
+    shutil.copy(ROOT / "firmware" / "README.md", folder / "firmware")
     for file in ("pyproject.toml", "Makefile"):
         shutil.copy(ROOT / file, folder)
     follow((ROOT / "docs" / "extending.md").read_text(), folder)

@@ -78,4 +78,4 @@ def test_a_rate_that_can_be_carried_is_a_preset_and_a_lower_one_after_losses(
             card.get_by_text(re.compile("running")).first.wait_for()
             with opened(browser, fresh, width=width, route=f"nodes/{node.uuid}/live") as after:
                 after.get_by_text("Stop it there").wait_for()
-                assert after.locator(".rate-hint").is_hidden(), "the group's card is the place"
+                after.locator(".rate-hint").wait_for(state="hidden")  # the group's card is the place

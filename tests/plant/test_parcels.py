@@ -12,6 +12,7 @@ import pytest
 
 from teds_provision.handover import incoming, life, outgoing
 from teds_provision.plant import parcels, sign_requests
+from teds_provision.plant.commands import parcels as commands_of_parcels
 from teds_provision.plant.transport import Parcel
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import CONTENT_TYPE
@@ -170,7 +171,7 @@ def test_a_person_takes_in_what_waits_and_nothing_else_than_was_shown(
         life.revoke(south, one, "stolen")
         return plan
 
-    monkeypatch.setattr(incoming, "plan_import", and_another_revokes)
+    monkeypatch.setattr(commands_of_parcels, "plan_import", and_another_revokes)
     done = call(tmp_path / "south", "--json", "import-keys", "--received", "--yes")
     assert (done.code, "changed the plan" in done.out) == (6, True)
     assert (holds(south, one), holds(south, other)) == ([], [])
