@@ -26,6 +26,7 @@ from urllib.parse import quote, urlencode, urlsplit
 
 from teds_provision.errors import EXIT_CODES, LinkError, PolicyError, TedsProvisionError, UsageError
 from teds_provision.files import short_path
+from teds_provision.shapes.measurement import MeasurementMembers
 from teds_provision.shapes.problem import problem_in
 
 if TYPE_CHECKING:
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
         Update,
     )
     from teds_provision.api.bodies import Mode
-    from teds_provision.shapes.measurement import MeasurementMembers
 
 API: Final = "/api/v1"
 SOCKET: Final = "ncap.sock"

@@ -18,14 +18,13 @@ from teds_provision.cli.context import SOCKET, App
 from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.files import require_no_pipe
 from teds_provision.lazy import late
-from teds_provision.links import LINKS, LinkSettings
+from teds_provision.links import LINKS, LinkSettings, Trace
 from teds_provision.links.ports import LISTEN_SECONDS
 from teds_provision.protocol.fingerprints import read_fingerprint
 from teds_provision.teds.certificate import split_channel
 
 if TYPE_CHECKING:
     from teds_provision import client
-    from teds_provision.links import Trace
     from teds_provision.measure.sinks import foxglove_server
     from teds_provision.trace import recorder
 else:

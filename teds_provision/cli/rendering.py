@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from teds_provision.cli.context import App
 from teds_provision.errors import TedsProvisionError, UsageError
+from teds_provision.links import Notice
 from teds_provision.provisioning.progress import FAILED, NOTHING, SKIPPED, Reporter, SilentReporter, StepResult
 from teds_provision.sanitize import sanitize
 from teds_provision.shapes.problem import problem_of
@@ -23,8 +25,6 @@ if TYPE_CHECKING:
     from rich.live import Live
     from rich.table import Table
 
-    from teds_provision.cli.context import App
-    from teds_provision.links import Notice
 
 _PIPE_COLUMNS = 1000
 _MARKS = {NOTHING: "·", SKIPPED: "–", FAILED: "✗"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from shlex import quote
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -15,13 +15,10 @@ from teds_provision.doctor import fleet
 from teds_provision.doctor.checks import System
 from teds_provision.errors import LinkError, NotFoundError, TedsProvisionError
 from teds_provision.links import LinkSettings
-from teds_provision.measure.link_survey import look, readers
+from teds_provision.measure.link_survey import LinkSurvey, look, readers
 from teds_provision.provisioning.inventory import inventory, search
 from teds_provision.sanitize import sanitize
-
-if TYPE_CHECKING:
-    from teds_provision.measure.link_survey import LinkSurvey
-    from teds_provision.station.station import Station
+from teds_provision.station.station import Station
 
 _SHOWN = 20
 

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.handover.deny import deny
 from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.handover.revocation import seal_revocation
 from teds_provision.protocol.handover.strict_json import is_label
+from teds_provision.provisioning.agree import ResetReceipt
 from teds_provision.provisioning.build import BuildOrder, build
 from teds_provision.station.measurements import HandedOn
 from teds_provision.station.station import Station
 from teds_provision.station.store import NodeRecord, RevocationRecord
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import BlockId, Image
-
-if TYPE_CHECKING:
-    from teds_provision.provisioning.agree import ResetReceipt
 
 DECOMMISSIONED = "decommissioned"
 REPLACED = "replaced by"

@@ -7,7 +7,6 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, UsageError
 from teds_provision.files import read_limited
@@ -19,12 +18,9 @@ from teds_provision.station.station import Station
 from teds_provision.station.store import StoreLock, TrustRecord
 from teds_provision.station.store.database import has_store
 from teds_provision.station.store.records import TrustRole
+from teds_provision.vault.base import Ask, Vault
 from teds_provision.vault.ca_file import read_ca
 from teds_provision.vault.selection import asked_first, create_vault
-
-if TYPE_CHECKING:
-    from teds_provision.vault.base import Ask, Vault
-
 
 # One CA for several stations: a station asks, the CA's keeper signs (profile.md, "Keys and trust").
 #

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import NotFoundError
 from teds_provision.lazy import late
+from teds_provision.teds.codec.model import Units
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
     from teds_provision.measure.blocks import Block, ChannelFacts
     from teds_provision.teds.calibration.model import Calibration
-    from teds_provision.teds.codec.model import Units
 else:
     np = late("numpy")
 

@@ -19,6 +19,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.lazy import late
+from teds_provision.measure.blocks import Block, ChannelFacts
 from teds_provision.measure.sinks.lines import plain
 from teds_provision.ncap.history import History, raw_numbers
 from teds_provision.ncap.sinks import for_readers
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from teds_provision.measure.blocks import Block, ChannelFacts
 else:
     np = late("numpy")
 

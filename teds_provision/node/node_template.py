@@ -6,13 +6,13 @@ import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadDataError
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
 from teds_provision.node.flash_file import FILE, FlashFile
 from teds_provision.node.hardware.board import Board
+from teds_provision.node.wrapped.description import WrappedSensor
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.teds.formats import UUID_OCTETS, placed, stated_uuid, under
 from teds_provision.teds.image import SECURITY, BlockId, Image
@@ -20,9 +20,6 @@ from teds_provision.teds.origin import ORIGIN
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.profile.model import renamed
 from teds_provision.teds.sheet import Sheet
-
-if TYPE_CHECKING:
-    from teds_provision.node.wrapped.description import WrappedSensor
 
 
 @dataclass(frozen=True)

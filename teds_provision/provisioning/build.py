@@ -44,6 +44,7 @@ from teds_provision.sanitize import printable
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store import Draft, NodeRecord
+from teds_provision.teds.calibration import Calibration
 from teds_provision.teds.certificate import CertificateChoice, CertificateReference, ChooseItem
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
@@ -59,9 +60,6 @@ from teds_provision.teds.profile.load import (
 )
 from teds_provision.teds.profile.reader import NAME_OCTETS
 from teds_provision.teds.sheet import Sheet, described
-
-if TYPE_CHECKING:
-    from teds_provision.teds.calibration import Calibration
 
 if TYPE_CHECKING:
     from teds_provision.teds import calibration

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadDataError, DatasheetChangedError
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
@@ -24,13 +23,11 @@ from teds_provision.provisioning.verify_node import judge_and_keep
 from teds_provision.provisioning.write import write
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
+from teds_provision.teds.calibration import Calibration
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.formats import stated_uuid, under
 from teds_provision.teds.image import BlockId, Image
-
-if TYPE_CHECKING:
-    from teds_provision.teds.calibration import Calibration
 
 
 @dataclass(frozen=True)

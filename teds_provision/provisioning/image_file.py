@@ -5,19 +5,17 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from teds_provision.errors import BadDataError, NotFoundError, TedsProvisionError
 from teds_provision.files import read_limited
 from teds_provision.provisioning.calibration_guard import guard
 from teds_provision.provisioning.verify import require_authentic, verify_image
 from teds_provision.shapes.verdict import Verification
+from teds_provision.station.firmware import KnownFirmware
 from teds_provision.station.station import Station
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import Image
-
-if TYPE_CHECKING:
-    from teds_provision.station.firmware import KnownFirmware
 
 MAX_IMAGE_OCTETS: Final = 16 << 20
 

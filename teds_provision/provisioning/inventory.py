@@ -16,12 +16,12 @@ from teds_provision.errors import NotFoundError, PolicyError
 from teds_provision.lazy import late
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.shapes.node import KnownNode
+from teds_provision.shapes.verdict import NodeVerdict
 from teds_provision.station.overview import NodeOverview, Search
 from teds_provision.station.station import Station
 
 if TYPE_CHECKING:
     from teds_provision.provisioning import readings
-    from teds_provision.shapes.verdict import NodeVerdict
     from teds_provision.station import firmware
     from teds_provision.station.firmware import KnownFirmware
     from teds_provision.teds.fits import Fit, Requirement

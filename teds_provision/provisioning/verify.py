@@ -15,6 +15,7 @@ from teds_provision.protocol.keys import fingerprint, node_key_good
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.wire_agreement import other_key
 from teds_provision.shapes.verdict import FRESHNESS, PAGES, SESSION, Check, Verification
+from teds_provision.station.plant.plant import SignerRules
 from teds_provision.station.station import Station
 from teds_provision.station.store import RevocationRecord, WhitelistEntry
 from teds_provision.teds.codec import security
@@ -24,7 +25,6 @@ from teds_provision.teds.image import SECURITY, BlockId, Image
 
 if TYPE_CHECKING:
     from teds_provision.protocol.plant.signer import SignerVerdict
-    from teds_provision.station.plant.plant import SignerRules
 
 # -- what it is judged by: a station's keys, pins and deny list, asked one by one or remembered for many ---------------
 

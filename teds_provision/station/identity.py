@@ -15,10 +15,10 @@ from teds_provision.station.store.database import places
 from teds_provision.station.store.records import StationRecord
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
+from teds_provision.vault.base import Vault
 
 if TYPE_CHECKING:
     from teds_provision.protocol import wire_agreement
-    from teds_provision.vault.base import Vault
     from teds_provision.vault.master import MasterKeys
 else:  # the codec of the TEDS: not for commands that only list
     wire_agreement = late("teds_provision.protocol.wire_agreement")

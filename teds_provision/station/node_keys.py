@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime, timedelta
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from teds_provision.errors import (
     KeyringUnavailableError,
@@ -24,10 +24,7 @@ from teds_provision.station.store.database import chunks, places
 from teds_provision.station.store.records import Holder, KeyFlags, KeyRecord, KeySource, utc_now
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
-from teds_provision.vault.base import node_key_context
-
-if TYPE_CHECKING:
-    from teds_provision.vault.base import Vault
+from teds_provision.vault.base import Vault, node_key_context
 
 MAX_PENDING = 8
 """So many keys of one node may wait for their proof at a time (issue 7 L4)."""

@@ -12,13 +12,11 @@ from __future__ import annotations
 
 import hmac
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from teds_provision.errors import StoreChangedError
 from teds_provision.station.store.row_sample import RowSample
-
-if TYPE_CHECKING:
-    from teds_provision.vault.base import Vault
+from teds_provision.vault.base import Vault
 
 MAC_OCTETS: Final = 16
 KEY_OCTETS: Final = 32

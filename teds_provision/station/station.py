@@ -61,12 +61,11 @@ from teds_provision.station.store.background_writer import BackgroundWriter
 from teds_provision.station.store.database import has_store
 from teds_provision.station.store.dump import RowSource, dump, load
 from teds_provision.station.store.row_sample import RowSample
-from teds_provision.vault.base import node_key_context
+from teds_provision.vault.base import Ask, Vault, node_key_context
 
 if TYPE_CHECKING:
     from teds_provision.protocol import wire_agreement
     from teds_provision.vault import master_socket, selection
-    from teds_provision.vault.base import Ask, Vault
     from teds_provision.vault.master import MasterKeys
 else:
     # cryptography, sockets and processes: `nodes` and others open no vault

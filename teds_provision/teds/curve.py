@@ -15,6 +15,7 @@ from teds_provision.teds.calibration.samples import Range
 from teds_provision.teds.channel import TURN, spans_a_turn
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.image import BlockId
+from teds_provision.teds.profile.model import Profile
 from teds_provision.teds.sheet import described
 from teds_provision.teds.units import WrittenUnit, display_unit, format_value
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from teds_provision.teds.profile.model import Profile
 else:
     np = late("numpy")
 

@@ -13,7 +13,7 @@ from teds_provision.teds.calibration.model import Calibration, from_decoded, is_
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import AccessCode, DecodedTeds, Field, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of, table
-from teds_provision.teds.curve import channel_of, curve_of
+from teds_provision.teds.curve import Curve, CurveChannel, channel_of, curve_of
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.sheet import described, name_among
 from teds_provision.teds.show import Context, meaning_of, text_of
@@ -21,7 +21,6 @@ from teds_provision.teds.show import Context, meaning_of, text_of
 if TYPE_CHECKING:
     import numpy as np
 
-    from teds_provision.teds.curve import Curve, CurveChannel
 else:
     np = late("numpy")
 

@@ -21,12 +21,9 @@ from teds_provision.teds.calibration.samples import Range
 from teds_provision.teds.channel import TURN, Channel
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import AccessCode, DecodedTeds
-from teds_provision.teds.curve import FLOAT32_STEP, Curve, channel_of, curve_of
+from teds_provision.teds.curve import FLOAT32_STEP, Curve, CurveChannel, channel_of, curve_of
 from teds_provision.teds.image import BlockId
-
-if TYPE_CHECKING:
-    from teds_provision.teds.curve import CurveChannel
-    from teds_provision.teds.profile.model import ChannelProfile, Profile
+from teds_provision.teds.profile.model import ChannelProfile, Profile
 
 if TYPE_CHECKING:
     import numpy as np

@@ -18,15 +18,14 @@ from teds_provision.lazy import how_to_install, late
 from teds_provision.teds.calibration.formula import kind_of, residuals
 from teds_provision.teds.calibration.model import Calibration, is_sound
 from teds_provision.teds.channel import TURN, wrapped
-from teds_provision.teds.curve import channel_of, curve_of
+from teds_provision.teds.curve import Curve, CurveChannel, channel_of, curve_of
 from teds_provision.teds.image import BlockId
+from teds_provision.teds.profile.model import Profile
 from teds_provision.teds.sheet import Sheet, name_among
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from teds_provision.teds.curve import Curve, CurveChannel
-    from teds_provision.teds.profile.model import Profile
 else:
     np = late("numpy")
 

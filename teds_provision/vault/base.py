@@ -7,8 +7,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+from teds_provision.protocol.keys import PrivateKey
+
 if TYPE_CHECKING:
-    from teds_provision.protocol.keys import PrivateKey
     from teds_provision.vault.master import MasterKeys
 
 Ask = Callable[[str, bool], str]

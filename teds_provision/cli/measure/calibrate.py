@@ -29,13 +29,13 @@ from teds_provision.errors import UsageError
 from teds_provision.files import SHARED, read_text, write_whole
 from teds_provision.limits import LIMITS
 from teds_provision.links import LinkSettings
+from teds_provision.teds.calibration import Calibration
 from teds_provision.teds.calibration.model import METHODS
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from teds_provision.measure.zero import ZeroResult
-    from teds_provision.teds.calibration import Calibration
 
 _NEGATIVE: dict[str, Any] = {"ignore_unknown_options": True}  # -0.5 is a value, and no option
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples, yes_option
 from teds_provision.station.groups import Groups
-
-if TYPE_CHECKING:
-    from teds_provision.station.store.records import Group
+from teds_provision.station.store.records import Group
 
 
 @click.group(

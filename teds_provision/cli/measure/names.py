@@ -13,11 +13,11 @@ from teds_provision.cli.options import COMMAND_SETTINGS, ChannelName, command, d
 from teds_provision.errors import NotFoundError, UsageError
 from teds_provision.station.measurements import STATION
 from teds_provision.station.shown_units import channel_profiles
+from teds_provision.station.station import Station
 
 if TYPE_CHECKING:
     from teds_provision.measure.blocks import ChannelFacts
     from teds_provision.measure.sinks.names import Topics
-    from teds_provision.station.station import Station
 
 
 @click.group(

@@ -23,12 +23,12 @@ from teds_provision.cli.options import (
 )
 from teds_provision.errors import NotFoundError
 from teds_provision.lazy import late
+from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
 from teds_provision.sanitize import counted
 
 if TYPE_CHECKING:
     from teds_provision.cli import rendering
     from teds_provision.cli.measure import measure_view
-    from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
     from teds_provision.measure.display_units import FileUnits
     from teds_provision.measure.recordings.source import Entry, Recording
     from teds_provision.measure.recordings.summary import RecordingSummary

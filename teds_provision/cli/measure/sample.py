@@ -20,8 +20,10 @@ from teds_provision.cli.rendering import print_table, reporter_for, shown, tidy
 from teds_provision.cli.shape_options import measurement_option
 from teds_provision.errors import NodeRefusedError, UsageError
 from teds_provision.links import LinkSettings
-from teds_provision.protocol.operation.commands import POWER, ChannelState, PowerReply, bit_words
+from teds_provision.protocol.operation.commands import POWER, ChannelState, OperationReply, PowerReply, bit_words
+from teds_provision.provisioning.conversation import Conversation
 from teds_provision.teds.channel import within_turn
+from teds_provision.teds.sheet import Channel
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -29,11 +31,8 @@ if TYPE_CHECKING:
     from teds_provision.measure.held_actuator import AppliedSetPoint
     from teds_provision.measure.sampling import Sample
     from teds_provision.measure.verified_session import VerifiedSession
-    from teds_provision.protocol.operation.commands import OperationReply, PowerReply
-    from teds_provision.provisioning.conversation import Conversation
     from teds_provision.provisioning.meeting import IdleStop
     from teds_provision.station.station import Station
-    from teds_provision.teds.sheet import Channel
 
 
 def over_the_bus(links: LinkSettings, *, streams: bool = False) -> LinkSettings:

@@ -13,15 +13,14 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import firmware_words, reporter_for
 from teds_provision.errors import UsageError
-from teds_provision.links import LinkSettings
+from teds_provision.links import LinkSettings, Notice
 from teds_provision.protocol.announce import LAST_ADDRESS
 from teds_provision.protocol.messages.firmware import LOCATE_SECONDS
+from teds_provision.provisioning.progress import Reporter, StepResult
 from teds_provision.station.store import utc_now
 
 if TYPE_CHECKING:
-    from teds_provision.links import Notice
     from teds_provision.provisioning.identify import ProvenNode
-    from teds_provision.provisioning.progress import Reporter, StepResult
 
 
 # -- identify ----------------------------------------------------------------------------------------------------------

@@ -31,11 +31,11 @@ from teds_provision.errors import UsageError
 from teds_provision.files import SHARED, read_limited, write_whole
 from teds_provision.lazy import late
 from teds_provision.links import LinkSettings
+from teds_provision.teds.certificate import CertificateReference
 
 if TYPE_CHECKING:
     from teds_provision.cli import terminal_operator
     from teds_provision.provisioning.write import WriteResult
-    from teds_provision.teds.certificate import CertificateReference
 else:  # loads the steps
     terminal_operator = late("teds_provision.cli.terminal_operator")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -13,15 +13,12 @@ from teds_provision.cli.options import command, dry_run_option, link_options, li
 from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import FrozenError, LinkError, PolicyError
 from teds_provision.handover import deny, life
-from teds_provision.handover.life import hand_on, is_finished, plan_takeover, retire, take_over
+from teds_provision.handover.life import TakeoverPlan, hand_on, is_finished, plan_takeover, retire, take_over
 from teds_provision.links import LinkSettings
+from teds_provision.provisioning.agree import ResetReceipt
 from teds_provision.sanitize import counted
-
-if TYPE_CHECKING:
-    from teds_provision.handover.life import TakeoverPlan
-    from teds_provision.provisioning.agree import ResetReceipt
-    from teds_provision.station.measurements import HandedOn
-    from teds_provision.station.station import Station
+from teds_provision.station.measurements import HandedOn
+from teds_provision.station.station import Station
 
 
 @command('teds-provision revoke 8d4d --why "stolen with the arm"', "teds-provision revoke --lift 8d4d --yes")

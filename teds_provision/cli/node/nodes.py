@@ -30,11 +30,10 @@ from teds_provision.optional_rooms import Hook
 from teds_provision.provisioning.inventory import STATES, inventory, search
 from teds_provision.sanitize import by_name
 from teds_provision.station.label import label_of, write_label
+from teds_provision.station.station import Station
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-    from teds_provision.station.station import Station
 
 
 class NodeView(Protocol):

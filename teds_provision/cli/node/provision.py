@@ -20,27 +20,25 @@ from teds_provision.cli.node.build import calibration_json, order_options
 from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, options_given, yes_option
 from teds_provision.cli.rendering import firmware_words, print_table, reporter_for
 from teds_provision.errors import TedsProvisionError, UsageError, WrongImageError
+from teds_provision.firmware_image import FirmwareImage
 from teds_provision.lazy import late
-from teds_provision.links import LinkSettings
+from teds_provision.links import LinkSettings, Notice
 from teds_provision.provisioning.progress import Reporter, StepResult
 from teds_provision.sanitize import sanitize
 from teds_provision.shapes.problem import problem_of
 from teds_provision.station.firmware import firmware_of
 from teds_provision.station.shown_units import shown_units
-from teds_provision.station.summary import summarise
+from teds_provision.station.station import Station
+from teds_provision.station.summary import NodeSummary, summarise
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from teds_provision.cli import terminal_operator
-    from teds_provision.firmware_image import FirmwareImage
-    from teds_provision.links import Notice
     from teds_provision.provisioning.batch import BatchRun, ProvisionPlan, ProvisionRequest
     from teds_provision.provisioning.batch_sheet import BoardResult, SheetRow
     from teds_provision.provisioning.operator import Operator
     from teds_provision.provisioning.provision import ProductionLine, ProvisionResult
-    from teds_provision.station.station import Station
-    from teds_provision.station.summary import NodeSummary
 else:  # loads the steps
     terminal_operator = late("teds_provision.cli.terminal_operator")
 

@@ -29,9 +29,9 @@ from teds_provision.protocol.messages.message import Argument, Message, decode_m
 from teds_provision.sanitize import sanitize
 from teds_provision.teds import convert, decode
 from teds_provision.teds.codec.model import AccessCode, Conformity, DecodedTeds, Edition, Finding, TimeInstance
-from teds_provision.teds.formats import Kind, TedsBlock, class_of, detect, read_blocks, with_class
+from teds_provision.teds.formats import Format, Kind, TedsBlock, class_of, detect, read_blocks, with_class
 from teds_provision.teds.formats.jsonform import FORMAT, value_to_json
-from teds_provision.teds.guard import check_calibration
+from teds_provision.teds.guard import GuardFinding, check_calibration
 from teds_provision.teds.show import (
     ShownField,
     ShownTeds,
@@ -51,8 +51,6 @@ if TYPE_CHECKING:
     from teds_provision.protocol.handover.bundle import BundleHeader
     from teds_provision.teds.dcc.items import CertificateItem
     from teds_provision.teds.dcc.shown import ShownCertificate
-    from teds_provision.teds.formats import Format
-    from teds_provision.teds.guard import GuardFinding
 else:
     bundles = late("teds_provision.protocol.handover.bundle")  # cryptography: only for a handover bundle
     markup, rich_table = late("rich.markup"), late("rich.table")

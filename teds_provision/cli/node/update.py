@@ -26,14 +26,13 @@ from teds_provision.cli.options import (
 )
 from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import UsageError, WrongImageError
-from teds_provision.links import LinkSettings
+from teds_provision.links import LinkSettings, Notice
 from teds_provision.provisioning.progress import NodeReporter, Reporter, SilentReporter
 from teds_provision.shapes.problem import problem_of
 
 if TYPE_CHECKING:
     from rich.live import Live
 
-    from teds_provision.links import Notice
     from teds_provision.provisioning.update import BoardUpdate, UpdateOrder, UpdatePlan
     from teds_provision.station.station import Station
 

@@ -23,6 +23,7 @@ from teds_provision.cli.context import SOCKET, App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, Number, WholeNumber, command, examples
 from teds_provision.errors import KnownUuidError, StoreError, TedsProvisionError, UsageError
 from teds_provision.lazy import late
+from teds_provision.node.flash_file import FlashFile
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station import store as store_room
 
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from teds_provision.node.ble.server import BleServer
     from teds_provision.node.can import server as can_server
     from teds_provision.node.can.server import CanServer
-    from teds_provision.node.flash_file import FlashFile
     from teds_provision.node.hardware import board as hardware_board
     from teds_provision.node.hardware.board import ActuatorReading, Board
     from teds_provision.node.nfc import server as nfc_server

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from teds_provision.backup.backup import backup as back_up
+from teds_provision.backup.content import Content
 from teds_provision.backup.restore import (
+    RestoreResult,
     complete_vault,
     keystore_for,
     merge,
@@ -26,13 +27,9 @@ from teds_provision.errors import NotFoundError, UsageError, VaultChangedError, 
 from teds_provision.handover.trust import spoken
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, from_pem
 from teds_provision.station import store as store_room
+from teds_provision.station.station import Station
 from teds_provision.vault.ca_file import read_ca
 from teds_provision.vault.selection import asked_first
-
-if TYPE_CHECKING:
-    from teds_provision.backup.content import Content
-    from teds_provision.backup.restore import RestoreResult
-    from teds_provision.station.station import Station
 
 _KEY_HINT = (
     "A recovery key is an encrypted PEM file: openssl genpkey -algorithm EC -pkeyopt ec_paramgen_curve:P-256 "

@@ -17,7 +17,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
 from teds_provision.cli.station.config import check_values
 from teds_provision.cli.table import COMMANDS
-from teds_provision.doctor.checks import System, examine, exit_code
+from teds_provision.doctor.checks import Finding, System, examine, exit_code
 from teds_provision.doctor.report import build_report
 from teds_provision.errors import BadDataError, TedsProvisionError, UsageError
 from teds_provision.files import SHARED, require_new, write_new
@@ -27,7 +27,6 @@ from teds_provision.sanitize import sanitize
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from teds_provision.doctor.checks import Finding
 
 _STYLES = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": "dim"}
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from io import BytesIO
 from itertools import chain, islice, zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal, Protocol
+from typing import Any, BinaryIO, Literal, Protocol
 
 import click
 
@@ -28,24 +28,32 @@ from teds_provision.cli.rendering import count_of, first_lines, local_time, repo
 from teds_provision.errors import BadDataError, LinkError, NotFoundError, PolicyError, TedsProvisionError
 from teds_provision.files import holds, open_to_read, read_limited, require_new, write_new
 from teds_provision.handover import pending as handover_pending
-from teds_provision.handover.incoming import ImportResult, NodeProof, import_bundle, plan_import, prove_nodes, proven_of
-from teds_provision.handover.outgoing import ExportOrder, export_all, outputs_of, plan_exports
-from teds_provision.handover.pending import close, find_handover, list_handovers, peer_name
+from teds_provision.handover.incoming import (
+    ImportPlan,
+    ImportResult,
+    NodeProof,
+    import_bundle,
+    plan_import,
+    prove_nodes,
+    proven_of,
+)
+from teds_provision.handover.outgoing import (
+    ExportOrder,
+    ExportPlan,
+    ExportResult,
+    LeavingNode,
+    export_all,
+    outputs_of,
+    plan_exports,
+)
+from teds_provision.handover.pending import CloseResult, close, find_handover, list_handovers, peer_name
 from teds_provision.handover.trust import spoken
 from teds_provision.links import LinkSettings
 from teds_provision.protocol.handover.bundle import MAX_BUNDLE_OCTETS
 from teds_provision.protocol.handover.jose import NO_COMPACT_JWS
 from teds_provision.protocol.handover.receipt import MAX_RECEIPT_OCTETS
 from teds_provision.protocol.keys import fingerprint
-
-if TYPE_CHECKING:
-    from contextlib import AbstractContextManager
-
-    from teds_provision.handover.incoming import ImportPlan, ImportResult
-    from teds_provision.handover.outgoing import ExportPlan, ExportResult, LeavingNode
-    from teds_provision.handover.pending import CloseResult
-    from teds_provision.station.station import Station
-
+from teds_provision.station.station import Station
 
 # -- export-keys -------------------------------------------------------------------------------------------------------
 

@@ -14,12 +14,11 @@ from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.files import read_limited, require_new, write_new
 from teds_provision.lazy import late
 from teds_provision.protocol.keys import fingerprint, to_pem
-from teds_provision.station.station import initialise
+from teds_provision.station.station import Station, initialise
 from teds_provision.vault import agent
 
 if TYPE_CHECKING:
     from teds_provision.handover import trust
-    from teds_provision.station.station import Station
 else:  # bundles and receipts: only for the CA of another station
     trust = late("teds_provision.handover.trust")
 

@@ -23,10 +23,10 @@ from teds_provision.errors import StoreError, UsageError
 from teds_provision.lazy import late
 from teds_provision.sanitize import counted, sanitize
 from teds_provision.station import store
+from teds_provision.station.store import AuditEntry, AuditFilter, AuditVerdict
 
 if TYPE_CHECKING:
     from teds_provision.station.station import Station
-    from teds_provision.station.store import AuditEntry, AuditFilter, AuditVerdict
     from teds_provision.trace import recorder
     from teds_provision.trace.record import Record
 else:  # the help of this command does without

@@ -17,8 +17,8 @@ from teds_provision.cli.rendering import print_table
 from teds_provision.errors import BadDataError, StoreError, UsageError
 from teds_provision.files import SHARED, holds, write_new
 from teds_provision.teds.formats.mapped import profile_from_xml
-from teds_provision.teds.profile import check as check_profile
 from teds_provision.teds.profile import (
+    ProfileProblem,
     default_folders,
     describe,
     find_profile,
@@ -27,6 +27,7 @@ from teds_provision.teds.profile import (
     load_profile,
     template,
 )
+from teds_provision.teds.profile import check as check_profile
 from teds_provision.teds.profile.load import parse_profile
 from teds_provision.teds.show import seconds
 from teds_provision.teds.units import short_unit
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from teds_provision.node.wrapped.description import WrappedSensor
-    from teds_provision.teds.profile import ProfileProblem
 
 
 @click.group(

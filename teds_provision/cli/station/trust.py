@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import click
 
@@ -22,6 +22,8 @@ from teds_provision.files import holds, read_limited, write_new
 from teds_provision.handover import trust as handover_trust
 from teds_provision.handover.trust import (
     MAX_OCTETS,
+    Candidate,
+    Removal,
     candidates_of,
     drop_ca,
     export_ca,
@@ -37,11 +39,8 @@ from teds_provision.handover.trust import (
 from teds_provision.protocol import keys as protocol_keys
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import to_pem
-
-if TYPE_CHECKING:
-    from teds_provision.handover.trust import Candidate, Removal
-    from teds_provision.station.station import Station
-    from teds_provision.station.store import TrustRecord
+from teds_provision.station.station import Station
+from teds_provision.station.store import TrustRecord
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 

@@ -7,18 +7,16 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 from teds_provision.errors import AddressConflictError
+from teds_provision.links.can.bus_multiplexer import BusMultiplexer, Listener
 from teds_provision.links.can.identify_broadcast import FunctionalAnswers, ask_all, ask_unclear_again, conflict_text
+from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.spec import CanSpec
 from teds_provision.links.ports import Notice, NoticeSink
 from teds_provision.protocol.announce import Announce, is_announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
-
-if TYPE_CHECKING:
-    from teds_provision.links.can.bus_multiplexer import BusMultiplexer, Listener
-    from teds_provision.links.can.isotp import Frame
 
 _GONE_SECONDS: Final = 3.0
 """A node that has been silent for so long has left."""

@@ -38,12 +38,11 @@ from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, Stati
 from teds_provision.measure.sinks.base import TICK, CommandTaker, Item, ThreadedSink
 from teds_provision.measure.sinks.lines import status_line
 from teds_provision.measure.sinks.names import Topics, slug
-from teds_provision.teds.units import display_unit, short_unit
+from teds_provision.teds.units import WrittenUnit, display_unit, short_unit
 
 if TYPE_CHECKING:
     import ssl
 
-    from teds_provision.teds.units import WrittenUnit
 else:
     ssl = late("ssl")
 

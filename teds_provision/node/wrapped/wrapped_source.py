@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from teds_provision.node.sources.base import Reading, SimulationClock
 from teds_provision.node.wrapped.latest_values import LatestValues, ValidityEvents
-
-if TYPE_CHECKING:
-    from teds_provision.node.sources.base import Reading, SimulationClock
 
 LAG: Final = 10_000_000
 """ns after its tick that a sample is taken: the thread that reads the sensors may get the interpreter's lock 5 ms late.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,14 +34,11 @@ from teds_provision.protocol.plant.signing import open_answer, open_request
 from teds_provision.sanitize import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
     from rich.console import Console
 
     from teds_provision.plant.office import AnsweredRequest
     from teds_provision.plant.verify_evidence import JudgedEvidence
     from teds_provision.plant.yield_stats import StationYield
-    from teds_provision.protocol.plant.job import CalibrationRule, Job
     from teds_provision.protocol.plant.roster import Roster
     from teds_provision.station.plant.line import EvidenceRow
     from teds_provision.station.station import Station

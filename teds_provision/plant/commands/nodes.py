@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import click
 
@@ -14,9 +14,7 @@ from teds_provision.cli.extending import add_options, callback_of
 from teds_provision.cli.rendering import local_time, print_json_list, shown
 from teds_provision.errors import NotFoundError
 from teds_provision.provisioning.inventory import PAGE
-
-if TYPE_CHECKING:
-    from teds_provision.station.station import Station
+from teds_provision.station.station import Station
 
 
 def extend(command: click.Command) -> None:

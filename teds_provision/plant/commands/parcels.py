@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -15,10 +15,8 @@ from teds_provision.cli.extending import add_examples, add_options, callback_of
 from teds_provision.cli.station.handover import import_plan, import_text, require_as_shown
 from teds_provision.errors import TedsProvisionError
 from teds_provision.handover.incoming import plan_import
-
-if TYPE_CHECKING:
-    from teds_provision.handover.outgoing import ExportPlan
-    from teds_provision.station.station import Station
+from teds_provision.handover.outgoing import ExportPlan
+from teds_provision.station.station import Station
 
 
 class ParcelCarrier:

@@ -27,11 +27,11 @@ from teds_provision.station.store.database import places
 from teds_provision.station.store.records import utc_now
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
+from teds_provision.vault.base import Vault
 
 if TYPE_CHECKING:
     from teds_provision.protocol.plant import claim, document, event, roster, signer
     from teds_provision.protocol.plant.roster import Role
-    from teds_provision.vault.base import Vault
 else:  # cryptography: not for commands that only list
     event = late("teds_provision.protocol.plant.event")
     claim, document = late("teds_provision.protocol.plant.claim"), late("teds_provision.protocol.plant.document")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from teds_provision.lazy import lazy
 from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Method, from_decoded
+from teds_provision.teds.calibration.samples import SampleReader
 
 if TYPE_CHECKING:
     from teds_provision.teds.calibration.files import fit_points, load_calibrations, read_calibrations
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
         sentence,
     )
     from teds_provision.teds.calibration.interpreter import ChannelInterpreter, Values
-    from teds_provision.teds.calibration.samples import SampleReader
 
 __all__ = [
     "METHODS",

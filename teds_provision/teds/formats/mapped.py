@@ -13,13 +13,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
+from xml.etree.ElementTree import Element
 
 from teds_provision.errors import BadDataError
 from teds_provision.limits import LIMITS, check_size, check_xml, load_toml
-
-if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
 
 _TABLES: Final = frozenset({"channel", "keys", "channel-keys", "values", "channel-values"})
 _PLACE: Final = frozenset({"at", "unit", "unit-at", "words"})

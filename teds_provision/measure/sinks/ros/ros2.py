@@ -17,14 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.lazy import how_to_install, late
-from teds_provision.measure.blocks import StationFacts
+from teds_provision.measure.blocks import ChannelFacts, StationFacts
 from teds_provision.measure.sinks.base import CommandTaker
 from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, DiagnosticEntry, TopicSink
 from teds_provision.measure.sinks.ros.rclpy_child import keep_on_loopback, ports_of
 from teds_provision.measure.sinks.vectors import FieldValue, Meaning
 
 if TYPE_CHECKING:
-    from teds_provision.measure.blocks import ChannelFacts
     from teds_provision.measure.sinks.ros import ros2_types
 else:  # cyclonedds: an extra
     ros2_types = late("teds_provision.measure.sinks.ros.ros2_types")
