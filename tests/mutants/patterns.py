@@ -199,7 +199,7 @@ PATTERNS = (
     Pattern(
         "a question to everyone costs no reply",
         "CanServer._end_answer_to_everyone",
-        "line.replying is not pair",
+        "state.replying is not pair",
         "True",
         "tests/node/test_can_server.py",
     ),
