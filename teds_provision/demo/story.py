@@ -252,15 +252,23 @@ class DemoResult:
     uuid: bytes
 
 
-def run_demo(reporter: Reporter, say: Callable[[str], None]) -> DemoResult:
-    """Run it; raises whatever a step raises. The folder is gone afterwards, however it ends."""
+@contextmanager
+def temporary_demo(reporter: Reporter, say: Callable[[str], None], *, mode: int = 0o700) -> Iterator[Demo]:
+    """Give a demo in a folder of this mode; its processes end and the folder is removed, however the block ends."""
     folder = Path(tempfile.mkdtemp(prefix="teds-provision-demo-"))
+    folder.chmod(mode)
     try:
         demo = Demo(folder, reporter, say)
         with demo.stack:
-            return _run(demo)
+            yield demo
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def run_demo(reporter: Reporter, say: Callable[[str], None]) -> DemoResult:
+    """Run it; raises whatever a step raises. The folder is gone afterwards, however it ends."""
+    with temporary_demo(reporter, say) as demo:
+        return _run(demo)
 
 
 def _run(demo: Demo) -> DemoResult:

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import json
 import secrets
-import shutil
-import tempfile
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from teds_provision import plant
-from teds_provision.demo.story import PROFILE, Demo, make_node, new_station, run_node
+from teds_provision.demo.story import PROFILE, Demo, make_node, new_station, run_node, temporary_demo
 from teds_provision.errors import LinkError, PolicyError
 from teds_provision.handover import trust
 from teds_provision.plant.evidence import export
@@ -65,13 +63,8 @@ class _LocalOffice:
 
 def run_line(reporter: Reporter, say: Callable[[str], None]) -> LineDemoResult:
     """Run it; raises whatever a step raises. The folder is gone afterwards, however it ends."""
-    folder = Path(tempfile.mkdtemp(prefix="teds-provision-demo-"))
-    try:
-        demo = Demo(folder, reporter, say)
-        with demo.stack:
-            return _run(demo)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    with temporary_demo(reporter, say) as demo:
+        return _run(demo)
 
 
 def _run(demo: Demo) -> LineDemoResult:

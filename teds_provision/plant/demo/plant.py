@@ -7,17 +7,14 @@ virtual board (a process, on a CAN bus over multicast) are gone at the end.
 from __future__ import annotations
 
 import secrets
-import shutil
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any, Final
 
 from teds_provision import plant
-from teds_provision.demo.story import PROFILE, Demo, provision_over, virtual_node
+from teds_provision.demo.story import PROFILE, Demo, provision_over, temporary_demo, virtual_node
 from teds_provision.errors import NotAuthenticError
 from teds_provision.handover import trust
 from teds_provision.links.ports import free_port
@@ -55,14 +52,8 @@ class PlantDemoResult:
 
 def run_plant_demo(reporter: Reporter, say: Callable[[str], None]) -> PlantDemoResult:
     """Run it; raises whatever a step raises. The folder is gone afterwards, however it ends."""
-    folder = Path(tempfile.mkdtemp(prefix="teds-provision-plant-"))
-    folder.chmod(0o755)  # the server runs as another user
-    try:
-        demo = Demo(folder, reporter, say)
-        with demo.stack:
-            return _Story(demo).run()
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    with temporary_demo(reporter, say, mode=0o755) as demo:  # the server runs as another user
+        return _Story(demo).run()
 
 
 class _Story:
