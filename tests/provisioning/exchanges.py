@@ -1,4 +1,4 @@
-"""What a station asks a node while it provisions it, word for word; whoever adds an exchange adds it here, with why."""
+"""What a station asks a node while it provisions it, word for word. A new exchange is added here, with its reason."""
 
 from __future__ import annotations
 

@@ -75,11 +75,11 @@ class Master:
         return self.echoes[-1]
 
     def published(self) -> dict[str, list[str]]:
-        """Topics that somebody publishes, and the names of who does, by the master."""
+        """Return the published topics and the names of their publishers, as the master has them."""
         return self._topics(0)
 
     def heard(self) -> dict[str, list[str]]:
-        """Topics that somebody subscribes to, and the names of who does, by the master."""
+        """Return the subscribed topics and the names of their subscribers, as the master has them."""
         return self._topics(1)
 
     def _topics(self, which: int) -> dict[str, list[str]]:
