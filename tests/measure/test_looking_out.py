@@ -21,7 +21,7 @@ from teds_provision.links.discovery import LEAST, BroadcastPace, Sighting
 from teds_provision.measure.presence import Presence
 from teds_provision.ncap.nodes.link_watch import MAX_PARALLEL, PresenceCheck
 from teds_provision.ncap.waits import USUAL
-from teds_provision.protocol.announce import Announce, uuid_crc
+from teds_provision.protocol.announce import Announce, is_announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from tests.links.can.conftest import hub, nodes  # noqa: F401  fixtures
 from tests.links.can.hub import Hub
@@ -44,13 +44,20 @@ def asked(bus: Hub) -> Counter[int]:
     return found
 
 
+def announced(bus: Hub) -> set[int]:
+    """Addresses that announced themselves."""
+    return {identifier & 0xFF for identifier, _ in list(bus.frames) if is_announce(identifier)}
+
+
 @pytest.fixture
 def lookout(hub: Hub, nodes: Start) -> Iterator[CanDiscovery]:  # noqa: F811
     nodes(hub.spec, *ADDRESSES)
+    until(lambda: announced(hub) >= {*ADDRESSES}, "every node has sent the Announce of its start")
     port = CanPort(hub.spec)
     made = CanDiscovery(port, Presence(), poll=30.0)
     made.discover()
     until(lambda: made._finished == made._begun and not made._asked.is_set(), "every answer of the start has come")
+    assert not made._asked_at, "an address that was asked already has no turn for 10 s"
     yield made
     made.close()
     port.close()
