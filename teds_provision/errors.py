@@ -250,13 +250,17 @@ class RevertedError(PolicyError):
 
 
 class NodeRefusedError(PolicyError):
-    """The node refused a command; ``reason`` is the u8 of profile.md, "Reasons"."""
+    """The node refused a command; ``reason`` is the u8 of profile.md, "Reasons".
+
+    ``sealed``: the refusal came in a session, under the node's key. Any device on the link can send another one.
+    """
 
     code = "node-refused"
 
-    def __init__(self, message: str, *, reason: int, hint: str = "") -> None:
+    def __init__(self, message: str, *, reason: int, hint: str = "", sealed: bool = False) -> None:
         super().__init__(message, hint=hint)
         self.reason = reason
+        self.sealed = sealed
 
 
 class StoreError(TedsProvisionError):

@@ -51,7 +51,7 @@ from teds_provision.measure.verified_session import (
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import idle
 from teds_provision.protocol.operation.stream_commands import SOON
-from teds_provision.provisioning.conversation import Conversation, SessionLostError
+from teds_provision.provisioning.conversation import Conversation, SessionLostError, came_under_key
 from teds_provision.provisioning.firmware import firmware_warning, read_firmware, require_good_firmware
 from teds_provision.station.firmware import firmware_of
 from teds_provision.station.station import Station
@@ -102,7 +102,7 @@ class NodeSupervisor:
         self._announced = 0.0  # when it announced itself (time.monotonic), 0: it did not
         self._elsewhere = 0.0  # when it answered at another place
         self._lost_at = 0.0
-        self._proven = True  # whether what failed last did so in a session
+        self._proven = True  # whether what failed last did so under the node's key
         self._retry_policy = RetryPolicy(None)
         self._standing: NodeStanding | None = None  # of the present try
         self.sighting: Sighting | None = None  # its last place
@@ -299,14 +299,28 @@ class NodeSupervisor:
             raise
         except BaseException as error:
             self._lost_at = time.monotonic()
+            self._proven = self._proven and came_under_key(error)
             self._buses.presence.let_announce(self.uuid)
             # Its refusal came under its key: it is there, and another measurement may want it now.
             if not (self._proven and isinstance(error, (NotAuthenticError, PolicyError, BadDataError))):
                 self._buses.presence.wrong(sighting)
-            conflict = self._buses.presence.conflict_at(sighting)
-            if not self._proven and isinstance(error, TedsProvisionError) and conflict is not None:
-                raise conflict from error  # whichever of the two answered
+            if not self._proven and isinstance(error, (TedsProvisionError, SessionLostError)):
+                if not isinstance(error, LinkError):
+                    self._ask_who_answers()
+                conflict = self._buses.presence.conflict_at(sighting)
+                if conflict is not None:
+                    raise conflict from error  # whichever of the two answered
             raise
+
+    def _ask_who_answers(self) -> None:
+        """Ask everyone on the bus while nothing is asked of the node itself: its replies would hide a second board's.
+
+        Only until its first value, for a caller that gives up in time: others are told by the next round anyway.
+        """
+        if self.bus is None or self.ever_ran or self._request.patient:
+            return
+        with suppress(LinkError):
+            self.bus.discovery.discover()
 
     def _in_session(self, bus: MeasuredBus, sighting: Sighting, standing: NodeStanding) -> None:
         self._announced = self._elsewhere = 0.0

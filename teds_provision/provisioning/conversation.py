@@ -93,9 +93,14 @@ def refused(reason: int | None, doing: str, *, sealed: bool = False) -> NodeRefu
     try:
         known = Reason(reason if reason is not None else 0)
     except ValueError:
-        return NodeRefusedError(f"{heard} {doing} without a known reason ({reason}).", reason=reason or 0)
+        return NodeRefusedError(
+            f"{heard} {doing} without a known reason ({reason}).", reason=reason or 0, sealed=sealed
+        )
     return NodeRefusedError(
-        f"{heard} {doing}: {_MEANING[known]} (reason {int(known)}).", reason=int(known), hint=_CURE.get(known, "")
+        f"{heard} {doing}: {_MEANING[known]} (reason {int(known)}).",
+        reason=int(known),
+        hint=_CURE.get(known, ""),
+        sealed=sealed,
     )
 
 
@@ -114,6 +119,17 @@ class SessionLostError(Exception):
     def __init__(self, cause: TedsProvisionError) -> None:
         super().__init__(cause.message)
         self.cause = cause
+
+
+def came_under_key(error: BaseException) -> bool:
+    """Return True if an error of an open session has its cause in what the node's key vouches for.
+
+    False for silence, a refusal that was not sealed, and a reply that did not open: any device on the link can cause
+    each of them, a second board at the same address among others.
+    """
+    if isinstance(error, (LinkError, SessionLostError)) or isinstance(error.__context__, SessionLostError):
+        return False  # the context: the session was lost, and could not be opened again
+    return not isinstance(error, NodeRefusedError) or error.sealed
 
 
 class Conversation:

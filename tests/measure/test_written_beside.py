@@ -55,7 +55,10 @@ def test_no_sequence_is_used_up_for_a_node_that_is_being_measured(hall: Hall) ->
 
 
 def test_two_boards_with_one_uuid_at_one_address_are_named_and_end_no_other_measurement(hall: Hall) -> None:
-    """Copies answer octet for octet alike: no answer of the address alone shows that they are two."""
+    """Copies answer octet for octet alike: no answer of the address alone shows that they are two.
+
+    One that answers every question before the other keeps its session: its second is measured, and both are named.
+    """
     a, b = hall.nodes["a"], hall.nodes["b"]
     b.start()
     beside = hall.begin(b.uuid, "--rate", 20)
@@ -63,9 +66,9 @@ def test_two_boards_with_one_uuid_at_one_address_are_named_and_end_no_other_meas
     shutil.copytree(a.folder, hall.folder / "twin")
     twin = Placed(hall, hall.folder / "twin", a.uuid).start()
     outcome = hall.begin(a.uuid, "--rate", 10, "--duration", 1, "--timeout", 3).end()
-    assert outcome.code == 5, outcome
-    last = events(outcome.out)[-1]
-    assert last["error"]["code"] == "address-conflict", last
+    assert outcome.code in (0, 5), outcome
+    if outcome.code:
+        assert events(outcome.out)[-1]["error"]["code"] == "address-conflict", outcome
     assert outcome.err.count("Two nodes answer at CAN address") == 1, "once, not at each question"
     assert hall.ask("identify", "--via", "can", code=5)["error"]["code"] == "address-conflict"
     before = beside.out.count('"event":"data"')

@@ -12,13 +12,20 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
-from teds_provision.errors import AddressConflictError, NodeRefusedError, NotAuthenticError, PolicyError, UnprovenError
+from teds_provision.errors import (
+    AddressConflictError,
+    NodeRefusedError,
+    NotAuthenticError,
+    PolicyError,
+    TedsProvisionError,
+    UnprovenError,
+)
 from teds_provision.links import Contact, LinkSettings, Notice
 from teds_provision.links.ports import CAN, Capabilities
 from teds_provision.protocol.messages.frames import COMMON, Function, Reason, Reply, refusal, security_command
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.provisioning.agree import proof_of_reset, require_session
-from teds_provision.provisioning.conversation import Conversation, refused
+from teds_provision.provisioning.conversation import Conversation, SessionLostError, came_under_key, refused
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.meeting import drop_duplicate_uuids, refuse_duplicate_uuids
 from teds_provision.provisioning.read import ReadReport, read_at
@@ -264,8 +271,29 @@ def test_a_refusal_in_a_session_is_the_nodes_own_word(station: Station, board: B
     run(station, board)
     with talk(board) as node:
         require_session(station, node)
-        with pytest.raises(NodeRefusedError, match="The node refused to do the unknown"):
+        with pytest.raises(NodeRefusedError, match="The node refused to do the unknown") as refusal:
             node.request(security_command(99), "to do the unknown")
+    assert came_under_key(refusal.value)
+
+
+@pytest.mark.parametrize("said", [refusal(Reason.NOT_PERMITTED), refusal(Reason.BAD_TAG), Reply(True, bytes(40))])
+def test_no_plain_answer_in_a_session_is_the_nodes_own_word(station: Station, board: Board, said: Reply) -> None:
+    """A second board at its address says so, or any other device; opened again, it says so again."""
+    run(station, board)
+    heard = False
+
+    def second_board(_count: int, reply: bytes) -> bytes:
+        return said.encode() if heard else reply
+
+    with talk(board, MemoryLink(board, tamper=second_board)) as node:
+        require_session(station, node)
+        heard = True
+        with pytest.raises(SessionLostError) as lost:
+            node.request(security_command(99), "to do the unknown")
+        assert not came_under_key(lost.value)
+        with pytest.raises(TedsProvisionError) as given_up:
+            node.request_idempotent(security_command(99), "to do the unknown")
+        assert not came_under_key(given_up.value)
 
 
 @pytest.mark.parametrize("answer", [bytes(64), b"", b"the wrong signature".ljust(64)])

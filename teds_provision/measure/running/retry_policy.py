@@ -48,8 +48,8 @@ class RetryPolicy:
     ) -> bool:
         """Return True if no other try is worth it.
 
-        ``decided``: this station itself decided so, by a ban, its whitelist or its trust. ``proven``: the error came in
-        a session. Outside one any device on the bus can take the node's UUID and refuse to open one: then the node is
+        ``decided``: this station itself decided so, by a ban, its whitelist or its trust. ``proven``: the error came
+        under the node's key. Without it any device on the bus can take the node's UUID and refuse: then the node is
         searched ``elsewhere``.
         """
         if self.seconds_left == math.inf:  # a datasheet that was changed under its values ends what has an end
