@@ -12,9 +12,11 @@ from teds_provision.errors import NodeRefusedError, NotAuthenticError, PolicyErr
 from teds_provision.handover.incoming import ImportPlan, ImportResult, import_bundle, plan_import
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import close
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.provisioning.agree import agree, reset_node
 from teds_provision.provisioning.identify import identify
+from teds_provision.station.store import TrustRecord
 from tests.bench import Board, make_station, talk
 from tests.handover.desk import Pair, everything, held, key_up, provisioned, session
 
@@ -157,6 +159,25 @@ def test_the_same_keys_again_in_a_new_bundle(pair: Pair) -> None:
     assert [node.decision for node in plan.nodes] == ["same"]
     import_bundle(pair.south, plan)
     assert len(held(pair.south, pair.board)) == 1
+
+
+def test_a_ca_whose_trust_ended_counts_again_once_a_person_takes_in_a_bundle_that_names_it(pair: Pair) -> None:
+    uuid, ca, other = pair.board.uuid, pair.north.ca, SoftwareKey(21).point
+    close(pair.north, pair.take(pair.export("copy")[0]).receipt)
+    for ended in (ca, other):
+        pair.south.policy.end_ca(ended)
+    assert ca not in pair.south.policy.trusted_cas(uuid)
+    pair.take(pair.export("copy")[0])
+    assert ca in pair.south.policy.trusted_cas(uuid)
+    assert not pair.south.policy.counts(other)
+
+
+def test_a_ca_whose_trust_ended_counts_again_once_a_person_trusts_its_key(pair: Pair) -> None:
+    lab, other = SoftwareKey(21).point, SoftwareKey(22).point
+    for ended in (lab, other):
+        pair.south.policy.end_ca(ended)
+    pair.south.policy.trust(TrustRecord("lab", "ca", lab, fingerprint(lab)))
+    assert [pair.south.policy.counts(ca) for ca in (lab, other)] == [True, False]
 
 
 def test_a_station_that_lost_the_node_to_a_rotation_does_not_agree_anew(pair: Pair) -> None:

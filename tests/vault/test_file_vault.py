@@ -9,14 +9,16 @@ import stat
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import StoreError, UsageError, VaultError, WrongPassphraseError
+from teds_provision.errors import StoreError, UsageError, VaultChangedError, VaultError, WrongPassphraseError
 from teds_provision.protocol.keys import SoftwareKey, verify
+from teds_provision.vault import file_vault
 from teds_provision.vault.file_vault import FileVault
 from teds_provision.vault.master import Material
 from teds_provision.vault.passphrase import PRODUCT, THROWAWAY, Costs, seal, unseal
@@ -141,6 +143,55 @@ def test_a_new_passphrase_replaces_the_old(tmp_path: Path, vault: FileVault) -> 
         FileVault.open(tmp_path, STORE, Person())
     again = FileVault.open(tmp_path, STORE, Person("another good passphrase"))
     assert again.identity().point == vault.identity().point
+
+
+CHANGES: dict[str, Callable[[FileVault, Path, str], object]] = {
+    "another passphrase": lambda vault, pem, old: vault.new_passphrase(Person(), costs=THROWAWAY)(),
+    "the CA key dropped": lambda vault, pem, old: vault.drop_ca(),
+    "the CA key taken in": lambda vault, pem, old: vault.import_ca(pem, GOOD),
+    "one more master key": lambda vault, pem, old: vault.add_master(),
+    "the old master keys deleted": lambda vault, pem, old: vault.retire_masters(),
+    "a backup joined": lambda vault, pem, old: vault.join(old),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_a_change_keeps_what_another_process_changed_before(
+    tmp_path: Path, vault: FileVault, change: Callable[[FileVault, Path, str], object]
+) -> None:
+    """A vault is read once and kept: what it wrote from that alone would lose a master key, and each key under it."""
+    vault.export_ca(tmp_path / "ca.pem", GOOD)
+    vault.add_master()
+    old = vault.secret_material()
+    other = FileVault.open(tmp_path, STORE, Person())
+    if change is CHANGES["the CA key taken in"]:
+        vault.drop_ca()
+        other.refresh()
+    other.add_master()
+    wrapped = other.wrap(b"a key of node 1.", context=b"1")
+    change(vault, tmp_path / "ca.pem", old)
+    again = FileVault.open(tmp_path, STORE, Person())
+    assert again.unwrap(wrapped, context=b"1") == b"a key of node 1."
+    with pytest.raises(VaultError):
+        again.unwrap(wrapped, context=b"2")
+    again.new_passphrase(Person("another good passphrase"), costs=THROWAWAY)()
+    with pytest.raises(VaultChangedError):
+        change(vault, tmp_path / "ca.pem", old)
+
+
+def test_a_passphrase_that_cannot_be_written_is_not_the_new_one(
+    tmp_path: Path, vault: FileVault, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*arguments: object, **options: object) -> None:
+        raise VaultError("The disk is full.")
+
+    seal_anew = vault.new_passphrase(Person("another good passphrase"), costs=THROWAWAY)
+    with monkeypatch.context() as patched:
+        patched.setattr(file_vault, "write_whole", full)
+        with pytest.raises(VaultError, match="full"):
+            seal_anew()
+    vault.add_master()
+    assert FileVault.open(tmp_path, STORE, Person()).masters() == (1, 2)
 
 
 def test_every_flipped_octet_of_the_file_is_noticed(tmp_path: Path, vault: FileVault) -> None:

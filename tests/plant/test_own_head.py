@@ -1,0 +1,235 @@
+"""What a station finds under its own key before it adds a page: nothing new, its own pages, or another home's."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import ForkError, LinkError, PolicyError
+from teds_provision.plant.apply_pages import alarm
+from teds_provision.plant.folder_transport import FolderTransport
+from teds_provision.plant.sync import SyncResult, acknowledge, resume, sync
+from teds_provision.plant.transport import CarriedPage
+from teds_provision.station.station import Station
+from teds_provision.station.store import WhitelistEntry
+from tests.plant.stations import Plant, ask
+
+
+class Registry(FolderTransport):
+    """A transport as a registry's database is one: each member appends its own pages and reads those that it lacks."""
+
+    everybody = False
+
+    def pages(self, station: str, after: int) -> Iterator[CarriedPage]:
+        return (page for page in super().pages(station, after) if page.number > after)
+
+
+class West:
+    """A station whose pages are few, and copies of its home as it was before."""
+
+    def __init__(self, plants: Plant) -> None:
+        self.plants, self.stick = plants, plants.stick
+        self.station = plants.member("west", "line", "sign")
+        self.others: list[Station] = []
+        self.pins = 0
+
+    def write(self, station: Station | None = None) -> None:
+        """Have something to put into the next page."""
+        self.pins += 1
+        (station or self.station).pins.put(WhitelistEntry(bytes([self.pins] * 10), "ab" * 32, assurance="tap"))
+
+    def page(self, station: Station | None = None) -> SyncResult:
+        """Write a page into the registry."""
+        self.write(station)
+        return self.sync(station)
+
+    def sync(self, station: Station | None = None, *, connected: bool = True, folder: Path | None = None) -> SyncResult:
+        return sync(station or self.station, Registry(folder or self.stick), connected=connected)
+
+    def copy(self, name: str = "yesterday", *, restored: bool = True) -> Station:
+        """Return its home as it is now, in another folder: a backup rebuilt it."""
+        self.station.close()
+        shutil.copytree(self.plants.folder / "west", self.plants.folder / name)
+        self.station = Station.open(self.plants.folder / "west", ask=ask)
+        copy = Station.open(self.plants.folder / name, ask=ask)
+        self.others.append(copy)
+        if restored:
+            copy.unlock()
+            copy.plant.begin_restored()
+        return copy
+
+    def file(self, number: int) -> Path:
+        return self.stick / self.station.fingerprint / f"{number}.jws"
+
+    def close(self) -> None:
+        for station in (self.station, *self.others):
+            station.close()
+
+
+@pytest.fixture
+def west(tmp_path: Path) -> Iterator[West]:
+    plants = Plant(tmp_path)
+    made = West(plants)
+    yield made
+    made.close()
+    plants.close()
+
+
+def alarms(station: Station) -> list[str]:
+    return [alarm.code for alarm in station.plant.alarms.all()]
+
+
+def about_the_backup(done: SyncResult) -> list[str]:
+    return [remark for remark in done.remarks if "backup" in remark]
+
+
+def joined_by(station: Station, url: str | None) -> None:
+    joined = station.plant.joined
+    assert joined is not None
+    station.plant.put_record(replace(joined, url=url))
+
+
+class ReadOnly(Registry):
+    """A registry that is gone when a page is to be appended."""
+
+    def append(self, station: str, n: int, previous: str, hash: str, octets: bytes) -> None:
+        raise LinkError("The connection broke.")
+
+
+def test_a_registry_that_forgot_pages_is_refilled_and_that_is_an_alarm(west: West) -> None:
+    assert west.page().remarks == []
+    assert west.sync().remarks == []
+    for left in (0, 1, 0):
+        newest = west.station.plant.pages.chain(west.station.fingerprint).counted[0]
+        for number in range(left + 1, newest + 1):
+            west.file(number).unlink()
+        elsewhere = west.plants.folder / f"another {newest}"
+        elsewhere.mkdir()
+        assert west.sync(connected=False, folder=elsewhere).remarks == [], "it is not what this station joined by"
+        assert sync(west.station, FolderTransport(elsewhere)).remarks == [], "a folder need not have them"
+        with pytest.raises(LinkError):
+            sync(west.station, ReadOnly(west.stick))
+        acknowledge(west.station)
+        (remark,) = west.sync().remarks
+        assert f"was rolled back: page {newest} was there, and now {left} is the last; it is being refilled" in remark
+        assert west.file(newest).exists()
+        (raised,) = (raised for raised in west.station.plant.alarms.all() if raised.n == newest)
+        assert (raised.code, raised.seen) == ("rolled-back", False), "it happened once more since it was seen"
+        assert west.sync().remarks == []
+
+
+@pytest.mark.parametrize(
+    ("count", "told"),
+    [
+        (1, "1 page that this station wrote before its backup is back"),
+        (2, "2 pages that this station wrote before its backup are back"),
+    ],
+)
+def test_a_rebuilt_home_takes_back_what_it_wrote_since(west: West, count: int, told: str) -> None:
+    west.page()
+    back = west.copy()
+    for _ in range(count):
+        west.page()
+    alarm(back, "fork", back.fingerprint, 2, "a look while a page was missing")
+    assert about_the_backup(west.sync(back)) == [told]
+    assert not alarms(back)
+    assert not back.plant.restored
+    assert west.page(back).remarks == []
+
+
+@pytest.mark.parametrize(
+    ("url", "connected", "ends"),
+    [(None, False, True), ("postgresql://plant", True, True), ("postgresql://plant", False, False)],
+)
+def test_a_rebuilt_home_goes_on_once_it_has_looked_where_its_pages_would_be(
+    west: West, url: str | None, connected: bool, ends: bool
+) -> None:
+    west.page()
+    back = west.copy()
+    joined_by(back, url)
+    west.write(back)
+    told = about_the_backup(west.sync(back, connected=connected))
+    assert back.plant.restored is not ends
+    assert west.file(2).exists() is ends
+    assert [remark.partition(" and ")[2] for remark in told] == (
+        [] if ends else ["publishes nothing new until it has synced with its own registry"]
+    )
+
+
+def test_a_rebuilt_home_goes_on_where_a_stick_brings_its_pages(west: West) -> None:
+    west.page()
+    back = west.copy()
+    joined_by(back, "postgresql://plant")
+    west.page()
+    assert about_the_backup(west.sync(back, connected=False)) == [
+        "1 page that this station wrote before its backup is back"
+    ]
+    assert not back.plant.restored
+
+
+def test_a_rebuilt_home_compares_its_first_page_too(west: West) -> None:
+    twin = west.copy("twin", restored=False)
+    west.page()
+    kept = west.file(1).read_bytes()
+    west.file(1).unlink()
+    west.page(twin)
+    other = west.file(1).read_bytes()
+    west.file(1).write_bytes(kept)
+    west.sync()
+    back = west.copy()
+    west.file(1).write_bytes(other)
+    with pytest.raises(ForkError):
+        west.sync(back)
+
+
+def test_what_others_report_of_pages_that_are_missing_stops_a_rebuilt_home_alone(west: West) -> None:
+    """A member may lie: a home that lost nothing knows its pages, and goes on."""
+    west.page()
+    for back in (west.copy(), west.station):
+        with back.transaction():
+            north = back.plant.pages.chain(west.plants.north.fingerprint).chain
+            back.plant.pages.put_heads(north, {back.fingerprint: (9, "ab" * 32)})
+        if back is west.station:
+            assert west.page().pushed == 1
+        else:
+            with pytest.raises(PolicyError, match="has seen its page 9, but the last one here is 1"):
+                west.sync(back)
+
+
+def another_wrote(west: West) -> Station:
+    """Return a copy that wrote a page of its own, of which the first one hears where it syncs."""
+    copy = west.copy("copy", restored=False)
+    west.page(copy)
+    west.write()
+    return copy
+
+
+def nothing_more(west: West) -> None:
+    """The registry shows the other's page no more."""
+
+
+def not_there(west: West) -> None:
+    west.file(2).unlink()
+
+
+@pytest.mark.parametrize("later", [nothing_more, not_there])
+def test_pages_that_another_home_wrote_stop_everything_until_a_person_decides(
+    west: West, later: Callable[[West], None]
+) -> None:
+    west.page()
+    another_wrote(west)
+    with pytest.raises(ForkError, match="a copy of this home is in use"):
+        west.sync()
+    later(west)
+    for _ in range(2):
+        with pytest.raises(ForkError):
+            west.sync()
+    assert alarms(west.station) == ["fork"]
+    assert resume(west.station, Registry(west.stick)) == (1 if later is nothing_more else 0)
+    west.sync()
+    assert alarms(west.station) == []
+    assert west.file(2).exists()
