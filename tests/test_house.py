@@ -45,21 +45,15 @@ LATE_MODULES = {
     "cli/station/log.py": "traces: only where one is merged in",
     "doctor/links.py": "python-can, nfcpy and pyserial: only if such a link was given, or PC/SC answers",
     "measure/sinks/ros/ros2.py": "cyclonedds: an extra",
-    "plant/commands/registry.py": "cryptography: not for --help",
     "plant/doctor.py": "cryptography: only for a station that joined a registry",
     "plant/verify_evidence.py": "the store, which nothing else there needs",
-    "provisioning/adoption.py": "numpy: not for a datasheet without calibration",
-    "provisioning/build.py": "numpy: not for a datasheet without calibration",
     "provisioning/inventory.py": "cryptography: not for a list of unverified nodes",
     "station/datasheets.py": _LISTS,
-    "station/identity.py": _LISTS,
-    "station/pins.py": _LISTS,
     "station/plant/plant.py": _LISTS,
     "station/policy.py": _LISTS,
-    "station/station.py": "cryptography, sockets and processes: `nodes` opens no vault",
+    "station/station.py": "sockets and processes: `nodes` opens no vault",
     "teds/calibration/files.py": "lxml: not for a calibration that is no certificate",
     "vault/selection.py": "argon2, keyring and python-pkcs11: a station has one of them",
-    "vault/software.py": "PKCS #8: for the commands of the CA key alone",
 }
 """Files that load a module of ours at its first use, by `late`, and what that spares a command that people wait for."""
 

@@ -17,6 +17,7 @@ from teds_provision.protocol.keys import (
     CHALLENGE_OCTETS,
     GROUP_ORDER,
     SIGNATURE_OCTETS,
+    Credentials,
     SoftwareKey,
     agreement_message,
     fingerprint,
@@ -38,13 +39,7 @@ from teds_provision.protocol.messages.frames import (
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.messages.tables import describe_command, describe_reply
 from teds_provision.protocol.session import OPEN_OCTETS, StationSession
-from teds_provision.protocol.wire_agreement import (
-    REPLY_OCTETS,
-    AgreedKey,
-    Credentials,
-    RequestPayload,
-    StationAgreement,
-)
+from teds_provision.protocol.wire_agreement import REPLY_OCTETS, AgreedKey, RequestPayload, StationAgreement
 from teds_provision.teds.image import SECURITY, BlockId
 
 _OFF_CURVE: Final = b"\x04" + bytes(64)

@@ -13,7 +13,7 @@ from teds_provision.errors import BadDataError, GarbledError, MessageTooLongErro
 from teds_provision.links import Contact
 from teds_provision.links.ports import Direction, FramedLink, Link, MultiStationLink, ResendLink, Trace
 from teds_provision.protocol.datasheet import SignedNodeKey
-from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.keys import Credentials, SoftwareKey
 from teds_provision.protocol.messages.frames import (
     IDENTIFY,
     Command,
@@ -28,7 +28,7 @@ from teds_provision.protocol.messages.frames import (
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.messages.tables import describe_answer, describe_command, describe_reply
 from teds_provision.protocol.session import TAG_OCTETS, StationSession, open_mac
-from teds_provision.protocol.wire_agreement import AgreedKey, Credentials, key_id
+from teds_provision.protocol.wire_agreement import AgreedKey, key_id
 from teds_provision.provisioning.conversation import BUSY_PAUSE, BUSY_SECONDS
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds

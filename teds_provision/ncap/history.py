@@ -20,14 +20,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import NotFoundError
 from teds_provision.lazy import late
+from teds_provision.measure.blocks import Block, ChannelFacts
+from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.codec.model import Units
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-    from teds_provision.measure.blocks import Block, ChannelFacts
-    from teds_provision.teds.calibration.model import Calibration
 else:
     np = late("numpy")
 

@@ -10,10 +10,9 @@ from pathlib import Path
 from teds_provision import __version__
 from teds_provision.errors import LinkError, NodeRefusedError, NotAuthenticError, StoreError
 from teds_provision.files import SHARED, holds, write_whole
-from teds_provision.protocol.keys import prove_message, verify
+from teds_provision.protocol.keys import Credentials, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.plant.evidence import NONCE_OCTETS, EvidenceClaim, seal
-from teds_provision.protocol.wire_agreement import Credentials
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.station.plant.line import EvidenceRow
 from teds_provision.station.station import Station

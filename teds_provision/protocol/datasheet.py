@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from teds_provision.errors import BadDataError
-from teds_provision.protocol.keys import Verify, is_point, station_key_message, verify
-from teds_provision.protocol.wire_agreement import Credentials
+from teds_provision.protocol.keys import Credentials, Verify, is_point, station_key_message, verify
 from teds_provision.teds.codec import frame, security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.codec.security import SecurityTeds

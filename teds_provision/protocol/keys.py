@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Protocol
 
-from teds_provision.errors import BadDataError
+from teds_provision.errors import BadDataError, KeyMismatchError
 from teds_provision.lazy import late
 
 if TYPE_CHECKING:
@@ -48,6 +49,15 @@ class PrivateKey(Protocol):
 
     def ecdh(self, peer: bytes) -> bytes:
         """Return the x-coordinate (32 octets) of the ECC CDH with the 65-octet point ``peer``."""
+
+
+@dataclass(frozen=True)
+class Credentials:
+    """A station's credentials: its key, and its owner's CA's signature over it (SIG104, 64 octets) with P(CA)."""
+
+    key: PrivateKey
+    station_signature: bytes
+    ca: bytes
 
 
 class SoftwareKey:
@@ -150,6 +160,14 @@ def verify(point: bytes, message: bytes, signature: bytes) -> bool:
 def fingerprint(point: bytes) -> str:
     """SHA-256(P(x)), 64 hex digits; people are shown the first 16."""
     return hashlib.sha256(point).hexdigest()
+
+
+def other_key(pinned: str, node: bytes) -> KeyMismatchError:
+    """Return the error for a known UUID that comes with another key."""
+    return KeyMismatchError(
+        f"This UUID is known with key {pinned[:16]}, the node shows {fingerprint(node)[:16]}.",
+        hint="It may be a clone. If the board was replaced on purpose: whitelist remove UUID, then whitelist add UUID.",
+    )
 
 
 def to_pem(point: bytes) -> str:

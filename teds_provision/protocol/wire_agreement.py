@@ -14,18 +14,20 @@ import os
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import BadDataError, GarbledError, KeyMismatchError, NotAuthenticError, PolicyError
+from teds_provision.errors import BadDataError, GarbledError, NotAuthenticError, PolicyError
 from teds_provision.lazy import late
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import (
     POINT_OCTETS,
     SIGNATURE_OCTETS,
+    Credentials,
     PrivateKey,
     SoftwareKey,
     agreement_message,
     fingerprint,
     is_point,
     node_key_good,
+    other_key,
     verify,
 )
 from teds_provision.protocol.messages.frames import Command, Function, security_command
@@ -44,15 +46,6 @@ TAG_OCTETS = 16
 REQUEST_OCTETS = POINT_OCTETS + SIGNATURE_OCTETS + POINT_OCTETS + POINT_OCTETS
 REPLY_OCTETS = NONCE_OCTETS + 4 + POINT_OCTETS + TAG_OCTETS + SIGNATURE_OCTETS
 LAST_EPOCH = 0xFFFFFFFF
-
-
-@dataclass(frozen=True)
-class Credentials:
-    """A station's credentials: its key, and its owner's CA's signature over it (SIG104, 64 octets) with P(CA)."""
-
-    key: PrivateKey
-    station_signature: bytes
-    ca: bytes
 
 
 @dataclass(frozen=True)
@@ -207,14 +200,6 @@ class StationAgreement:
             )
         confirm = security_command(Function.CONFIRM, derived.station_tag)
         return AgreedKey(derived.key, offered, node, confirm, unsigned=not shown.signed)
-
-
-def other_key(pinned: str, node: bytes) -> KeyMismatchError:
-    """Return the error for a known UUID that comes with another key."""
-    return KeyMismatchError(
-        f"This UUID is known with key {pinned[:16]}, the node shows {fingerprint(node)[:16]}.",
-        hint="It may be a clone. If the board was replaced on purpose: whitelist remove UUID, then whitelist add UUID.",
-    )
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from teds_provision.errors import BadDataError, PolicyError
-from teds_provision.lazy import late
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.sanitize import printable
 from teds_provision.station.station import Station
+from teds_provision.teds import guard as guarding
 from teds_provision.teds.channel import Channel
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import AccessCode, Field
@@ -24,11 +24,6 @@ from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.profile.model import renamed
 from teds_provision.teds.profile.reader import NAME_OCTETS
 from teds_provision.teds.sheet import Sheet
-
-if TYPE_CHECKING:
-    from teds_provision.teds import guard as guarding
-else:  # numpy: not for a datasheet without calibration
-    guarding = late("teds_provision.teds.guard")
 
 _NAME: Final = (0, int(AccessCode.NAME))
 _PREFIX: Final = 4

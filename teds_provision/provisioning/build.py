@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from teds_provision import teds
 from teds_provision.errors import (
@@ -26,7 +26,6 @@ from teds_provision.errors import (
     UsageError,
 )
 from teds_provision.files import read_limited
-from teds_provision.lazy import late
 from teds_provision.protocol import datasheet
 from teds_provision.provisioning.adoption import read_factory_datasheet
 from teds_provision.provisioning.board_type import (
@@ -44,12 +43,15 @@ from teds_provision.sanitize import printable
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store import Draft, NodeRecord
+from teds_provision.teds import guard as guarding
 from teds_provision.teds.calibration import Calibration
+from teds_provision.teds.calibration.files import load_calibrations
 from teds_provision.teds.certificate import CertificateChoice, CertificateReference, ChooseItem
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.image import SECURITY, BlockId, Image
+from teds_provision.teds.profile import BuiltDatasheet, Profile
 from teds_provision.teds.profile.load import (
     default_folders,
     files_digest,
@@ -60,16 +62,6 @@ from teds_provision.teds.profile.load import (
 )
 from teds_provision.teds.profile.reader import NAME_OCTETS
 from teds_provision.teds.sheet import Sheet, described
-
-if TYPE_CHECKING:
-    from teds_provision.teds import calibration
-    from teds_provision.teds import guard as guarding
-    from teds_provision.teds.calibration import Calibration
-    from teds_provision.teds.image import BlockId
-    from teds_provision.teds.profile import BuiltDatasheet, Profile
-else:  # numpy: not for a datasheet without calibration
-    calibration, guarding = late("teds_provision.teds.calibration"), late("teds_provision.teds.guard")
-
 
 # -- the order: profile, calibration, name; read, fitted and guarded before any node is waited for ---------------------
 
@@ -437,7 +429,7 @@ def _from_file(order: BuildOrder, profile: Profile) -> Mapping[int, Calibration]
         return None
     pems = tuple(read_limited(path, _MOST_PEM, "certificate") for path in order.trusted)
     choice = CertificateChoice(order.channel, order.item, pems, order.choose)
-    return calibration.load_calibrations(order.calibration, profile, choice, due=order.due)
+    return load_calibrations(order.calibration, profile, choice, due=order.due)
 
 
 def _built_of(

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from teds_provision import teds
 from teds_provision.errors import PolicyError
+from teds_provision.station.station import Station
 from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.image import Image
 
 if TYPE_CHECKING:
-    from teds_provision.station.station import Station
     from teds_provision.teds.calibration import Calibration
     from teds_provision.teds.guard import GuardFinding
-    from teds_provision.teds.image import Image
     from teds_provision.teds.profile import Profile
 
 

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 from teds_provision.errors import BadDataError, BadDatasheetError, NotAuthenticError, TedsProvisionError, UnprovenError
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.fingerprints import same_key
-from teds_provision.protocol.keys import fingerprint, node_key_good
+from teds_provision.protocol.keys import fingerprint, node_key_good, other_key
 from teds_provision.protocol.messages.identity import Identity
-from teds_provision.protocol.wire_agreement import other_key
 from teds_provision.shapes.verdict import FRESHNESS, PAGES, SESSION, Check, Verification
 from teds_provision.station.plant.plant import SignerRules
 from teds_provision.station.station import Station

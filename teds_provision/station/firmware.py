@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 from teds_provision import teds
 from teds_provision.errors import BadDataError, GarbledError, NotFoundError, StoreError
 from teds_provision.protocol.messages.firmware import FirmwareFlag, FirmwareReport
+from teds_provision.station.station import Station
+from teds_provision.station.store.records import FirmwareRecord
 
 if TYPE_CHECKING:
-    from teds_provision.station.station import Station
-    from teds_provision.station.store.records import FirmwareRecord
     from teds_provision.teds.profile.firmware import FirmwareDemand
 
 CHANGED: Final = "firmware changed since calibration"

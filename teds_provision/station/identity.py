@@ -5,10 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING
 
 from teds_provision.errors import NotAuthenticError, NotFoundError, PolicyError, VaultError
-from teds_provision.lazy import late
 from teds_provision.protocol import keys
 from teds_provision.station.row_macs import KEY_OCTETS, MacRow, RowMacs, Values, changed
 from teds_provision.station.store.database import places
@@ -16,12 +14,7 @@ from teds_provision.station.store.records import StationRecord
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 from teds_provision.vault.base import Vault
-
-if TYPE_CHECKING:
-    from teds_provision.protocol import wire_agreement
-    from teds_provision.vault.master import MasterKeys
-else:  # the codec of the TEDS: not for commands that only list
-    wire_agreement = late("teds_provision.protocol.wire_agreement")
+from teds_provision.vault.master import MasterKeys
 
 DEFAULT_NAME = "station"
 _FACTS = ", ".join(column.name for column in fields(StationRecord))
@@ -252,10 +245,10 @@ class StationIdentity:
             )
         return signature
 
-    def credentials(self, ca: bytes | None = None) -> wire_agreement.Credentials:
+    def credentials(self, ca: bytes | None = None) -> keys.Credentials:
         """Return the credentials that the station shows under ``ca``, by default the owner's."""
         under = self.ca if ca is None else ca
-        return wire_agreement.Credentials(self._vault().identity(), self.signature_under(under), under)
+        return keys.Credentials(self._vault().identity(), self.signature_under(under), under)
 
 
 def _bound(record: StationRecord) -> Values:

@@ -6,9 +6,8 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, replace
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from teds_provision.lazy import late
 from teds_provision.protocol import keys
 from teds_provision.protocol.fingerprints import is_whole, same_key
 from teds_provision.station.datasheets import Datasheets
@@ -20,11 +19,6 @@ from teds_provision.station.store.database import PAGE, places
 from teds_provision.station.store.records import ExportEligibility, NodeRecord, WhitelistEntry
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
-
-if TYPE_CHECKING:
-    from teds_provision.protocol import wire_agreement
-else:  # the codec of the TEDS: not for commands that only list
-    wire_agreement = late("teds_provision.protocol.wire_agreement")
 
 _values = attrgetter(*(column.name for column in fields(WhitelistEntry)))
 
@@ -94,7 +88,7 @@ class Pins:
         pinned = self.pinned(uuid)
         if pinned is not None and not same_key(pinned, keys.fingerprint(point)):
             self._record(uuid, keys.fingerprint(point), pinned)
-            raise wire_agreement.other_key(pinned, point)
+            raise keys.other_key(pinned, point)
 
     def _record(self, uuid: bytes, shown: str, pinned: str) -> None:
         """One entry of the audit log in :data:`RECORD_AGAIN`; ``unrecorded``: how often it happened since the last."""

@@ -62,13 +62,12 @@ from teds_provision.station.store.database import has_store
 from teds_provision.station.store.dump import RowSource, dump, load
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.vault.base import Ask, Vault, node_key_context
+from teds_provision.vault.master import MasterKeys
 
 if TYPE_CHECKING:
-    from teds_provision.protocol import wire_agreement
     from teds_provision.vault import master_socket, selection
-    from teds_provision.vault.master import MasterKeys
 else:
-    # cryptography, sockets and processes: `nodes` and others open no vault
+    # sockets and processes: `nodes` and others open no vault
     master_socket, selection = late("teds_provision.vault.master_socket"), late("teds_provision.vault.selection")
 
 __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", "not_initialised"]
@@ -309,7 +308,7 @@ class Station:
         if uuid is None or self.keys.held(uuid):
             self.current_vault()
 
-    def credentials(self, uuid: bytes | None = None) -> wire_agreement.Credentials:
+    def credentials(self, uuid: bytes | None = None) -> keys.Credentials:
         """Return the credentials for node ``uuid`` under the CA that this node keeps, else the station's own."""
         return self.identity.credentials(None if uuid is None else self.keys.ca_of(uuid))
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from teds_provision.protocol.keys import PrivateKey
-
-if TYPE_CHECKING:
-    from teds_provision.vault.master import MasterKeys
+from teds_provision.vault.master import MasterKeys
 
 Ask = Callable[[str, bool], str]
 """``ask(prompt, confirm)`` returns a passphrase or PIN; raises if there is no terminal to ask at."""

@@ -4,17 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from teds_provision.errors import VaultError
-from teds_provision.lazy import late
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint
+from teds_provision.vault import ca_file
 from teds_provision.vault.master import MasterKeys, Material, another_life
-
-if TYPE_CHECKING:
-    from teds_provision.vault import ca_file
-else:  # PKCS #8: for the commands of the CA key alone
-    ca_file = late("teds_provision.vault.ca_file")
 
 
 class SoftwareVault(ABC):

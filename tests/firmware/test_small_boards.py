@@ -7,11 +7,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from teds_provision.protocol.keys import GROUP_ORDER
+from teds_provision.protocol.keys import GROUP_ORDER, Credentials
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, security_command
 from teds_provision.protocol.operation.commands import read_data_set, run_self_test, sample, set_values, write_data_set
 from teds_provision.protocol.operation.stream_commands import stop
-from teds_provision.protocol.wire_agreement import Credentials, StationAgreement
+from teds_provision.protocol.wire_agreement import StationAgreement
 from tests.firmware.bench import Acting, CBench
 from tests.firmware.desk import CDesk
 from tests.protocol.desk import CREDENTIALS, META, NAME, UUID, Desk

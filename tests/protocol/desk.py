@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 from teds_provision.protocol.datasheet import SignedNodeKey, digests, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.flash import Flash
-from teds_provision.protocol.keys import SoftwareKey, fingerprint, node_key_message, station_key_message
+from teds_provision.protocol.keys import Credentials, SoftwareKey, fingerprint, node_key_message, station_key_message
 from teds_provision.protocol.messages.frames import Command, Reply, decode_reply, update_teds, write_teds
 from teds_provision.protocol.session import StationSession
 from teds_provision.protocol.tim import Tim
-from teds_provision.protocol.wire_agreement import Credentials, StationAgreement
+from teds_provision.protocol.wire_agreement import StationAgreement
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY, BlockId

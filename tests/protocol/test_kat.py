@@ -9,11 +9,11 @@ import pytest
 from teds_provision.protocol import keys
 from teds_provision.protocol.datasheet import SignedNodeKey, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.flash import Flash
-from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.keys import Credentials, SoftwareKey
 from teds_provision.protocol.messages.frames import Command, decode_reply
 from teds_provision.protocol.session import StationSession, pad
 from teds_provision.protocol.tim import Tim
-from teds_provision.protocol.wire_agreement import Credentials, StationAgreement, derive
+from teds_provision.protocol.wire_agreement import StationAgreement, derive
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
 

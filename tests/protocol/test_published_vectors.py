@@ -12,11 +12,11 @@ import pytest
 from teds_provision.errors import TedsProvisionError
 from teds_provision.protocol.handover.bundle import open_bundle
 from teds_provision.protocol.handover.receipt import open_receipt
-from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
+from teds_provision.protocol.keys import Credentials, SoftwareKey, fingerprint, station_key_message
 from teds_provision.protocol.messages.frames import Command, decode_reply
 from teds_provision.protocol.repetition import Repetition
 from teds_provision.protocol.session import StationSession
-from teds_provision.protocol.wire_agreement import Credentials, StationAgreement
+from teds_provision.protocol.wire_agreement import StationAgreement
 from teds_provision.teds.codec import security
 from tests.vectors import generate
 from tests.vectors.scene import BLOCKS

@@ -9,6 +9,7 @@ import pytest
 from teds_provision.errors import GarbledError, KeyMismatchError, NotAuthenticError, PolicyError
 from teds_provision.protocol.keys import (
     GROUP_ORDER,
+    Credentials,
     SoftwareKey,
     agreement_message,
     fingerprint,
@@ -20,7 +21,6 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.tim import Tim
 from teds_provision.protocol.wire_agreement import (
     AgreedKey,
-    Credentials,
     NodeAgreement,
     RequestPayload,
     StationAgreement,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.errors import LinkError, NodeRefusedError
-from teds_provision.protocol.keys import SoftwareKey, station_key_message
+from teds_provision.protocol.keys import Credentials, SoftwareKey, station_key_message
 from teds_provision.protocol.messages.frames import Function, Reason, decode_reply, read_teds, security_command
 from teds_provision.protocol.session import StationSession
-from teds_provision.protocol.wire_agreement import Credentials, StationAgreement
+from teds_provision.protocol.wire_agreement import StationAgreement
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.teds.image import SECURITY
 from tests.bench import Board, MemoryLink, contact, talk

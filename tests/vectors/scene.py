@@ -15,11 +15,18 @@ from typing import Any
 
 from teds_provision.protocol.datasheet import SignedNodeKey, digests, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.flash import Flash
-from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, fingerprint, node_key_message, station_key_message
+from teds_provision.protocol.keys import (
+    GROUP_ORDER,
+    Credentials,
+    SoftwareKey,
+    fingerprint,
+    node_key_message,
+    station_key_message,
+)
 from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
 from teds_provision.protocol.session import SessionKeys, StationSession, _seal, open_mac
 from teds_provision.protocol.tim import Tim
-from teds_provision.protocol.wire_agreement import AgreedKey, Credentials, StationAgreement, key_id
+from teds_provision.protocol.wire_agreement import AgreedKey, StationAgreement, key_id
 from teds_provision.teds.image import SECURITY, BlockId
 from tests.protocol.memory import RamFlash
 

@@ -17,11 +17,11 @@ from teds_provision.cli.options import options_given
 from teds_provision.errors import UsageError
 from teds_provision.links import LinkSettings
 from teds_provision.station.label import require_label_packages
+from teds_provision.station.station import Station
 
 if TYPE_CHECKING:
     from teds_provision.plant.line import LineRun
     from teds_provision.provisioning.batch import ProvisionRequest
-    from teds_provision.station.station import Station
 
 
 @dataclass(frozen=True)

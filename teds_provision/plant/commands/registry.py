@@ -26,20 +26,16 @@ from teds_provision.cli.options import (
 from teds_provision.cli.rendering import local_time, moment, print_json_list
 from teds_provision.errors import NotFoundError, PolicyError
 from teds_provision.files import SHARED, write_new
-from teds_provision.lazy import late
 from teds_provision.plant.transport import Transport
 from teds_provision.protocol import keys
+from teds_provision.protocol.plant import document, roster
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.sanitize import sanitize
 
 if TYPE_CHECKING:
     from teds_provision.plant.status import PlantStatus, StationStanding
     from teds_provision.plant.sync import SyncResult
-    from teds_provision.protocol.plant import document, roster
     from teds_provision.station.station import Station
-else:
-    document = late("teds_provision.protocol.plant.document")
-    roster = late("teds_provision.protocol.plant.roster")
 
 _FILE: Final = click.Path(path_type=Path, dir_okay=False)
 _FOLDER: Final = click.Path(path_type=Path, file_okay=False)

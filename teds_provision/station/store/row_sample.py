@@ -10,10 +10,9 @@ from __future__ import annotations
 import json
 import random
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-if TYPE_CHECKING:
-    from teds_provision.station.store.database import Database
+from teds_provision.station.store.database import Database
 
 SAMPLED: Final = 5_000
 """Rows at random of each large table; a table with no more rows is read whole."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.errors import BadDataError, VaultError
-from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, verify
-from teds_provision.protocol.wire_agreement import Credentials, NodeAgreement, StationAgreement
+from teds_provision.protocol.keys import Credentials, SoftwareKey, fingerprint, station_key_message, verify
+from teds_provision.protocol.wire_agreement import NodeAgreement, StationAgreement
 
 pytestmark = pytest.mark.system
 
