@@ -1,7 +1,8 @@
 """A stranger's node: a firmware written from the contract alone, in one loop, on CAN.
 
 Usage: python -m tests.strangers.node FILE. FILE is JSON: bus (group, port, fd, address), uuid, key, epoch, sequence,
-identity (private scalar), teds {"channel,code": hex}, channels {number: {kind, octets, shortest, bears}}, fault.
+identity (private scalar), teds {"channel,code": hex}, channels {number: {kind, octets, shortest, bears}}, fault, and
+pause, the seconds that each turn takes longer.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ from tests.strangers.wire import Wire, pieces
 MAX = 2048
 SENSOR, EVENT, ACTUATOR = "sensor", "event sensor", "actuator"
 DRIFT, STEP = 50, 1000
+HURRY, HURRIED = 10**10, 50
+"""A node that sends from the future is ahead by so many ns at most, and sends so many messages a turn until it is."""
 
 
 class No(Exception):
@@ -434,14 +437,15 @@ class Node:
             if now - session.heard > session.lease * 10**9:
                 self.let_go(session, list(session.claims))
             for number, stream in list(session.streams.items()):
-                if stream.start is not None:
-                    self.due(session, number, stream, now)
+                for _ in range(HURRIED if self.fault == "from the future" else 1):
+                    if stream.start is not None:
+                        self.due(session, number, stream, now)
 
     def due(self, session: Session, number: int, stream: Stream, now: int) -> None:
         assert stream.start is not None
         first = stream.start + stream.counter * stream.n * stream.period
         last = first + (stream.n - 1) * stream.period
-        hurry = 10**10 if self.fault == "from the future" else 0
+        hurry = HURRY if self.fault == "from the future" else 0
         if now + hurry < last:
             return
         instants = [first + i * stream.period for i in range(stream.n)]
@@ -521,6 +525,7 @@ class Node:
         announced = False
         while True:
             self.wire.turn(0.002)
+            time.sleep(self.given.get("pause", 0.0))
             self.pump()
             if not announced:
                 self.announce()

@@ -72,8 +72,8 @@ class Stranger:
         plan.write_text(json.dumps(given))
         return plan
 
-    def start(self, fault: str = "", *, program: str = "tests.strangers.node") -> Stranger:
-        self.process = self.hall.desk.start(self.plan(fault), program=(sys.executable, "-m", program))
+    def start(self, fault: str = "", *, program: str = "tests.strangers.node", **more: Any) -> Stranger:
+        self.process = self.hall.desk.start(self.plan(fault, **more), program=(sys.executable, "-m", program))
         self.process.wait_for('"ready": true')
         return self
 
@@ -253,6 +253,14 @@ def test_a_fault_is_counted_and_no_value_is_false(classic_angle: Stranger, fault
     assert indices == sorted(set(indices))
     [stream] = lines[-1]["nodes"][0]["streams"]
     assert FAULTS[fault](stream), (stream, outcome.err)
+
+
+def test_what_a_slow_node_sends_from_the_future_is_bad_too(classic_angle: Stranger) -> None:
+    """It sent one message a turn: on a busy machine turns took longer than messages, and all of them had come true."""
+    node = classic_angle.start("from the future", pause=0.05)
+    outcome = node.hall.begin(node.uuid, "--rate", 400, "--duration", 2, can=node.can).end()
+    [stream] = events(outcome.out)[-1]["nodes"][0]["streams"]
+    assert stream["bad"] > stream["messages"], (stream, outcome.err)
 
 
 @pytest.mark.parametrize("fault", ["clock runs back", "clock at the end of time"])
