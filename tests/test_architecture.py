@@ -21,8 +21,18 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 # Room: the rooms that it may import. All may import those of _FOR_ALL and itself; all but protocol also files and
 # portable.
-_FOR_ALL = {"errors", "sanitize", "lazy", "limits", "json_decoder", "optional_rooms"}
-WITHOUT_FILES = {"errors", "sanitize", "lazy", "limits", "portable", "protocol", "json_decoder", "optional_rooms"}
+_FOR_ALL = {"errors", "sanitize", "lazy", "arrays", "limits", "json_decoder", "optional_rooms"}
+WITHOUT_FILES = {
+    "errors",
+    "sanitize",
+    "lazy",
+    "arrays",
+    "limits",
+    "portable",
+    "protocol",
+    "json_decoder",
+    "optional_rooms",
+}
 _BELOW_PROVISIONING = {"station", "links", "vault", "protocol", "teds", "shapes"}
 ARROWS = {
     "shapes": set(),
@@ -32,6 +42,7 @@ ARROWS = {
     "portable": set(),
     "sanitize": set(),
     "lazy": set(),
+    "arrays": set(),
     "limits": set(),
     "optional_rooms": set(),
     "json_decoder": set(),

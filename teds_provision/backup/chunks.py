@@ -9,18 +9,10 @@ that was cut off or carried on, fail at a tag.
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING, BinaryIO, Final, Protocol
+from typing import BinaryIO, Final, Protocol
 
 from teds_provision.errors import BadDataError, NotAuthenticError
-from teds_provision.lazy import late
-
-if TYPE_CHECKING:
-    from cryptography import exceptions
-    from cryptography.hazmat.primitives.ciphers import aead
-else:
-    exceptions = late("cryptography.exceptions")
-    aead = late("cryptography.hazmat.primitives.ciphers.aead")
-
+from teds_provision.protocol.primitives import aead, exceptions
 
 CHUNK_OCTETS: Final = 1 << 20
 KEY_OCTETS: Final = 32

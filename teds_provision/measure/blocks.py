@@ -10,15 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+from teds_provision.arrays import NDArray
 from teds_provision.teds import Units
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.channel import spans_a_turn
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
 
 Kind = Literal["sensor", "event", "actuator"]
 MOST_REASONS = 3  # reasons in one line

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from teds_provision.arrays import np
 from teds_provision.errors import NotFoundError, PolicyError
 from teds_provision.files import SHARED, read_text, write_whole
-from teds_provision.lazy import late
 from teds_provision.limits import LIMITS
 from teds_provision.links import LinkSettings
 from teds_provision.measure.sample_series import SampleSeries, reference_for, require_still, take_samples_of
@@ -23,11 +23,6 @@ from teds_provision.station.station import Station
 from teds_provision.teds.calibration.points import Point, points_of, with_point
 from teds_provision.teds.calibration.zero import reading_of
 from teds_provision.teds.channel import Channel
-
-if TYPE_CHECKING:
-    import numpy as np
-else:
-    np = late("numpy")
 
 _NAME: Final = "calibrate capture"
 

@@ -16,14 +16,12 @@ import math
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from teds_provision.arrays import NDArray
 from teds_provision.protocol.operation.subscription import TickBounds
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 OWN_DRIFT = 50.0  # ppm that the host's clock may be off beside the node's
 NODE_DRIFT = 100.0  # ppm, until the node has reported its own

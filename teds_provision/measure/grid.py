@@ -10,14 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from teds_provision.arrays import NDArray
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 PERIODS_OF_A_VALUE = 2.0  # then it is too old to represent the channel
 LONGEST_BURST = 10_000  # rows at once; a longer gap of all streams is left out

@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from teds_provision.arrays import NDArray, np
 from teds_provision.errors import BadDataError, PolicyError, UsageError
-from teds_provision.lazy import late
 from teds_provision.measure.held_actuator import unit_for
 from teds_provision.measure.verified_session import VerifiedSession, claim
 from teds_provision.protocol.operation.commands import SampleReply, idle, sample
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.zero import SampleStatistics, reading_of, turn_of
 from teds_provision.teds.sheet import Channel
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-else:
-    np = late("numpy")
 
 SAMPLES: Final = 32
 SECONDS: Final = 0.5

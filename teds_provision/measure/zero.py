@@ -10,10 +10,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from teds_provision.arrays import np
 from teds_provision.errors import BadDataError, PolicyError
-from teds_provision.lazy import late
 from teds_provision.links import LinkSettings
 from teds_provision.measure.held_actuator import unit_for
 from teds_provision.measure.sample_series import SampleSeries, reference_for, require_still, take_samples_of
@@ -38,11 +38,6 @@ from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.diff import diff_blocks
 from teds_provision.teds.image import Image
 from teds_provision.teds.units import format_value
-
-if TYPE_CHECKING:
-    import numpy as np
-else:
-    np = late("numpy")
 
 _NAME = "calibrate zero"
 _AFTERWARDS: Final = 16

@@ -16,19 +16,13 @@ import time
 from collections import deque
 from collections.abc import Container, Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from teds_provision.arrays import NDArray, np
 from teds_provision.errors import NotFoundError
-from teds_provision.lazy import late
 from teds_provision.measure.blocks import Block, ChannelFacts
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.codec.model import Units
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-else:
-    np = late("numpy")
 
 HOUR, MINUTE = 3600, 60
 FINE: Final = 0.01  # seconds of a bin of the last minute

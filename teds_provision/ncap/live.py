@@ -16,21 +16,14 @@ from collections import deque
 from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from teds_provision.lazy import late
+from teds_provision.arrays import NDArray, np
 from teds_provision.measure.blocks import Block, ChannelFacts
 from teds_provision.measure.sinks.lines import plain
 from teds_provision.ncap.history import History, raw_numbers
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.teds.channel import TURN
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-else:
-    np = late("numpy")
 
 BEAT: Final = 0.05  # seconds between two messages of values
 POINTS: Final = 100.0  # a second and channel, at most

@@ -10,21 +10,10 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from teds_provision.errors import BadDataError, KeyMismatchError
-from teds_provision.lazy import late
-
-if TYPE_CHECKING:
-    from cryptography import exceptions
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import ec, utils
-else:
-    ec = late("cryptography.hazmat.primitives.asymmetric.ec")
-    exceptions = late("cryptography.exceptions")
-    hashes = late("cryptography.hazmat.primitives.hashes")
-    serialization = late("cryptography.hazmat.primitives.serialization")
-    utils = late("cryptography.hazmat.primitives.asymmetric.utils")
+from teds_provision.protocol.primitives import ec, exceptions, hashes, serialization, utils
 
 POINT_OCTETS = 65
 SIGNATURE_OCTETS = 64

@@ -10,25 +10,12 @@ from __future__ import annotations
 import hmac
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from teds_provision.errors import GarbledError, NotAuthenticError
-from teds_provision.lazy import late
 from teds_provision.protocol.keys import POINT_OCTETS, PrivateKey, SoftwareKey
 from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
+from teds_provision.protocol.primitives import aead, exceptions, hashes, hkdf
 from teds_provision.protocol.wire_agreement import good_one_time, key_id
-
-if TYPE_CHECKING:
-    from cryptography import exceptions
-    from cryptography.hazmat.primitives import hashes
-    from cryptography.hazmat.primitives.ciphers import aead
-    from cryptography.hazmat.primitives.kdf import hkdf
-else:
-    exceptions = late("cryptography.exceptions")
-    aead = late("cryptography.hazmat.primitives.ciphers.aead")
-    hashes = late("cryptography.hazmat.primitives.hashes")
-    hkdf = late("cryptography.hazmat.primitives.kdf.hkdf")
-
 
 COUNTER_OCTETS = 8
 KEY_ID_OCTETS = 8

@@ -12,10 +12,8 @@ import hashlib
 import hmac
 import os
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadDataError, GarbledError, NotAuthenticError, PolicyError
-from teds_provision.lazy import late
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import (
     POINT_OCTETS,
@@ -31,15 +29,9 @@ from teds_provision.protocol.keys import (
     verify,
 )
 from teds_provision.protocol.messages.frames import Command, Function, security_command
+from teds_provision.protocol.primitives import hashes, hkdf
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
-
-if TYPE_CHECKING:
-    from cryptography.hazmat.primitives import hashes
-    from cryptography.hazmat.primitives.kdf import hkdf
-else:
-    hashes = late("cryptography.hazmat.primitives.hashes")
-    hkdf = late("cryptography.hazmat.primitives.kdf.hkdf")
 
 NONCE_OCTETS = 16
 TAG_OCTETS = 16

@@ -6,20 +6,14 @@ import time
 from contextlib import closing, suppress
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from teds_provision.errors import StoreError
 from teds_provision.files import whole_draft
-from teds_provision.lazy import late
 from teds_provision.station.station import Station
 from teds_provision.station.store.connection import as_store_failure
 from teds_provision.station.store.database import FILE_NAME
-
-if TYPE_CHECKING:
-    import sqlite3
-else:  # loaded with the first store: --help does not wait for it
-    sqlite3 = late("sqlite3")
-
+from teds_provision.station.store.sqlite import sqlite3
 
 _COUNTED: Final = ("whitelist", "nodes", "keys", "trust")
 _DAMAGE: Final = (11, 26)  # SQLITE_CORRUPT, SQLITE_NOTADB (sqlite.org, rescode): for --help sqlite3 is not loaded

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from enum import IntEnum
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from teds_provision.arrays import Ends, NDArray, np
 from teds_provision.errors import BadDataError
-from teds_provision.lazy import late
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import DataModel, SampleForm
 from teds_provision.teds.codec.decode import decode
@@ -29,14 +29,6 @@ from teds_provision.teds.units import (
     parse_unit,
     units_of,
 )
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Ends = float | NDArray[np.float64]
-else:
-    np = late("numpy")
 
 NOT_STATED: Final = math.nan
 """Represents a number that the TEDS lack, or call not available: IEEE 1451.0 writes NaN for that itself."""

@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from teds_provision.lazy import late
+from teds_provision.arrays import NDArray, np
 from teds_provision.teds.calibration.formula import evaluate
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import Range
@@ -18,13 +18,6 @@ from teds_provision.teds.image import BlockId
 from teds_provision.teds.profile.model import Profile
 from teds_provision.teds.sheet import described
 from teds_provision.teds.units import WrittenUnit, display_unit, format_value
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-else:
-    np = late("numpy")
 
 SAMPLES: Final = 65_537
 GRID: Final = 250_000

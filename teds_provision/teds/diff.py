@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from teds_provision.arrays import np
 from teds_provision.errors import BadDataError
-from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import kind_of
 from teds_provision.teds.calibration.model import Calibration, from_decoded, is_sound
 from teds_provision.teds.codec.decode import decode
@@ -17,12 +17,6 @@ from teds_provision.teds.curve import Curve, CurveChannel, channel_of, curve_of
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.sheet import described, name_among
 from teds_provision.teds.show import Context, meaning_of, text_of
-
-if TYPE_CHECKING:
-    import numpy as np
-
-else:
-    np = late("numpy")
 
 _BLOCKS: Final[Mapping[int, str]] = {
     AccessCode.META: "Meta-TEDS",

@@ -11,10 +11,10 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
+from teds_provision.arrays import np
 from teds_provision.errors import BadDataError
-from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import evaluate, residuals
 from teds_provision.teds.calibration.model import Calibration, from_decoded
 from teds_provision.teds.calibration.samples import Range
@@ -24,12 +24,6 @@ from teds_provision.teds.codec.model import AccessCode, DecodedTeds
 from teds_provision.teds.curve import FLOAT32_STEP, Curve, CurveChannel, channel_of, curve_of
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.profile.model import ChannelProfile, Profile
-
-if TYPE_CHECKING:
-    import numpy as np
-else:
-    np = late("numpy")
-
 
 # The single checks of the guard on a curve that can be computed.
 

@@ -10,11 +10,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from teds_provision.arrays import np
 from teds_provision.errors import BadDataError, TedsProvisionError, UsageError
 from teds_provision.files import SHARED, write_whole
-from teds_provision.lazy import how_to_install, late
+from teds_provision.lazy import how_to_install
 from teds_provision.teds.calibration.formula import kind_of, residuals
 from teds_provision.teds.calibration.model import Calibration, is_sound
 from teds_provision.teds.channel import TURN, wrapped
@@ -22,12 +23,6 @@ from teds_provision.teds.curve import Curve, CurveChannel, channel_of, curve_of
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.profile.model import Profile
 from teds_provision.teds.sheet import Sheet, name_among
-
-if TYPE_CHECKING:
-    import numpy as np
-
-else:
-    np = late("numpy")
 
 FORMATS: Final = ("png", "svg")
 COLUMNS: Final = 3

@@ -12,19 +12,11 @@ import binascii
 import json
 import os
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from teds_provision.errors import UnknownMasterKeyError, VaultError
-from teds_provision.lazy import late
 from teds_provision.protocol.keys import SoftwareKey
-
-if TYPE_CHECKING:
-    from cryptography import exceptions
-    from cryptography.hazmat.primitives.ciphers import aead
-else:
-    exceptions = late("cryptography.exceptions")
-    aead = late("cryptography.hazmat.primitives.ciphers.aead")
-
+from teds_provision.protocol.primitives import aead, exceptions
 
 MASTER_OCTETS = 32
 _SECRET_OCTETS = 32

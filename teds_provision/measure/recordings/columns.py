@@ -8,15 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
+from teds_provision.arrays import NDArray
 from teds_provision.measure.blocks import Block
 from teds_provision.measure.recordings.source import ROWS, Entry
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _EXACT = 2**53  # integers up to here are floats without loss
 

@@ -6,10 +6,11 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, get_args
+from typing import Any, Final, get_args
 
 import numpy as np
 
+from teds_provision.arrays import NDArray
 from teds_provision.errors import BadDataError
 from teds_provision.files import open_to_read
 from teds_provision.measure.blocks import Block, InvalidValues, NodeReport, Note, State
@@ -22,9 +23,6 @@ from teds_provision.measure.recordings.source import (
     facts_of,
     station_of,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 FIRST: Final = b'{"event":'
 _PIECE: Final = 1 << 20

@@ -13,10 +13,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any, BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 
+from teds_provision.arrays import NDArray
 from teds_provision.errors import BadDataError
 from teds_provision.files import open_to_read
 from teds_provision.measure.blocks import Block, ChannelFacts, Note
@@ -36,9 +37,6 @@ from teds_provision.measure.sinks.mcap.writer import (
     METADATA,
     SCHEMA,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _STREAM: Final = re.compile(r"/stream_(\d{1,3})$")
 _SMALLEST: Final = {kind: layout(0, kind).itemsize for kind in (True, False)}

@@ -10,10 +10,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
+from teds_provision.arrays import NDArray
 from teds_provision.errors import BadDataError, UsageError
 from teds_provision.lazy import how_to_install
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, Note, StationFacts
@@ -23,9 +24,6 @@ from teds_provision.measure.recordings.source import MOST, ROWS, Entry, Recordin
 from teds_provision.measure.sinks.lines import facts_as_json, iso, status_line
 from teds_provision.measure.sinks.text import heads_of, names_of, note_of
 from teds_provision.sanitize import printable
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 MAGIC: Final = b"PAR1"
 _KEY: Final = b"teds-provision"

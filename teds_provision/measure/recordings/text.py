@@ -6,19 +6,17 @@ import csv
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
+from teds_provision.arrays import NDArray
 from teds_provision.errors import BadDataError
 from teds_provision.files import open_to_read
 from teds_provision.limits import load_json
 from teds_provision.measure.blocks import ChannelFacts, GroupRows, NodeReport, Note, State
 from teds_provision.measure.recordings.columns import Rows, Streams, integers, raw_kind
 from teds_provision.measure.recordings.source import MOST, ROWS, Entry, Recording, facts_of, station_of, unix_of
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 FIRST: Final = "# teds-provision measurement, text 1"
 _PIECE: Final = 1 << 20

@@ -14,10 +14,9 @@ import secrets
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 from teds_provision.errors import BadDataError, NotAuthenticError
-from teds_provision.lazy import late
 from teds_provision.limits import check_size
 from teds_provision.protocol.handover.jose import (
     CHANGED_CONTENT,
@@ -38,12 +37,7 @@ from teds_provision.protocol.handover.strict_json import (
     separators,
 )
 from teds_provision.protocol.keys import PrivateKey
-
-if TYPE_CHECKING:
-    from cryptography import exceptions
-else:
-    exceptions = late("cryptography.exceptions")
-
+from teds_provision.protocol.primitives import exceptions
 
 PIECE = 64 * 1024
 _LONGEST_EDGE = 16384  # characters of a JWS header or signature

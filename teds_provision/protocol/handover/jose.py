@@ -19,7 +19,6 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError
-from teds_provision.lazy import late
 from teds_provision.limits import check_size
 from teds_provision.protocol.handover.strict_json import (
     Base64urlWriter,
@@ -33,25 +32,18 @@ from teds_provision.protocol.handover.strict_json import (
     write_base64url,
 )
 from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey, SoftwareKey, fingerprint, public_key
-
-if TYPE_CHECKING:
-    from cryptography import exceptions
-    from cryptography.hazmat.primitives import ciphers, hashes, keywrap
-    from cryptography.hazmat.primitives.asymmetric import ec, utils
-    from cryptography.hazmat.primitives.ciphers import aead, algorithms, modes
-    from cryptography.hazmat.primitives.kdf import concatkdf
-else:
-    exceptions = late("cryptography.exceptions")
-    ec = late("cryptography.hazmat.primitives.asymmetric.ec")
-    utils = late("cryptography.hazmat.primitives.asymmetric.utils")
-    ciphers = late("cryptography.hazmat.primitives.ciphers")
-    aead = late("cryptography.hazmat.primitives.ciphers.aead")
-    algorithms = late("cryptography.hazmat.primitives.ciphers.algorithms")
-    modes = late("cryptography.hazmat.primitives.ciphers.modes")
-    hashes = late("cryptography.hazmat.primitives.hashes")
-    concatkdf = late("cryptography.hazmat.primitives.kdf.concatkdf")
-    keywrap = late("cryptography.hazmat.primitives.keywrap")
-
+from teds_provision.protocol.primitives import (
+    aead,
+    algorithms,
+    ciphers,
+    concatkdf,
+    ec,
+    exceptions,
+    hashes,
+    keywrap,
+    modes,
+    utils,
+)
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.ciphers import AEADDecryptionContext

@@ -14,19 +14,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from teds_provision.errors import BadDataError, NewerStoreError, StoreError, StoreLockedError, TedsProvisionError
-from teds_provision.lazy import late
 from teds_provision.portable import CLOSING, NOFOLLOW, sync_content
 from teds_provision.station.store.background_writer import BackgroundWriter
 from teds_provision.station.store.schema import SCHEMA_VERSION
-
-if TYPE_CHECKING:
-    import sqlite3
-else:  # loaded with the first store: --help does not wait for it
-    sqlite3 = late("sqlite3")
-
+from teds_provision.station.store.sqlite import sqlite3
 
 # Errors of SQLite and the system when the store's file fails, as messages of the tool: cause and remedy.
 

@@ -15,10 +15,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 from teds_provision.errors import StoreError, StoreLockedError
-from teds_provision.lazy import late
 from teds_provision.portable import NOFOLLOW, is_mine, is_open_to
 from teds_provision.station.store.connection import (
     BUSY_SECONDS,
@@ -31,12 +30,7 @@ from teds_provision.station.store.connection import (
     too_old,
 )
 from teds_provision.station.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, statements
-
-if TYPE_CHECKING:
-    import sqlite3
-else:  # loaded with the first store: --help does not wait for it
-    sqlite3 = late("sqlite3")
-
+from teds_provision.station.store.sqlite import sqlite3
 
 # Before SQLite opens anything in the home of a station: its owner, its permissions, and its content.
 

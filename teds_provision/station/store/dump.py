@@ -12,20 +12,14 @@ import re
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 from teds_provision.errors import BadDataError, StoreError
-from teds_provision.lazy import late
 from teds_provision.station.store.connection import too_old
 from teds_provision.station.store.database import PAGE, places
 from teds_provision.station.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, statements
+from teds_provision.station.store.sqlite import sqlite3
 from teds_provision.station.store.store import Store
-
-if TYPE_CHECKING:
-    import sqlite3
-else:  # loaded with the first store: --help does not wait for it
-    sqlite3 = late("sqlite3")
-
 
 MAX_RECORD_OCTETS: Final = 128 << 20
 _MAX_HEAD_OCTETS: Final = 64 * 1024

@@ -27,12 +27,12 @@ from teds_provision.lazy import late
 from teds_provision.portable import CLOSING, HAS_LOCKS, NOFOLLOW, lock
 from teds_provision.station.store.connection import as_store_failure
 from teds_provision.station.store.records import utc_now
+from teds_provision.station.store.sqlite import sqlite3
 
 if TYPE_CHECKING:
     import fcntl
-    import sqlite3
 else:  # no such module on Windows, where nodes are not used
-    fcntl, sqlite3 = late("fcntl"), late("sqlite3")
+    fcntl = late("fcntl")
 
 FILE_NAME = "store.lock"
 TURNS_NAME = "store.turns"

@@ -5,15 +5,13 @@ from __future__ import annotations
 import secrets
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Literal, Self
+from typing import Literal, Self
 
 from teds_provision.errors import BadDataError, StoreError
 from teds_provision.station.store.audit import AuditLog
 from teds_provision.station.store.database import FILE_NAME, Database
 from teds_provision.station.store.row_sample import ALL_ROWS, RowSample
-
-if TYPE_CHECKING:
-    import sqlite3
+from teds_provision.station.store.sqlite import sqlite3
 
 _ID_OCTETS = 16
 

@@ -11,20 +11,12 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar, overload
+from typing import Any, Final, Generic, TypeVar, overload
 
+from teds_provision.arrays import Floats, NDArray, np
 from teds_provision.errors import BadDataError
-from teds_provision.lazy import late
 from teds_provision.sanitize import counted
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput, Method
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
-else:
-    np = late("numpy")
 
 _Value = TypeVar("_Value")
 

@@ -10,25 +10,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
+from teds_provision.arrays import Floats, NDArray, Octets, np
 from teds_provision.errors import BadDataError
-from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import PreparedCurve, PreparedInverse
 from teds_provision.teds.calibration.samples import Range, SampleForm, SampleReader
 from teds_provision.teds.channel import ROUNDING, TURN, wrapped
 from teds_provision.teds.sheet import Channel, Sheet
 from teds_provision.teds.units import WrittenUnit
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from teds_provision.teds.calibration.samples import Octets
-
-    Floats = NDArray[np.float64]
-else:
-    np = late("numpy")
 
 
 @dataclass(frozen=True)

@@ -11,18 +11,10 @@ import math
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from teds_provision.arrays import NDArray, Octets, np
 from teds_provision.errors import BadDataError
-from teds_provision.lazy import late
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Octets = bytes | bytearray | memoryview | NDArray[np.uint8]
-else:
-    np = late("numpy")
 
 Range = tuple[float, float]
 """Lowest and highest value, ends included."""

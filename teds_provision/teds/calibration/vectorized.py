@@ -9,20 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 from weakref import WeakValueDictionary
 
 import numpy as np
 
+from teds_provision.arrays import Floats, NDArray
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import WORD, DataModel, big_endian
 from teds_provision.teds.channel import wrapped
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
 
 _FAR_FROM_OVERFLOW: Final = 1e100
 _MOST_SEGMENTS: Final = 64

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from teds_provision.lazy import late
+from teds_provision.arrays import NDArray, np
 from teds_provision.teds.calibration.model import Calibration, float32, instant
 from teds_provision.teds.channel import TURN
 from teds_provision.teds.codec.composer import Composer, tuple_width
@@ -19,12 +19,6 @@ from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.frame import RawTuple, frame, raw_tuple, tuples, unframe
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.codec.tables import table
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-else:
-    np = late("numpy")
 
 _SIGMAS: Final = 3
 _STEP: Final = 2.0**-23
