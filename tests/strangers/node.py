@@ -468,7 +468,8 @@ class Node:
                 continue
             identifier = 0x1CFF0000 | ((session.station & 7) * 32 + number * 8 + segment) << 8 | self.address
             self.wire.put(identifier, data, self.fd)
-            time.sleep(stream.gap / 10**6)
+            if self.fault != "from the future":  # a pause is as long as the machine is busy: it would not get ahead
+                time.sleep(stream.gap / 10**6)
         if self.fault == "replay" and stream.counter == 5:
             self.kept = octets
         if self.fault == "replay" and stream.counter > 5 and stream.counter % 4 == 0:
