@@ -34,7 +34,7 @@ from teds_provision.measure.blocks import Block, StationFacts
 from teds_provision.measure.clock import ClockMap, Exchange, HostClock, MonotonicStamps
 from teds_provision.measure.grid import Grid
 from teds_provision.measure.interpreter import StreamInterpreter
-from teds_provision.measure.runner import BEAT
+from teds_provision.measure.running.measurement import BEAT
 from teds_provision.measure.sinks import Sink, open_sink
 from teds_provision.measure.stream_receiver import ReceivedStream, StreamReceiver
 from teds_provision.measure.verified_session import facts_of

@@ -28,7 +28,7 @@ from teds_provision.links.can.port import CanPort
 from teds_provision.measure.blocks import Block
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.request import MeasurementRequest
-from teds_provision.measure.runner import Watcher
+from teds_provision.measure.running.measurement import Watcher
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.node.can.server import CanServer
 from teds_provision.node.hardware.board import Board

@@ -109,12 +109,12 @@ def main() -> None:
                 server.psql(schema.member_sql(name, scram.verifier(secret)), "plant")
                 posts.append(postgres.Registry(postgres.parameters(server.url("plant"), name, secret)))
             chains = [chain(key, size.pages, size.events) for key in keys]
-            for post in posts:
-                post.look()
+            for transport in posts:
+                transport.look()
             _pushed(posts, chains, size)
             _woken(posts, keys)
-            for post in posts:
-                post.close()
+            for transport in posts:
+                transport.close()
 
 
 def _local(boards: int) -> None:
@@ -200,24 +200,24 @@ def _peak() -> float:
 def _pushed(posts: list[postgres.Registry], chains: list[Pages], size: argparse.Namespace) -> None:
     took: list[float] = []
 
-    def push(post: postgres.Registry, pages: Pages) -> Callable[[], None]:
+    def push(transport: postgres.Registry, pages: Pages) -> Callable[[], None]:
         def work() -> None:
             for page in pages:
                 began = time.perf_counter()
-                post.append([page])
+                transport.append([page])
                 took.append(time.perf_counter() - began)
 
         return work
 
-    def empty(post: postgres.Registry) -> Callable[[], None]:
+    def empty(transport: postgres.Registry) -> Callable[[], None]:
         def ask() -> None:
             for _ in range(size.pages):
-                post.parcel(REGISTRY)
+                transport.parcel(REGISTRY)
 
         return ask
 
-    floor = at_once([empty(post) for post in posts])
-    seconds = at_once([push(post, pages) for post, pages in zip(posts, chains, strict=True)])
+    floor = at_once([empty(transport) for transport in posts])
+    seconds = at_once([push(transport, pages) for transport, pages in zip(posts, chains, strict=True)])
     pages, took = len(took), sorted(took)
     heads = posts[0].look().heads
     newest = {h for _, h in heads.values()}

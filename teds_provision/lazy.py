@@ -4,7 +4,7 @@
 gives the modules of a room (PEP 562): its ``__init__`` names them for type checkers and loads them late for all else::
 
     if TYPE_CHECKING:
-        from teds_provision.measure import blocks, runner
+        from teds_provision.measure import blocks, sources
     else:
         __getattr__ = lazy(__name__)
 

@@ -138,7 +138,7 @@ from teds_provision.links import open_place
 from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.request import MeasurementRequest
-from teds_provision.measure.runner import Watcher
+from teds_provision.measure.running.measurement import Watcher
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.station.store import KeptMeasurement
 from teds_provision.station.store import NodeRecord

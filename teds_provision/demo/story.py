@@ -49,12 +49,13 @@ from teds_provision.station.store import TrustRecord
 from teds_provision.vault.passphrase import THROWAWAY
 
 if TYPE_CHECKING:
-    from teds_provision.measure import blocks, held_actuator, request, runner, sinks, verified_session
+    from teds_provision.measure import blocks, held_actuator, request, sinks, verified_session
     from teds_provision.measure import buses as buses_room
+    from teds_provision.measure.running import measurement
 else:  # numpy and what measuring needs are loaded when the demo gets there
-    blocks, buses_room, held_actuator, runner, sinks, verified_session, request = (
+    blocks, buses_room, held_actuator, measurement, sinks, verified_session, request = (
         late(f"teds_provision.measure.{name}")
-        for name in ("blocks", "buses", "held_actuator", "runner", "sinks", "verified_session", "request")
+        for name in ("blocks", "buses", "held_actuator", "running.measurement", "sinks", "verified_session", "request")
     )
 
 
@@ -196,7 +197,9 @@ def measure_group(demo: Demo, station: Station, uuids: tuple[bytes, ...]) -> Non
             facts = blocks.StationFacts(station.name, group="robot", started=time.time())
             asked = request.MeasurementRequest(rate=RATE, timeout=15.0)
             with buses_room.Buses([port]) as buses:
-                ended = runner.Measurement(station, buses, uuids, asked, [sink], facts).run(threading.Event(), SECONDS)
+                ended = measurement.Measurement(station, buses, uuids, asked, [sink], facts).run(
+                    threading.Event(), SECONDS
+                )
         finally:
             port.close()
         if ended.error is not None:

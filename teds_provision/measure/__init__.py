@@ -21,7 +21,6 @@ if TYPE_CHECKING:
         presence,
         recordings,
         request,
-        runner,
         running,
         sample_series,
         sampling,

@@ -1,4 +1,4 @@
-"""The data that pass from the runner to the sinks: facts of channels, blocks of samples, rows of a group, reports.
+"""The data that pass from the measurement to the sinks: facts of channels, blocks of samples, rows of a group, reports.
 
 One vocabulary for every sink, so that a sink never asks a node, the store or a datasheet. All of it is frozen, and a
 block's arrays are never written to after they were handed on: several sinks read them in their threads.

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from teds_provision.errors import BadDataError, LinkError, PolicyError, TedsProvisionError
-from teds_provision.measure.sinks.lines import plain
+from teds_provision.measure.sinks.json_events import plain
 from teds_provision.measure.verified_session import DEAD_MAN, LEASE, VerifiedSession, claim, operation
 from teds_provision.protocol.operation.commands import ChannelState, idle, write_data_set
 from teds_provision.provisioning.conversation import SessionLostError

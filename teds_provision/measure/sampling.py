@@ -12,7 +12,7 @@ import numpy as np
 
 from teds_provision.measure.clock import END_OF_TICKS, ClockMap, WallClock
 from teds_provision.measure.planning import sensors_of
-from teds_provision.measure.sinks.lines import plain
+from teds_provision.measure.sinks.json_events import plain
 from teds_provision.measure.verified_session import VerifiedSession, claim, exchange_clock
 from teds_provision.protocol.operation.commands import MOST_SAMPLE_CHANNELS, SampleReply, idle, sample
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter

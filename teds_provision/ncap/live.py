@@ -20,7 +20,7 @@ from typing import Any, Final
 
 from teds_provision.arrays import NDArray, np
 from teds_provision.measure.blocks import Block, ChannelFacts
-from teds_provision.measure.sinks.lines import plain
+from teds_provision.measure.sinks.json_events import plain
 from teds_provision.ncap.history import History, raw_numbers
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.teds.channel import TURN

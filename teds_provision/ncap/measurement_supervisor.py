@@ -40,7 +40,7 @@ from teds_provision.measure.matching import ListedNodes, NodeMatch, UnsignedNode
 from teds_provision.measure.planning import BusTime, period_of, sensors_of
 from teds_provision.measure.rates import RateProposal, Surroundings, propose, this_machine
 from teds_provision.measure.request import MeasurementRequest
-from teds_provision.measure.runner import Measurement, Watcher
+from teds_provision.measure.running.measurement import Measurement, Watcher
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.measure.sinks import Sink
 from teds_provision.measure.sinks.base import BUDGET

@@ -9,7 +9,7 @@ from enum import Enum
 from typing import Any
 
 from teds_provision.measure.matching import ListedNodes, NodeMatch, UnsignedNodes
-from teds_provision.measure.runner import Measurement
+from teds_provision.measure.running.measurement import Measurement
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.ncap.membership import Budget, Membership
 from teds_provision.station.store import KeptMeasurement

@@ -24,7 +24,7 @@ from teds_provision.protocol.plant.chain import counting
 from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.document import join, split
 from teds_provision.protocol.plant.event import Event
-from teds_provision.protocol.plant.fold import BY_CONTACT, BanStatement, LocalState, MergedClaims, merge_claims
+from teds_provision.protocol.plant.merged_claims import BY_CONTACT, BanStatement, LocalState, MergedClaims, merge_claims
 from teds_provision.protocol.plant.page import Page
 from teds_provision.protocol.plant.roster import MOST_AHEAD, Roster, Taking, open_roster, taking
 from teds_provision.station.plant.alarms import Alarm
@@ -137,8 +137,8 @@ def take_pages(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
     with station.transaction():
         chain = station.plant.pages.chain(pages[0].station)
         for page in pages:
-            station.plant.pages.add(chain.chain, row_of(page))
-            station.plant.pages.put_heads(chain.chain, page.heads)
+            station.plant.pages.add(chain.id, row_of(page))
+            station.plant.pages.put_heads(chain.id, page.heads)
         fresh = recount(station, chain, roster)
         for page in pages:
             if (page.number, page.hash) not in fresh:  # on no branch that counts; what it bans is banned all the same
@@ -161,7 +161,7 @@ def fold_new_acts(station: Station, roster: Roster) -> int:
     for chain in station.plant.pages.chains().values():
         with station.transaction():
             folded += len(recount(station, station.plant.pages.chain(chain.station), roster, again=True))
-    own = station.plant.pages.chain(station.fingerprint).chain
+    own = station.plant.pages.chain(station.fingerprint).id
     with station.transaction():
         for act, uuid, members in list(firmware_reports(station)):
             assert uuid is not None
@@ -177,8 +177,8 @@ def recount(station: Station, chain: Chain, roster: Roster, *, again: bool = Fal
 
     Returns the pages that were folded now. ``again``: from the first one in any case.
     """
-    names = station.plant.pages.names(chain.chain)
-    counts = counting(names, last=_last(roster, chain.station), accepted=chain.accepted)
+    links = station.plant.pages.links(chain.id)
+    counts = counting(links, last=_last(roster, chain.station), accepted=chain.accepted)
     if counts.two is not None:
         why = "two histories part at this page" if chain.station != station.fingerprint else "of this very station"
         alarm(station, "two-histories", chain.station, counts.two, why)
@@ -186,14 +186,14 @@ def recount(station: Station, chain: Chain, roster: Roster, *, again: bool = Fal
         station.plant.alarms.end_about("two-histories", chain.station)
     folded = chain.folded
     if folded[0] and (again or folded not in counts.pages):
-        station.plant.claims.forget(chain.chain)
+        station.plant.claims.forget(chain.id)
         folded = (0, "")
-        for n, hash, _ in names:
-            if (n, hash) not in counts.pages and (page := station.plant.pages.get(chain.chain, n, hash)) is not None:
+        for n, hash, _ in links:
+            if (n, hash) not in counts.pages and (page := station.plant.pages.get(chain.id, n, hash)) is not None:
                 _keep_bans(station, chain, _events_of(page), counts=False)
     fresh = [place for place in counts.pages if place[0] > folded[0]]
     for n, hash in fresh:
-        row = station.plant.pages.get(chain.chain, n, hash)
+        row = station.plant.pages.get(chain.id, n, hash)
         assert row is not None
         _fold_page(station, chain, n, _events_of(row))
     if counts.newest != chain.counted or counts.newest != chain.folded:
@@ -211,7 +211,7 @@ def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object])
     read = [stated for stated in map(event.read, values) if stated is not None]
     wrong = [stated for stated in read if isinstance(stated, str)]
     events = [stated for stated in read if isinstance(stated, Event)]
-    known = station.plant.claims.known_ids(chain.chain, [_number(stated.id) for stated in events])
+    known = station.plant.claims.known_ids(chain.id, [_number(stated.id) for stated in events])
     by_node: dict[bytes, list[Event]] = {}
     digests: list[tuple[bytes, int, bool]] = []
     for stated in events:
@@ -227,17 +227,17 @@ def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object])
             station.plant.claims.put_lifting(stated.members["of"], chain)
         if stated.uuid is not None:
             by_node.setdefault(stated.uuid, []).append(stated)
-    station.plant.claims.add_ids(chain.chain, known)
+    station.plant.claims.add_ids(chain.id, known)
     station.plant.claims.put_digests(chain, digests)
     _keep_bans(station, chain, events, counts=True)
-    there = station.plant.claims.of_station(chain.chain, list(by_node))
+    there = station.plant.claims.of_station(chain.id, list(by_node))
     claims: dict[bytes, str] = {}
     for uuid, statements in by_node.items():
         claim = Claim.from_json(there[uuid]) if uuid in there else Claim()
         for stated in statements:
             claim.apply_event(stated)
         claims[uuid] = claim.to_json()
-    station.plant.claims.put(chain.chain, claims)
+    station.plant.claims.put(chain.id, claims)
     if wrong:
         why = f"{len(wrong)} events were skipped: {wrong[0]}"
         alarm(station, "bad-event", chain.station, n, why)
@@ -255,13 +255,13 @@ def _keep_bans(station: Station, chain: Chain, values: Iterable[object], *, coun
             text = one.members["statement"]
             if text.isascii():
                 hash = event.hash_of_statement(text)
-                station.plant.claims.put_ban(hash, chain.chain, counts=counts, uuid=one.uuid, statement=text)
+                station.plant.claims.put_ban(hash, chain.id, counts=counts, uuid=one.uuid, statement=text)
 
 
 def counted_places(station: Station, roster: Roster, chain: Chain) -> frozenset[tuple[int, str]]:
     """Return number and H of the pages of a chain that count; of another history none above where the two part."""
-    names = station.plant.pages.names(chain.chain)
-    return frozenset(counting(names, last=_last(roster, chain.station), accepted=chain.accepted).pages)
+    links = station.plant.pages.links(chain.id)
+    return frozenset(counting(links, last=_last(roster, chain.station), accepted=chain.accepted).pages)
 
 
 def octets_of(row: PageRow) -> bytes:

@@ -41,15 +41,17 @@ def listener(station: Station) -> postgres.Registry | None:
     return postgres.Registry(_login(station, record.url))
 
 
-def check_database(station: Station, post: Transport) -> list[str]:
+def check_database(station: Station, transport: Transport) -> list[str]:
     """Return what the database allows and should not, and keep it for ``registry status``; empty for a folder."""
-    if not isinstance(post, postgres.PostgresTransport):
+    if not isinstance(transport, postgres.PostgresTransport):
         return []
-    post.sweep()
-    doors, roster = post.open_doors(), station.plant.roster
+    transport.sweep()
+    doors, roster = transport.open_doors(), station.plant.roster
     left = {removed.fingerprint: removed.name for removed in roster.removed} if roster is not None else {}
     doors += [
-        f"login of {left[open_login]}, which was removed" for open_login in post.open_logins() if open_login in left
+        f"login of {left[open_login]}, which was removed"
+        for open_login in transport.open_logins()
+        if open_login in left
     ]
     station.plant.put_doors(doors)
     return doors
@@ -65,11 +67,11 @@ def absolute(url: str) -> str:
     return urlunsplit(parts._replace(query=urlencode(words, quote_via=quote)))
 
 
-def require_registry(post: Transport, registry: str) -> None:
+def require_registry(transport: Transport, registry: str) -> None:
     """Raise PolicyError if a database is of another registry than the roster that is to be joined."""
-    there = post.registry()
+    there = transport.registry()
     if there != registry:
-        raise PolicyError(f"{post.where} belongs to another registry ({there}) than the roster ({registry}).")
+        raise PolicyError(f"{transport.where} belongs to another registry ({there}) than the roster ({registry}).")
 
 
 def _login(station: Station, url: str) -> dict[str, object]:

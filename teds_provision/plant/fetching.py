@@ -50,20 +50,20 @@ def read_pages(carried: Iterable[CarriedPage], roster: Roster, station: str) -> 
     return good, junk
 
 
-def fetch(station: Station, post: Transport, roster: Roster) -> int:
+def fetch(station: Station, transport: Transport, roster: Roster) -> int:
     """Take in other stations' pages, station by station, and return how many came.
 
     Faults in the pages of one station delay no other's.
     """
-    heads, fetched = post.heads(), 0
+    heads, fetched = transport.heads(), 0
     for fingerprint in roster.by_key:
         if fingerprint == station.fingerprint or fingerprint not in heads:
             continue
         chain = station.plant.pages.chain(fingerprint)
-        newest = max((n for n, _, _ in station.plant.pages.names(chain.chain)), default=0)
-        taken = take_carried(station, roster, fingerprint, post.pages(fingerprint, newest))
+        newest = max((n for n, _, _ in station.plant.pages.links(chain.id)), default=0)
+        taken = take_carried(station, roster, fingerprint, transport.pages(fingerprint, newest))
         fetched += taken.pages
-        _report_junk(station, roster, fingerprint, [carried.number for carried in taken.junk], post)
+        _report_junk(station, roster, fingerprint, [carried.number for carried in taken.junk], transport)
         note_waiting(station, fingerprint, taken)
     return fetched
 
@@ -79,8 +79,8 @@ def take_carried(
 
     A page that the station did not sign is no page: it ends nothing and may be asked for again.
     """
-    names = station.plant.pages.names(station.plant.pages.chain(author).chain)
-    known, numbers = {hash for _, hash, _ in names}, {n for n, _, _ in names} | {0}
+    links = station.plant.pages.links(station.plant.pages.chain(author).id)
+    known, numbers = {hash for _, hash, _ in links}, {n for n, _, _ in links} | {0}
     taken = Taken()
     batch: list[Page] = []
     for carried in pages:
@@ -112,13 +112,13 @@ def note_waiting(station: Station, author: str, taken: Taken) -> None:
     """Note that a chain waits for a newer version of this program, or that it does so no longer."""
     chain = station.plant.pages.chain(author)
     if taken.waits is not None:
-        newest = max((n for n, _, _ in station.plant.pages.names(chain.chain)), default=0)
+        newest = max((n for n, _, _ in station.plant.pages.links(chain.id)), default=0)
         alarm(station, "newer-format", author, newest + 1, taken.waits)
     if taken.waits != chain.waits:
         station.plant.pages.put_chain(replace(chain, waits=taken.waits))
 
 
-def _report_junk(station: Station, roster: Roster, name: str, junk: Sequence[int], post: Transport) -> None:
+def _report_junk(station: Station, roster: Roster, name: str, junk: Sequence[int], transport: Transport) -> None:
     if not junk:
         station.plant.alarms.end_about("junk", name)
     for n in junk[:1]:
@@ -127,5 +127,5 @@ def _report_junk(station: Station, roster: Roster, name: str, junk: Sequence[int
             "junk",
             name,
             n,
-            f"{post.where}: {counted(len(junk), 'page')} of {roster.name_of(name)} that it did not sign",
+            f"{transport.where}: {counted(len(junk), 'page')} of {roster.name_of(name)} that it did not sign",
         )

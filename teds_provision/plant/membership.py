@@ -41,7 +41,7 @@ def request(station: Station) -> bytes:
     return octets
 
 
-def found_roster(station: Station, post: Transport, octets: bytes | None) -> Roster:
+def found_roster(station: Station, transport: Transport, octets: bytes | None) -> Roster:
     """Return the best roster that names this station, of a file or of the transport; an expired one is refused here.
 
     Raises NotFoundError, PolicyError.
@@ -50,7 +50,7 @@ def found_roster(station: Station, post: Transport, octets: bytes | None) -> Ros
     held = station.plant.roster
     if held is not None:  # it belongs already, and changes what carries
         found.append(held)
-    for roster_octets in post.rosters() if octets is None else ():
+    for roster_octets in transport.rosters() if octets is None else ():
         try:
             found.append(open_roster(roster_octets, station.ca))
         except TedsProvisionError:  # the transport is untrusted
@@ -61,14 +61,14 @@ def found_roster(station: Station, post: Transport, octets: bytes | None) -> Ros
     mine = [roster for roster in found if roster.member(station.fingerprint) is not None]
     if not mine:
         raise NotFoundError(
-            f"No roster in {post.where} that this owner's CA signed names this station.",
+            f"No roster in {transport.where} that this owner's CA signed names this station.",
             hint="Send the owner a request (registry request --output FILE); the owner then runs: registry add"
             " FILE --role …",
         )
     registries = {roster.registry for roster in mine}
     if len(registries) > 1:
         raise PolicyError(
-            f"{post.where} contains rosters of {len(registries)} registries.", hint="Choose one: --roster FILE"
+            f"{transport.where} contains rosters of {len(registries)} registries.", hint="Choose one: --roster FILE"
         )
     best = max(mine, key=lambda roster: (roster.version, roster.hash))
     if best is not held and best.created > now() + MOST_AHEAD:
@@ -137,12 +137,12 @@ def vouch(station: Station, found: Sequence[tuple[bytes, str, str]]) -> int:
     return fresh
 
 
-def accept(station: Station, of: str, hash: str | None, post: Transport | None) -> tuple[int, str]:
+def accept(station: Station, of: str, hash: str | None, transport: Transport | None) -> tuple[int, str]:
     """Take the branch of two histories that the registry shows, or the one that ``hash`` (16 digits or more) names.
 
     Local: others decide for themselves, and a roster's ``last`` goes before it. Returns the page that was taken.
     """
-    n, wanted = branch(station, of, hash, post)
+    n, wanted = branch(station, of, hash, transport)
     with station.transaction():
         station.plant.pages.put_chain(replace(station.plant.pages.chain(of), accepted=(n, wanted)))
         recount(station, station.plant.pages.chain(of), require_roster(station))
@@ -150,18 +150,18 @@ def accept(station: Station, of: str, hash: str | None, post: Transport | None) 
     return n, wanted
 
 
-def branch(station: Station, of: str, hash: str | None, post: Transport | None) -> tuple[int, str]:
+def branch(station: Station, of: str, hash: str | None, transport: Transport | None) -> tuple[int, str]:
     """Return the branch that :func:`accept` takes: number and H of its first page.
 
     An earlier choice can be changed: name the other branch by its ``hash``. Raises NotFoundError, PolicyError.
     """
     roster = require_roster(station)
     chain: Chain = station.plant.pages.chain(of)
-    names = station.plant.pages.names(chain.chain)
+    links = station.plant.pages.links(chain.id)
     partings = [chain.counted[0] + 1]  # the one that is undecided
     if chain.accepted is not None:  # and the one that was decided, which a person may decide differently
-        partings.append(counting(names, last=None, accepted=None).two or 0)
-    by_number = {n: sorted({hash for number, hash, _ in names if number == n}) for n in partings}
+        partings.append(counting(links, last=None, accepted=None).two or 0)
+    by_number = {n: sorted({hash for number, hash, _ in links if number == n}) for n in partings}
     n = next((n for n in partings if len(by_number[n]) > 1 and _among(by_number[n], hash)), 0)
     n = n or next((n for n in partings if len(by_number[n]) > 1), 0)
     if not n:
@@ -170,8 +170,8 @@ def branch(station: Station, of: str, hash: str | None, post: Transport | None) 
         )
     branches = by_number[n]
     wanted = _among(branches, hash)
-    if hash is None and post is not None and not post.everybody:
-        shown = {carried.number: carried for carried in post.pages(of, n - 1)}
+    if hash is None and transport is not None and not transport.everybody:
+        shown = {carried.number: carried for carried in transport.pages(of, n - 1)}
         wanted = [branch for branch in branches if n in shown and hash_of(shown[n].octets) == branch]
     if len(wanted) != 1:
         listed = ", ".join(branch[:16] for branch in branches)

@@ -109,7 +109,7 @@ def answer(station: Station, octets: bytes, jobs: Collection[str] | None = None,
 
 def answer_all(
     station: Station,
-    post: Transport,
+    transport: Transport,
     inbox: Inbox,
     jobs: Collection[str] | None = None,
     *,
@@ -127,7 +127,7 @@ def answer_all(
         if sealed is not None:
             request = open_request(come.document, roster_of(station).point_of)
             if roster_of(station).member(request.signer) is not None:
-                send(station, post, request.signer, sealed, name_of(hash_of(sealed)))
+                send(station, transport, request.signer, sealed, name_of(hash_of(sealed)))
             answered = open_answer(sealed, lambda kid: station.point)
             yield AnsweredRequest(request, answered)
         come.drop()

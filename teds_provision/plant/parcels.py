@@ -27,7 +27,7 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant import sharing
 from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.document import JOB, SIGN_REQUEST, SIGNED, open_document
-from teds_provision.protocol.plant.fold import MergedClaims
+from teds_provision.protocol.plant.merged_claims import MergedClaims
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.plant.alarms import Alarm
 from teds_provision.station.plant.parcels import ParcelKind, ParcelRow
@@ -60,7 +60,7 @@ class ParcelCounts:
     waiting: int
 
 
-def take_in(station: Station, post: Transport, views: Views, now: datetime) -> ParcelCounts:
+def take_in(station: Station, transport: Transport, views: Views, now: datetime) -> ParcelCounts:
     """Take in the parcels for this station; those that need an operator are kept for ``import-keys --received``."""
     roster = station.plant.roster
     if roster is None:
@@ -68,10 +68,10 @@ def take_in(station: Station, post: Transport, views: Views, now: datetime) -> P
     _drop_outlived(station, now)
     reader = _Reader(station, roster, views, now)
     taken = sum(reader.again(row) for row in station.plant.parcels.all("in", "later"))
-    for parcel in post.parcels(station.fingerprint):
+    for parcel in transport.parcels(station.fingerprint):
         done = reader.process_parcel(parcel)
         if done is not None:
-            post.drop(parcel.id, station.fingerprint)
+            transport.drop(parcel.id, station.fingerprint)
             taken += done
     return ParcelCounts(taken, sum(row.kind == "bundle" for row in station.plant.parcels.all("in", "waiting", "later")))
 
@@ -337,7 +337,7 @@ def send_export(station: Station, plan: outgoing.ExportPlan, now: datetime) -> s
     return parcel
 
 
-def send_out(station: Station, post: Transport, views: Views, now: datetime) -> int:
+def send_out(station: Station, transport: Transport, views: Views, now: datetime) -> int:
     """Send what waits: copies that are due, receipts, what a person sent; returns how many parcels left."""
     roster = station.plant.roster
     if roster is None:
@@ -347,7 +347,7 @@ def send_out(station: Station, post: Transport, views: Views, now: datetime) -> 
     if now < roster.expires:
         _make_copies(station, roster, views, now)
         _forget(station, roster, views)
-    return _send(station, roster, post)
+    return _send(station, roster, transport)
 
 
 def waiting_out(station: Station) -> int:
@@ -369,13 +369,13 @@ def _put_out(
     return parcel
 
 
-def _send(station: Station, roster: Roster, post: Transport) -> int:
+def _send(station: Station, roster: Roster, transport: Transport) -> int:
     parcels, sent = station.plant.parcels, 0
     for row in parcels.all("out", "ready"):
         if roster.member(row.peer) is None:
             continue  # a removed station gets nothing; a move to it is a person's to take back
         try:
-            post.send(Parcel(row.id, row.peer, parcels.document(row.id, "out"), row.expires, station.fingerprint))
+            transport.send(Parcel(row.id, row.peer, parcels.document(row.id, "out"), row.expires, station.fingerprint))
         except PolicyError:
             break  # too much waits there: the rest goes with the next sync
         with station.durable(_COMMAND):
@@ -490,7 +490,7 @@ def silent_stations(station: Station, roster: Roster, now: datetime) -> set[str]
     created = dict[str, datetime | None]()
     for digits, seen in station.plant.pages.chains().items():
         if roster.member(digits) is not None and digits != station.fingerprint:
-            page = station.plant.pages.get(seen.chain, *seen.counted) if seen.counted[0] else None
+            page = station.plant.pages.get(seen.id, *seen.counted) if seen.counted[0] else None
             at = page.created if page is not None else ""
             created[digits] = datetime.fromisoformat(at) if at else None
     return sharing.silent(created, now)

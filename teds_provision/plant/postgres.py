@@ -488,20 +488,20 @@ class PostgresTransport:
 class ReturnedPages:
     """Pages in the database that their authors did not append themselves: others handed them in (table ``found``)."""
 
-    def __init__(self, post: PostgresTransport) -> None:
-        self._post = post
+    def __init__(self, transport: PostgresTransport) -> None:
+        self._transport = transport
 
     @property
     def takes_pages(self) -> bool:
         """False for a database of schema 1, which has no such table."""
-        return self._post._look.schema >= _RETURNING
+        return self._transport._look.schema >= _RETURNING
 
     def state(self, station: str) -> str:
         """Return a text that changes with any handed-in page of a station, or its state.
 
         "" for an open member without handed-in pages.
         """
-        look = self._post._look
+        look = self._transport._look
         handed_in = look.handed_in.get(station, ())
         if station in look.open and not handed_in:
             return ""
@@ -510,27 +510,27 @@ class ReturnedPages:
 
     def was_handed_in(self, station: str) -> bool:
         """Return True if a member handed in a page of this station."""
-        return station in self._post._look.handed_in
+        return station in self._transport._look.handed_in
 
     def is_open(self, station: str) -> bool:
         """Return True if the station appends its pages itself."""
-        return station in self._post._look.open
+        return station in self._transport._look.open
 
     def head(self, station: str) -> int:
         """Return the number of the newest page that the station appended itself."""
-        return self._post._look.heads.get(station, (0, ""))[0]
+        return self._transport._look.heads.get(station, (0, ""))[0]
 
     def offers(self, station: str) -> list[Offer]:
         """Return every page of a station, from any sender."""
-        return self._post._registry.offers(station)
+        return self._transport._registry.offers(station)
 
     def octets(self, offers: Sequence[Offer]) -> list[CarriedPage]:
         """Return the offered pages; one that is gone is left out."""
-        return self._post._registry.offered(offers)
+        return self._transport._registry.offered(offers)
 
     def restore(self, author: str, pages: Sequence[tuple[int, bytes]]) -> None:
         """Hand in pages of a station. Raises AuthorIsMemberError, PolicyError."""
-        self._post._registry.restore(author, pages)
+        self._transport._registry.restore(author, pages)
 
 
 def _handed_in(rows: Sequence[tuple[Any, ...]]) -> dict[str, tuple[str, ...]]:

@@ -186,8 +186,8 @@ def _beyond(station: Station, roster: Roster) -> dict[tuple[bytes, int, str], se
         if chain is None:
             continue
         counted = counted_places(station, roster, chain)
-        for n, hash, _ in station.plant.pages.names(chain.chain):
-            page = None if (n, hash) in counted else station.plant.pages.get(chain.chain, n, hash)
+        for n, hash, _ in station.plant.pages.links(chain.id):
+            page = None if (n, hash) in counted else station.plant.pages.get(chain.id, n, hash)
             if page is None:
                 continue
             for value in load_exact(page.content, "A page").get("events", ()):

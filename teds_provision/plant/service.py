@@ -27,7 +27,7 @@ from teds_provision.errors import (
 )
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.service_part import Line, PartKind
-from teds_provision.ncap.web.answers import reading
+from teds_provision.ncap.web.responses import reading
 from teds_provision.plant.postgres import PostgresTransport, Registry
 from teds_provision.plant.transport import Transport
 from teds_provision.protocol.plant.job import Job
@@ -269,7 +269,7 @@ class PlantWatch:
         chain = station.plant.pages.chains().get(station.fingerprint)
         if roster is None or chain is None or not chain.counted[0]:
             return
-        page = station.plant.pages.get(chain.chain, *chain.counted)
+        page = station.plant.pages.get(chain.id, *chain.counted)
         if (
             page is not None
             and (datetime.now(UTC) - datetime.fromisoformat(page.created)).total_seconds() > _EMPTY_PAGE

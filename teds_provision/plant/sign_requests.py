@@ -85,15 +85,15 @@ class OfficeSilentError(UnprovenError):
 
 def transport_for(station: Station, folder: Path | None) -> Transport:
     """Return the transport between the stations: the folder, or the registry that this station is connected to."""
-    post = FolderTransport(folder) if folder is not None else connecting.open_transport(station)
-    if post is None:
+    transport = FolderTransport(folder) if folder is not None else connecting.open_transport(station)
+    if transport is None:
         raise PolicyError(
             "This station has no way to reach the other stations.", hint="Give a transfer folder: --files DIR"
         )
-    return post
+    return transport
 
 
-def send(station: Station, post: Transport, to: str, document: bytes, name: str) -> None:
+def send(station: Station, transport: Transport, to: str, document: bytes, name: str) -> None:
     """Seal a signed document for a member and hand it over; ``name`` (a UUID) makes the same one the same parcel.
 
     Raises PolicyError (no member, no room), LinkError.
@@ -103,7 +103,7 @@ def send(station: Station, post: Transport, to: str, document: bytes, name: str)
         raise PolicyError(f"Station {to[:16]} is not a member of the plant.", hint="See: registry status")
     sealed = jose.encrypt(document, [member.point], cty=CONTENT_TYPE)
     until = time_text(datetime.now(UTC) + timedelta(days=DAYS))
-    post.send(Parcel(name, to, sealed, until, station.identity.fingerprint))
+    transport.send(Parcel(name, to, sealed, until, station.identity.fingerprint))
 
 
 @dataclass(frozen=True)
@@ -121,11 +121,11 @@ class Inbox:
     and ``wait`` are for one thread at a time.
     """
 
-    def __init__(self, station: Station, post: Transport, kind: DocumentKind) -> None:
-        self._station, self._transport, self._kind = station, post, kind
+    def __init__(self, station: Station, transport: Transport, kind: DocumentKind) -> None:
+        self._station, self._transport, self._kind = station, transport, kind
         self._known: set[str] = set()
         self._listener: postgres.Registry | None = None
-        self._hears = isinstance(post, postgres.PostgresTransport)
+        self._hears = isinstance(transport, postgres.PostgresTransport)
 
     def collect(self) -> list[Delivery]:
         """Return what came since; raises LinkError."""
@@ -196,10 +196,16 @@ def receivers(station: Station, job: Job) -> list[str]:
     return [fromkey for fromkey in dict.fromkeys(named) if fromkey != station.identity.fingerprint]
 
 
-def send_job(station: Station, post: Transport, job: Job) -> None:
+def send_job(station: Station, transport: Transport, job: Job) -> None:
     """Send a job to all stations that it is for; the same again changes nothing."""
     for receiver in receivers(station, job):
-        send(station, post, receiver, job.octets, name_of(hashlib.sha256(f"{job.hash}{receiver}".encode()).hexdigest()))
+        send(
+            station,
+            transport,
+            receiver,
+            job.octets,
+            name_of(hashlib.sha256(f"{job.hash}{receiver}".encode()).hexdigest()),
+        )
 
 
 # -- asking ------------------------------------------------------------------------------------------------------------
@@ -218,9 +224,9 @@ class RemoteOffice:
     Boards on several readers ask at once: one of them looks for all, and lays down what came for the others.
     """
 
-    def __init__(self, station: Station, post: Transport, timeout: float) -> None:
-        self.station, self.transport, self.timeout = station, post, timeout
-        self._inbox = Inbox(station, post, SIGNED)
+    def __init__(self, station: Station, transport: Transport, timeout: float) -> None:
+        self.station, self.transport, self.timeout = station, transport, timeout
+        self._inbox = Inbox(station, transport, SIGNED)
         self._news = threading.Condition()
         self._came: dict[tuple[str, str], Delivery] = {}
         self._looking = False

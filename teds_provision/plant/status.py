@@ -11,7 +11,7 @@ from teds_provision.errors import NotFoundError, UsageError
 from teds_provision.plant.apply_pages import AT_ONCE, counted_places, heads_digest, merged_views, now, require_roster
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
-from teds_provision.protocol.plant.fold import FirmwareClaim
+from teds_provision.protocol.plant.merged_claims import FirmwareClaim
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Member, Roster
 from teds_provision.station.plant.alarms import Alarm
 from teds_provision.station.plant.pages import Chain
@@ -91,7 +91,7 @@ def _standing(station: Station, member: Any, chain: Chain | None, at: datetime) 
     n = chain.counted[0] if chain is not None else 0
     age = None
     if chain is not None and n:
-        created = next((c for number, h, c, _ in station.plant.pages.times(chain.chain, 50)
+        created = next((c for number, h, c, _ in station.plant.pages.times(chain.id, 50)
                         if (number, h) == chain.counted and c), None)  # fmt: skip
         age = max(0, int((at - datetime.fromisoformat(created)).total_seconds())) if created else None
     if not isinstance(member, Member):
@@ -129,7 +129,7 @@ def log(
         if of is not None and fingerprint != of:
             continue
         counted = counted_places(station, roster, chain)
-        for page in station.plant.pages.each(chain.chain):
+        for page in station.plant.pages.each(chain.id):
             if since is not None and page.created < since:
                 continue
             for value in load_exact(page.content, "A page").get("events", ()):
@@ -238,4 +238,4 @@ def _firmware_to_json(roster: Roster, reported: FirmwareClaim) -> dict[str, Any]
 def page_list(station: Station, of: str, most: int = 20) -> list[tuple[int, str, str]]:
     """Return number, H and time of the newest pages of a station, newest first: to choose a last one from."""
     chain = station.plant.pages.chain(of)
-    return [(n, hash, created) for n, hash, created, _ in station.plant.pages.times(chain.chain, most)]
+    return [(n, hash, created) for n, hash, created, _ in station.plant.pages.times(chain.id, most)]

@@ -33,7 +33,7 @@ from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.evidence import PASSED
-from teds_provision.protocol.plant.fold import MergedClaims
+from teds_provision.protocol.plant.merged_claims import MergedClaims
 from teds_provision.protocol.plant.page import MOST_EVENTS, MOST_PAYLOAD, Page, PageDraft, open_page, seal_page
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.sanitize import counted
@@ -73,7 +73,7 @@ def alone(station: Station) -> Iterator[None]:
         yield
 
 
-def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncResult:
+def sync(station: Station, transport: Transport, *, connected: bool = True) -> SyncResult:
     """Bring this station and the transport to the same state, as far as signatures go.
 
     ``connected``: it is what the station joined by; how far its database came is remembered. Raises LinkError,
@@ -82,7 +82,9 @@ def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncRe
     station.unlock()
     with alone(station):
         done = SyncResult()
-        done.rosters = [roster.version for roster, how, _ in _rosters(station, post, done) if how.startswith("taken")]
+        done.rosters = [
+            roster.version for roster, how, _ in _rosters(station, transport, done) if how.startswith("taken")
+        ]
         roster = require_roster(station)
         if roster.member(station.fingerprint) is None:
             apply_claims(station)
@@ -90,20 +92,20 @@ def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncRe
                 f"This station was removed from {roster.name} (roster {roster.version}).",
                 hint="A removed key cannot return: create a new station (init) and have it added.",
             )
-        _own_head(station, post, roster, done, connected=connected)
+        _own_head(station, transport, roster, done, connected=connected)
         if again := fold_new_acts(station, roster):
             done.remarks.append(f"{counted(again, 'page')} read again: this version shows more of what pages say")
         while close_page(station, roster) is not None:
             pass
-        _push(station, post, roster, done, connected=connected)
-        done.fetched += fetching.fetch(station, post, roster)
-        _return_pages(station, post, roster, done)
+        _push(station, transport, roster, done, connected=connected)
+        done.fetched += fetching.fetch(station, transport, roster)
+        _return_pages(station, transport, roster, done)
         done.judged = apply_claims(station)
         acknowledged = station.plant.pages.seen_heads()
         done.remarks += [
             head_text for head, head_text in unseen_heads(station, roster).items() if head not in acknowledged
         ]
-        _parcels(station, post, roster, done)
+        _parcels(station, transport, roster, done)
         with station.transaction():
             joined = station.plant.joined
             assert joined is not None
@@ -111,39 +113,39 @@ def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncRe
         return done
 
 
-def _return_pages(station: Station, post: Transport, roster: Roster, done: SyncResult) -> None:
+def _return_pages(station: Station, transport: Transport, roster: Roster, done: SyncResult) -> None:
     """Take what others handed in for stations that left, and hand in what the registry lacks of them."""
-    if post.returned is None or not returned.is_new(station, post.returned, roster):
+    if transport.returned is None or not returned.is_new(station, transport.returned, roster):
         return
-    done.fetched += returned.take(station, post.returned, roster)
-    done.returned, refused = returned.hand_in(station, post.returned, roster)
+    done.fetched += returned.take(station, transport.returned, roster)
+    done.returned, refused = returned.hand_in(station, transport.returned, roster)
     if done.returned:
         pages = "1 page" if done.returned == 1 else f"{done.returned} pages"
         done.remarks.append(f"{pages} of stations that are no longer members, which the registry lacked, handed in")
     done.remarks += refused
-    if post.returned.takes_pages:
-        returned.note(station, post.returned, roster)
+    if transport.returned.takes_pages:
+        returned.note(station, transport.returned, roster)
 
 
-def _rosters(station: Station, post: Transport, done: SyncResult) -> list[tuple[Roster, str, str]]:
+def _rosters(station: Station, transport: Transport, done: SyncResult) -> list[tuple[Roster, str, str]]:
     """Take the best roster in the transport, and post one's own."""
     joined = station.plant.joined
-    if joined is not None and post.registry() not in (None, joined.registry):
+    if joined is not None and transport.registry() not in (None, joined.registry):
         raise PolicyError(
-            f"{post.where} belongs to another registry ({post.registry()}).",
+            f"{transport.where} belongs to another registry ({transport.registry()}).",
             hint="Use the one that this station joined.",
         )
-    results = take_rosters(station, post.rosters())
+    results = take_rosters(station, transport.rosters())
     for roster, how, why in results:
         if how not in ("taken", "older"):  # each member posts the newest that it knows: some are behind
             done.remarks.append(f"roster {roster.version}: {how}: {why}")
     held = station.plant.held_roster()
     if held is not None:
-        post.post_roster(held.version, held.hash, held.octets)
+        transport.post_roster(held.version, held.hash, held.octets)
     return [(roster_read, str(how), why) for roster_read, how, why in results]
 
 
-def _parcels(station: Station, post: Transport, roster: Roster, done: SyncResult) -> None:
+def _parcels(station: Station, transport: Transport, roster: Roster, done: SyncResult) -> None:
     """Take in and send keys, after the pages that determine their holders."""
 
     def seen(uuids: Sequence[bytes]) -> Mapping[bytes, MergedClaims]:
@@ -151,9 +153,9 @@ def _parcels(station: Station, post: Transport, roster: Roster, done: SyncResult
 
     at = max(now(), roster.created)
     removed_members.review(station, roster, at)
-    came = parcels.take_in(station, post, seen, at)
+    came = parcels.take_in(station, transport, seen, at)
     done.parcels_in, done.waiting = came.taken, came.waiting
-    done.parcels_out = parcels.send_out(station, post, seen, at)
+    done.parcels_out = parcels.send_out(station, transport, seen, at)
 
 
 # -- one's own chain ---------------------------------------------------------------------------------------------------
@@ -164,15 +166,15 @@ def own_chain(station: Station) -> Chain:
     return station.plant.pages.chain(station.fingerprint)
 
 
-def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResult, *, connected: bool) -> None:
+def _own_head(station: Station, transport: Transport, roster: Roster, done: SyncResult, *, connected: bool) -> None:
     """Check the pages under this station's key before any is added, in the order of contract/plant.md, section 6."""
     chain, joined = own_chain(station), station.plant.joined
     assert joined is not None
     restored = station.plant.restored
-    known = {(n, hash) for n, hash, _ in station.plant.pages.names(chain.chain)}
+    known = {(n, hash) for n, hash, _ in station.plant.pages.links(chain.id)}
     above = max(0, joined.acknowledged - 1) if connected and not restored else 0
-    appended = _own_pages(station, post, roster, done, above)
-    found = appended + returned.own(station, post.returned, roster, {page.hash for page in appended})
+    appended = _own_pages(station, transport, roster, done, above)
+    found = appended + returned.own(station, transport.returned, roster, {page.hash for page in appended})
     new = [page for page in found if (page.number, page.hash) not in known]
     if new and restored and _follows(chain, new):
         take_back(station, roster, new)
@@ -182,7 +184,7 @@ def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResul
             back = f"{len(new)} pages that this station wrote before its backup are"
         done.remarks.append(f"{back} back")
     elif new:
-        _stop_at_fork(station, post, new)
+        _stop_at_fork(station, transport, new)
     else:
         _require_resumed(station)
     if restored:
@@ -195,45 +197,45 @@ def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResul
                 " own registry"
             )
     there = max((page.number for page in appended), default=0)
-    if connected and there < joined.acknowledged and not post.everybody:
-        there = post.heads().get(station.fingerprint, 0)
+    if connected and there < joined.acknowledged and not transport.everybody:
+        there = transport.heads().get(station.fingerprint, 0)
         why = f"page {joined.acknowledged} was there, and now {there} is the last"
         alarm(station, "rolled-back", station.fingerprint, joined.acknowledged, why, again=True)
-        done.remarks.append(f"{post.where} was rolled back: {why}; it is being refilled")
+        done.remarks.append(f"{transport.where} was rolled back: {why}; it is being refilled")
 
 
-def _own_pages(station: Station, post: Transport, roster: Roster, done: SyncResult, above: int) -> list[Page]:
+def _own_pages(station: Station, transport: Transport, roster: Roster, done: SyncResult, above: int) -> list[Page]:
     """Return the pages under this station's key.
 
     If only members can write, one that it did not sign stops everything.
     """
-    found, junk = fetching.read_pages(post.pages(station.fingerprint, above), roster, station.fingerprint)
-    if junk and not post.everybody:
+    found, junk = fetching.read_pages(transport.pages(station.fingerprint, above), roster, station.fingerprint)
+    if junk and not transport.everybody:
         alarm(
             station,
             "junk",
             station.fingerprint,
             junk[0],
-            f"{post.where} has pages that this station's key did not sign",
+            f"{transport.where} has pages that this station's key did not sign",
         )
         raise NotAuthenticError(
-            f"{post.where} has pages of this station that its key did not sign, from number {junk[0]} on.",
+            f"{transport.where} has pages of this station that its key did not sign, from number {junk[0]} on.",
             hint=f"To delete them there: registry sql --mend {quote(roster.name_of(station.fingerprint))} {junk[0]}",
         )
     if junk:
         done.remarks.append(
-            f"{post.where}: {counted(len(junk), 'file')} in this station's folder that it did not sign; ignored"
+            f"{transport.where}: {counted(len(junk), 'file')} in this station's folder that it did not sign; ignored"
         )
     return found
 
 
-def _stop_at_fork(station: Station, post: Transport, new: Sequence[Page]) -> NoReturn:
+def _stop_at_fork(station: Station, transport: Transport, new: Sequence[Page]) -> NoReturn:
     """Raise ForkError: another home writes, or has written, under this station's key."""
     homes = ", ".join(sorted({page.home or "unknown" for page in new}))
     first = min(page.number for page in new)
     alarm(station, "fork", station.fingerprint, first, f"pages of home {homes} that are not of this one")
     raise ForkError(
-        f"{post.where} has pages under this station's key that are not of this home, from number {first} on"
+        f"{transport.where} has pages under this station's key that are not of this home, from number {first} on"
         f" (home {homes}; here {station.plant.home}): a disk image was restored, or a copy of this home is in use.",
         hint="Find out who has a copy; if in doubt, have this station removed. Then: teds-provision registry resume",
     )
@@ -309,7 +311,7 @@ def _know_again(station: Station, page: Page) -> None:
         elif uuid in signed:  # no sequence is used twice, whether the board is known here or not
             station.nodes.remember(uuid, sequence=sequence)
     # Pin boards that this station signed for under the key that it said itself: no other board gets their units.
-    for uuid, text in station.plant.claims.of_station(own_chain(station).chain, sorted(signed)).items():
+    for uuid, text in station.plant.claims.of_station(own_chain(station).id, sorted(signed)).items():
         pin = Claim.from_json(text).pin
         if pin is not None and station.pins.entry(uuid) is None:
             station.pins.put(WhitelistEntry(uuid, pin[0], assurance=pin[1]))  # type: ignore[arg-type]
@@ -350,7 +352,7 @@ def _require_all_seen(station: Station, roster: Roster, there: set[int]) -> None
             )
 
 
-def resume(station: Station, post: Transport) -> int:
+def resume(station: Station, transport: Transport) -> int:
     """Go on after a fork, as an operator confirmed: existing pages are adopted, one's own unsent events stay.
 
     A page of this home whose place another one took there is written again with its content; returns how many were
@@ -360,13 +362,13 @@ def resume(station: Station, post: Transport) -> int:
     with alone(station):
         roster = require_roster(station)
         chain = own_chain(station)
-        found = _under_our_key(station, post, roster)
+        found = _under_our_key(station, transport, roster)
         new = _strange(station, found)
         with station.transaction():
             if new:
                 newest = max(new, key=lambda page: (page.number, page.hash))
                 theirs = {(page.number, page.hash) for page in found}
-                counted = [(n, hash) for n, hash, _ in station.plant.pages.names(chain.chain) if n <= chain.counted[0]]
+                counted = [(n, hash) for n, hash, _ in station.plant.pages.links(chain.id) if n <= chain.counted[0]]
                 lost = [place for place in counted if place not in theirs and place[0] >= new[0].number]
                 station.plant.pages.put_chain(replace(chain, accepted=(newest.number, newest.hash)))
                 take_back(station, roster, new)
@@ -381,26 +383,26 @@ def resume(station: Station, post: Transport) -> int:
     return len(new)
 
 
-def strange(station: Station, post: Transport) -> list[Page]:
+def strange(station: Station, transport: Transport) -> list[Page]:
     """Return the unknown pages under this station's key: what :func:`resume` adopts."""
-    return _strange(station, _under_our_key(station, post, require_roster(station)))
+    return _strange(station, _under_our_key(station, transport, require_roster(station)))
 
 
-def _under_our_key(station: Station, post: Transport, roster: Roster) -> list[Page]:
-    post.registry()  # a database is checked again
-    found, _ = fetching.read_pages(post.pages(station.fingerprint, 0), roster, station.fingerprint)
-    return found + returned.own(station, post.returned, roster, {page.hash for page in found}, always=True)
+def _under_our_key(station: Station, transport: Transport, roster: Roster) -> list[Page]:
+    transport.registry()  # a database is checked again
+    found, _ = fetching.read_pages(transport.pages(station.fingerprint, 0), roster, station.fingerprint)
+    return found + returned.own(station, transport.returned, roster, {page.hash for page in found}, always=True)
 
 
 def _strange(station: Station, found: Sequence[Page]) -> list[Page]:
-    known = {(n, hash) for n, hash, _ in station.plant.pages.names(own_chain(station).chain)}
+    known = {(n, hash) for n, hash, _ in station.plant.pages.links(own_chain(station).id)}
     return [page for page in found if (page.number, page.hash) not in known]
 
 
 def _report_again(station: Station, chain: Chain, lost: Sequence[tuple[int, str]], new: Sequence[Page]) -> None:
     adopted = {stated.get("id") for page in new for stated in page.events if isinstance(stated, dict)}
     for n, hash in lost:
-        row = station.plant.pages.get(chain.chain, n, hash)
+        row = station.plant.pages.get(chain.id, n, hash)
         for item in load_exact(row.content, "A page")["events"] if row is not None else ():
             if item["id"] not in adopted:
                 station.plant.queue_event(item)
@@ -445,26 +447,28 @@ def _fresh_heads(station: Station, own: Chain) -> dict[str, tuple[int, str]]:
 # -- out and in --------------------------------------------------------------------------------------------------------
 
 
-def _push(station: Station, post: Transport, roster: Roster, done: SyncResult, *, connected: bool) -> None:
+def _push(station: Station, transport: Transport, roster: Roster, done: SyncResult, *, connected: bool) -> None:
     """Append missing pages: one's own, and in a folder those of all stations."""
-    heads = post.heads()
+    heads = transport.heads()
     for fingerprint, chain in station.plant.pages.chains().items():
         own = fingerprint == station.fingerprint
-        if not own and not post.everybody:
+        if not own and not transport.everybody:
             continue
-        there = {hash_of(carried.octets) for carried in post.pages(fingerprint, 0)} if post.everybody else set()
-        above = 0 if post.everybody else heads.get(fingerprint, 0)
-        for n, hash, previous in station.plant.pages.names(chain.chain):
-            if n <= above or hash in there or (own and not post.everybody and n > chain.counted[0]):
+        there = (
+            {hash_of(carried.octets) for carried in transport.pages(fingerprint, 0)} if transport.everybody else set()
+        )
+        above = 0 if transport.everybody else heads.get(fingerprint, 0)
+        for n, hash, previous in station.plant.pages.links(chain.id):
+            if n <= above or hash in there or (own and not transport.everybody and n > chain.counted[0]):
                 continue
-            row = station.plant.pages.get(chain.chain, n, hash)
+            row = station.plant.pages.get(chain.id, n, hash)
             assert row is not None
-            post.append(fingerprint, n, previous, hash, octets_of(row))
+            transport.append(fingerprint, n, previous, hash, octets_of(row))
             done.pushed += own
     joined, newest = station.plant.joined, own_chain(station).counted[0]
     assert joined is not None
     # to a station that uses folders each of them is the registry: a stick has another path on each machine
-    by_folder = post.everybody and (joined.url or "").startswith(FILES)
+    by_folder = transport.everybody and (joined.url or "").startswith(FILES)
     if (connected or by_folder) and joined.acknowledged != newest:
         station.plant.put_record(replace(joined, acknowledged=newest))
 
@@ -480,8 +484,8 @@ def unseen_heads(station: Station, roster: Roster) -> dict[tuple[str, str, int, 
         chain = chains.get(about)
         if roster.member(who) is None or about not in roster.by_key or who == station.fingerprint:
             continue
-        names = station.plant.pages.names(chain.chain) if chain is not None else []
-        if any((n, hash) == (number, named) for number, named, _ in names):
+        links = station.plant.pages.links(chain.id) if chain is not None else []
+        if any((n, hash) == (number, named) for number, named, _ in links):
             continue
         here = chain.counted[0] if chain is not None else 0
         if n > here:

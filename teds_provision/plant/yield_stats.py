@@ -125,7 +125,7 @@ def _of_pages(station: Station, job: str) -> Iterator[tuple[str, Attempt]]:
     """Yield the attempts that pages report, in their order, each with the SHA-256 of its evidence."""
     counts = Counter[tuple[str, bytes]]()
     for name, pages in station.plant.pages.chains().items():
-        for page in station.plant.pages.each(pages.chain):
+        for page in station.plant.pages.each(pages.id):
             for value in json.loads(page.content).get("events", []):
                 stated = event.read(value)
                 if not isinstance(stated, event.Event) or stated.act != "evidence" or stated.uuid is None:

@@ -45,15 +45,15 @@ def map_ranges(work: Callable[[range], Result], ranges: Sequence[range], workers
 
     Raises TedsProvisionError if a process ends before its work is done.
     """
-    crew: list[_Worker] = []
+    forked: list[_Worker] = []
     try:
-        _fork_workers(crew, workers, work)
-        if crew:
-            yield from _collect(crew, ranges)
+        _fork_workers(forked, workers, work)
+        if forked:
+            yield from _collect(forked, ranges)
         else:  # the system has no process to spare
             yield from map(work, ranges)
     finally:
-        _end(crew)
+        _end(forked)
 
 
 @dataclass
@@ -76,8 +76,8 @@ class _Worker:
             del self.received[:end]
 
 
-def _fork_workers(crew: list[_Worker], count: int, work: Callable[[range], object]) -> None:
-    """Fork processes into ``crew``; fewer if the system gives no more."""
+def _fork_workers(forked: list[_Worker], count: int, work: Callable[[range], object]) -> None:
+    """Fork processes into ``forked``; fewer if the system gives no more."""
     for _ in range(count):
         here, there = socket.socketpair()
         # A signal that came between fork and the child's own settings would run the program's handler in the child.
@@ -85,8 +85,8 @@ def _fork_workers(crew: list[_Worker], count: int, work: Callable[[range], objec
         try:
             pid = os.fork()
             if not pid:
-                _serve(there, [here, *(worker.line for worker in crew)], work)
-            crew.append(_Worker(pid, here))
+                _serve(there, [here, *(worker.line for worker in forked)], work)
+            forked.append(_Worker(pid, here))
         except OSError:
             here.close()
             return
@@ -122,15 +122,15 @@ def _answer(work: Callable[[range], object], places: range) -> tuple[bool, bytes
             return False, pickle.dumps(RuntimeError(repr(error)))
 
 
-def _collect(crew: Sequence[_Worker], ranges: Sequence[range]) -> Iterator[Any]:
+def _collect(forked: Sequence[_Worker], ranges: Sequence[range]) -> Iterator[Any]:
     """Hand out the ranges, and yield the results in the order of the ranges."""
     results: dict[int, tuple[bool, bytes]] = {}
-    handed, due, most = 0, 0, 4 * _AHEAD * len(crew)  # results that wait for an earlier one
+    handed, due, most = 0, 0, 4 * _AHEAD * len(forked)  # results that wait for an earlier one
     with selectors.DefaultSelector() as selector:
-        for worker in crew:
+        for worker in forked:
             selector.register(worker.line, selectors.EVENT_READ, worker)
         while due < len(ranges):
-            for worker in crew:
+            for worker in forked:
                 while len(worker.places) < _AHEAD and handed < min(len(ranges), due + most):
                     _hand(worker, handed, ranges[handed])
                     handed += 1
@@ -183,13 +183,13 @@ def _wait(worker: _Worker) -> int:
         return 0
 
 
-def _end(crew: Sequence[_Worker]) -> None:
+def _end(forked: Sequence[_Worker]) -> None:
     """End every worker that is still there."""
-    running = [worker for worker in crew if worker.pid]
+    running = [worker for worker in forked if worker.pid]
     for worker in running:
         with suppress(ProcessLookupError):
             os.kill(worker.pid, signal.SIGKILL)
-    for worker in crew:
+    for worker in forked:
         worker.line.close()
     for worker in running:
         _wait(worker)

@@ -15,7 +15,7 @@ from teds_provision.links.can.isotp import Frame
 from teds_provision.links.ports import BusFrame
 from teds_provision.node.can.endpoint import CanEndpoint
 from teds_provision.node.can.server import CanServer
-from teds_provision.node.handler import JobQueue
+from teds_provision.node.worker_pool import JobQueue
 from teds_provision.protocol.messages.identity import NodeState
 
 if TYPE_CHECKING:

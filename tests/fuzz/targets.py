@@ -750,7 +750,7 @@ def evidence_seeds() -> Iterable[bytes]:
 def check_plant(data: bytes) -> None:
     """Rosters, pages and requests: the first octet says which; a payload, which a key signs first. Then the fold."""
     from teds_provision.protocol.handover import jose
-    from teds_provision.protocol.plant import claim, document, event, fold, page, roster
+    from teds_provision.protocol.plant import claim, document, event, merged_claims, page, roster
 
     if not data:
         return
@@ -762,7 +762,7 @@ def check_plant(data: bytes) -> None:
         if kind is document.ROSTER:
             read = roster.open_roster(octets, key.point)
             assert roster.taking(read, None, read.registry)[0] == "taken"
-            assert fold.merge_claims(read, {}, fold.LocalState("f" * 64)).key_it
+            assert merged_claims.merge_claims(read, {}, merged_claims.LocalState("f" * 64)).key_it
         elif kind is document.PAGE:
             opened = page.open_page(octets, "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29", lambda kid: key.point)
             gathered = claim.Claim()

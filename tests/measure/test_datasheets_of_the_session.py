@@ -43,7 +43,7 @@ def test_a_group_whose_datasheets_suffice_together_is_measured(hall: Hall, tmp_p
 
 LATE = """
 import runpy, sys, time
-from teds_provision.measure.runner import Measurement
+from teds_provision.measure.running.measurement import Measurement
 told = Measurement._describe
 Measurement._describe = lambda self, facts: (time.sleep(1), told(self, facts))[1]
 sys.argv[0] = "teds-provision"

@@ -22,8 +22,8 @@ from websockets.sync.client import connect
 from teds_provision.errors import StoreError
 from teds_provision.ncap.nodes.directory import for_reader
 from teds_provision.ncap.sinks import for_readers
-from teds_provision.ncap.web.answers import answer_error
 from teds_provision.ncap.web.guard import CALLER, Caller, Guard, Message, Receive, RequestRefusedError, Scope, Send
+from teds_provision.ncap.web.responses import answer_error
 from teds_provision.ncap.web.tokens import Tokens
 from tests.e2e.desk import PASSPHRASE, Desk
 from tests.ncap.service import Answer, Service, virtual

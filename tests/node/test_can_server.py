@@ -13,7 +13,7 @@ from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import Pair, physical_id, single
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.node.can.server import CanServer
-from teds_provision.node.handler import MOST_THREADS
+from teds_provision.node.worker_pool import MOST_THREADS
 from teds_provision.protocol.announce import Announce
 from teds_provision.protocol.messages.identity import NodeState
 from tests.links.can.echo_node import EchoNode

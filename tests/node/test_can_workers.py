@@ -1,4 +1,4 @@
-"""The crew of a bus: jobs of a line in order, lines side by side, and an end that waits for what runs."""
+"""The workers of a bus: jobs of one link in order, links side by side, and an end that waits for what runs."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from types import SimpleNamespace
 import pytest
 
 from teds_provision.node.can import endpoint
-from teds_provision.node.handler import WorkerPool
+from teds_provision.node.worker_pool import WorkerPool
 from teds_provision.protocol.repetition import KEEP_SECONDS
 
 _SECONDS = 30.0
 
 
 def test_jobs_of_a_line_run_in_order_and_one_at_a_time() -> None:
-    crew = WorkerPool(8)
-    turns, done, running, all_done = crew.turns(), [], threading.Semaphore(1), threading.Event()
+    workers = WorkerPool(8)
+    queue, done, running, all_done = workers.new_queue(), [], threading.Semaphore(1), threading.Event()
 
     def job(number: int) -> Callable[[], None]:
         def run() -> None:
@@ -31,14 +31,14 @@ def test_jobs_of_a_line_run_in_order_and_one_at_a_time() -> None:
         return run
 
     for number in range(200):
-        turns.put(job(number))
+        queue.put(job(number))
     assert all_done.wait(_SECONDS)
-    crew.end()
+    workers.end()
     assert done == list(range(200))
 
 
 def test_lines_run_side_by_side_as_far_as_there_are_threads() -> None:
-    crew, most = WorkerPool(4), 4
+    workers, most = WorkerPool(4), 4
     together = threading.Barrier(most)
     met = threading.Semaphore(0)
 
@@ -48,14 +48,14 @@ def test_lines_run_side_by_side_as_far_as_there_are_threads() -> None:
 
     for _ in range(3):  # threads that are free again take the next ones
         for _ in range(most):
-            crew.turns().put(meet)
+            workers.new_queue().put(meet)
         for _ in range(most):
             assert met.acquire(timeout=_SECONDS)
-    crew.end()
+    workers.end()
 
 
 def test_more_lines_than_threads_all_get_their_turn() -> None:
-    crew, lines = WorkerPool(2), 20
+    workers, lines = WorkerPool(2), 20
     go, ran = threading.Event(), threading.Semaphore(0)
     threads: set[str] = set()
 
@@ -65,26 +65,26 @@ def test_more_lines_than_threads_all_get_their_turn() -> None:
         ran.release()
 
     for _ in range(lines):
-        crew.turns().put(job)
+        workers.new_queue().put(job)
     go.set()
     for _ in range(lines):
         assert ran.acquire(timeout=_SECONDS)
-    crew.end()
+    workers.end()
     assert len(threads) <= 2
 
 
 def test_a_job_that_fails_costs_no_thread_and_no_line(caplog: pytest.LogCaptureFixture) -> None:
-    crew, ran = WorkerPool(1), threading.Event()
-    turns = crew.turns()
-    turns.put(lambda: {}[0])
-    turns.put(ran.set)
+    workers, ran = WorkerPool(1), threading.Event()
+    queue = workers.new_queue()
+    queue.put(lambda: {}[0])
+    queue.put(ran.set)
     assert ran.wait(_SECONDS)
-    crew.end()
+    workers.end()
     assert "A node's command failed." in caplog.text
 
 
 def test_the_end_waits_for_what_runs_and_drops_the_rest() -> None:
-    crew, began, go = WorkerPool(1), threading.Event(), threading.Event()
+    workers, began, go = WorkerPool(1), threading.Event(), threading.Event()
     ended: list[str] = []
 
     def slow() -> None:
@@ -92,18 +92,18 @@ def test_the_end_waits_for_what_runs_and_drops_the_rest() -> None:
         assert go.wait(_SECONDS)
         ended.append("slow")
 
-    crew.turns().put(slow)
+    workers.new_queue().put(slow)
     assert began.wait(_SECONDS)
-    crew.turns().put(lambda: ended.append("never"))
-    over = threading.Thread(target=crew.end)
+    workers.new_queue().put(lambda: ended.append("never"))
+    over = threading.Thread(target=workers.end)
     over.start()
     until = time.monotonic() + _SECONDS
-    while not crew._ended and time.monotonic() < until:
+    while not workers._ended and time.monotonic() < until:
         time.sleep(0.001)
     go.set()  # not before: a thread that is free would still take the next job
     over.join(_SECONDS)
     assert not over.is_alive()
-    crew.turns().put(lambda: ended.append("after the end"))
+    workers.new_queue().put(lambda: ended.append("after the end"))
     assert ended == ["slow"]
 
 

@@ -14,7 +14,7 @@ from teds_provision.plant.transport import CarriedPage, Parcel
 from teds_provision.protocol.keys import PrivateKey, node_key_message, station_key_message
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.claim import Claim
-from teds_provision.protocol.plant.fold import LocalState, MergedClaims, merge_claims
+from teds_provision.protocol.plant.merged_claims import LocalState, MergedClaims, merge_claims
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster, Share, open_roster, seal_roster
 from teds_provision.provisioning.agree import agree
 from teds_provision.provisioning.identify import identify
@@ -31,7 +31,7 @@ def ask(prompt: str, confirm: bool) -> str:
 
 
 @dataclass
-class MemoryPost:
+class MemoryTransport:
     """A post office in memory: what one station sends lies there for the other."""
 
     everybody: bool = False
@@ -89,7 +89,7 @@ class Plant:
             made = trust.adopt_certificate(home, certificate, ask=ask)
             self.stack.callback(made.close)
             self.stations[name] = made
-        self.post = MemoryPost()
+        self.transport = MemoryTransport()
         self.deaf: set[str] = set()
         """Stations whose pages nobody has."""
         self.roster_ = Roster(

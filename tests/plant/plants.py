@@ -13,7 +13,7 @@ from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_m
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.chain import CountedPages, counting
 from teds_provision.protocol.plant.claim import Claim
-from teds_provision.protocol.plant.fold import BanStatement, LocalState, MergedClaims, merge_claims
+from teds_provision.protocol.plant.merged_claims import BanStatement, LocalState, MergedClaims, merge_claims
 from teds_provision.protocol.plant.page import Page, PageDraft, open_page, seal_page
 from teds_provision.protocol.plant.roster import Member, Place, RemovedMember, Roster, open_roster, seal_roster
 from teds_provision.protocol.plant.signer import SignatureClaim, SignerVerdict, signing

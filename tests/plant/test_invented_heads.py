@@ -24,7 +24,7 @@ def test_an_auditors_word_counts_for_nothing_and_a_keeper_knows_its_own_chain(
     for station in (made.north, south):
         made.sync(station)
         station.plant.pages.put_heads(
-            station.plant.pages.chain(witness.fingerprint).chain, {made.north.fingerprint: (10_000, "ab" * 32)}
+            station.plant.pages.chain(witness.fingerprint).id, {made.north.fingerprint: (10_000, "ab" * 32)}
         )
         rules = station.policy.signer_rules()
         assert rules is not None

@@ -385,7 +385,7 @@ def test_another_members_answer_neither_ends_the_waiting_nor_hides_the_offices(d
     east = desk.plant.member("east", "audit")
     desk.plant.round()
     east.unlock()
-    run, one, post = desk.run(), board(1), FolderTransport(desk.plant.stick)
+    run, one, transport = desk.run(), board(1), FolderTransport(desk.plant.stick)
     request = desk.request(run, one)
     lies = [
         seal_answer(Answer(request.hash, refused="revoked", why="a lie"), station.credentials().key)
@@ -394,10 +394,10 @@ def test_another_members_answer_neither_ends_the_waiting_nor_hides_the_offices(d
     lies.append(seal_answer(Answer(request.hash, 9, b""), SoftwareKey.generate()))
 
     def leave(document: bytes, name: str) -> None:
-        send(east, post, desk.line.identity.fingerprint, document, f"{name}-0000-4000-8000-000000000000")
+        send(east, transport, desk.line.identity.fingerprint, document, f"{name}-0000-4000-8000-000000000000")
 
     leave(lies[0], "00000000")
-    run.office = RemoteOffice(desk.line, post, 0.2)
+    run.office = RemoteOffice(desk.line, transport, 0.2)
     with pytest.raises(OfficeSilentError):
         build(run, one)
     for n, lie in enumerate(lies):
@@ -412,17 +412,17 @@ def test_an_answer_waits_for_the_line_that_asked_and_for_no_person(desk: Desk) -
     """One that came again, after the board was done, stayed for ever: "1 parcel waits for import-keys --received"."""
     run, one = desk.run(), board(1)
     request = desk.request(run, one)
-    post, me = FolderTransport(desk.plant.stick), desk.line.identity.fingerprint
+    transport, me = FolderTransport(desk.plant.stick), desk.line.identity.fingerprint
     sealed = answer(desk.office, request.octets)
     assert sealed is not None
-    send(desk.office, post, me, sealed, str(uuid.uuid4()))
+    send(desk.office, transport, me, sealed, str(uuid.uuid4()))
     done = desk.plant.sync(desk.line)
     assert (done.parcels_in, done.waiting) == (0, 0)
     (kept,) = parcels.received(desk.line, "signed")
     assert kept[1] == sealed
     desk.line.plant.parcels.drop(kept[0].id, "in")
     build(run, one)
-    send(desk.office, post, me, sealed, str(uuid.uuid4()))
+    send(desk.office, transport, me, sealed, str(uuid.uuid4()))
     assert desk.plant.sync(desk.line).waiting == 0
     assert parcels.received(desk.line, "signed") == []
 

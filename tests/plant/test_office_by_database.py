@@ -48,7 +48,7 @@ def test_an_office_signs_through_the_registry_for_all_readers_of_a_line(plant: O
     west.unlock()
     told = {"registry": plant.plant.roster.registry, "sign": north.fingerprint, "stations": {west.fingerprint: 8}}
     job = take_job(north, job_of(north, **told, count=8))
-    at_office, at_line = plant.post(north), plant.post(west)
+    at_office, at_line = plant.transport(north), plant.transport(west)
     send_job(north, at_office, job)
     plant.sync(north, west)
     over, failed = threading.Event(), []
@@ -85,7 +85,7 @@ def test_a_request_that_its_office_took_away_is_there_again_when_it_is_asked_aga
     """What lay there when the line began was taken for lying there still: who asked again waited for nothing."""
     north, west = plant.north, plant.member("west", "line")
     plant.sync(north, west)
-    at_office, at_line = plant.post(north), plant.post(west)
+    at_office, at_line = plant.transport(north), plant.transport(west)
     parcel = Parcel(str(uuid.uuid4()), north.fingerprint, b"{}" * 100, time_text(datetime.now(UTC) + timedelta(days=1)))
     at_line.send(parcel)
     at_line.registry()
@@ -105,9 +105,9 @@ def test_a_registry_that_was_away_hears_everything_once(plant: Office) -> None:
     west.unlock()
     told = {"registry": plant.plant.roster.registry, "sign": north.fingerprint, "stations": {west.fingerprint: 3}}
     job = take_job(north, job_of(north, **told))
-    send_job(north, plant.post(north), job)
+    send_job(north, plant.transport(north), job)
     plant.sync(north, west)
-    away = RemoteOffice(west, plant.post(west, port=free_tcp_port()), 1)
+    away = RemoteOffice(west, plant.transport(west, port=free_tcp_port()), 1)
     line = LineRun(west, find_job(west, job.id), office=away)
     first, second = board(1), board(2)
     with pytest.raises(RegistryError):

@@ -43,8 +43,8 @@ def now(days: float = 0) -> datetime:
 
 def sync(plant: Plant, *names: str, at: datetime | None = None) -> None:
     for name in names:
-        parcels.take_in(plant[name], plant.post, plant.views(name), at or now())
-        parcels.send_out(plant[name], plant.post, plant.views(name), at or now())
+        parcels.take_in(plant[name], plant.transport, plant.views(name), at or now())
+        parcels.send_out(plant[name], plant.transport, plant.views(name), at or now())
 
 
 def holds(station: Station, uuid: bytes) -> list[tuple[int, str]]:
@@ -63,7 +63,7 @@ def test_a_key_goes_to_who_shares_it_and_its_receipt_comes_back(plant: Plant) ->
     assert parcels.waiting_out(plant["west"]) == 1
     sync(plant, "west")
     assert parcels.waiting_out(plant["west"]) == 0
-    assert plant.post.there == {}
+    assert plant.transport.there == {}
     assert [holder.fingerprint for holder in plant["west"].keys.holders(board.uuid)] == [plant["south"].fingerprint]
 
 
@@ -73,7 +73,7 @@ def test_nothing_goes_round_in_circles(plant: Plant) -> None:
     for _ in range(3):
         sync(plant, "west", "north", "south")
     assert [len(holds(plant[name], board.uuid)) for name in ROLES] == [1, 1, 1]
-    assert plant.post.there == {}
+    assert plant.transport.there == {}
     sent = [handover for name in ROLES for handover in plant[name].handovers.all() if handover.direction == "out"]
     assert len(sent) == 2
 
@@ -97,7 +97,7 @@ def test_who_forgets_keeps_nothing_once_all_have_it(plant: Plant) -> None:
     assert holds(plant["west"], board.uuid) == []
     assert holds(plant["south"], board.uuid)
     sync(plant, "west", "north", "south")
-    assert plant.post.there == {}
+    assert plant.transport.there == {}
 
 
 def test_a_copy_that_nobody_shares_waits_for_a_person(plant: Plant) -> None:
@@ -110,13 +110,13 @@ def test_a_copy_that_nobody_shares_waits_for_a_person(plant: Plant) -> None:
     sync(plant, "west", "south")
     assert holds(plant["south"], board.uuid) == []
     assert waits(plant["south"]) == [f"{board.uuid.hex()}: no share of the roster sends it here"]
-    assert plant.post.there == {}
+    assert plant.transport.there == {}
 
 
 def test_a_copy_that_expired_while_it_waited_makes_room_for_the_next_one(plant: Plant) -> None:
     board_of(plant["west"], os.urandom(10))
     plant.roster(ROLES, everything(plant, "south"))
-    parcels.send_out(plant["west"], plant.post, plant.views("west"), now())
+    parcels.send_out(plant["west"], plant.transport, plant.views("west"), now())
     plant.roster(ROLES)  # shared no more: it waits for a person
     sync(plant, "south")
     assert len(waits(plant["south"])) == 1
@@ -136,7 +136,7 @@ def test_requests_that_nobody_answers_any_more_do_not_keep_jobs_out(plant: Plant
         members = {"format": kind.format, "id": f"6f1c0a52-6f0e-4c1b-8a55-{n:012d}"}
         signed = document.seal(members, north.vault.identity(), kind)
         sealed = jose.encrypt(signed, [west.point], cty=CONTENT_TYPE)
-        plant.post.send(Parcel(f"{kind.typ} {n}", west.fingerprint, sealed, time_text(now(60)), north.fingerprint))
+        plant.transport.send(Parcel(f"{kind.typ} {n}", west.fingerprint, sealed, time_text(now(60)), north.fingerprint))
 
     for n in range(64):
         send(document.SIGN_REQUEST, n)
@@ -234,25 +234,25 @@ def test_a_bundle_of_which_nothing_is_taken_is_refused_and_never_sent_again(plan
         assert any('"refused"' in text and row.about in text for _, _, text in told)
         from teds_provision.protocol.plant.claim import Claim
 
-        chain = plant["west"].plant.pages.chain(plant["south"].fingerprint).chain
+        chain = plant["west"].plant.pages.chain(plant["south"].fingerprint).id
         refused = {(row.about, plant["west"].fingerprint, "no")}
         plant["west"].plant.claims.put(chain, {board.uuid: Claim(refused=refused).to_json()})
-    parcels.send_out(plant["west"], plant.post, claims, now())
+    parcels.send_out(plant["west"], plant.transport, claims, now())
     assert parcels.waiting_out(plant["west"]) == 0
-    parcels.send_out(plant["west"], plant.post, claims, now(8))
-    assert plant.post.there == {}
+    parcels.send_out(plant["west"], plant.transport, claims, now(8))
+    assert plant.transport.there == {}
 
 
 def test_a_copy_without_receipt_is_made_anew_after_seven_days(plant: Plant) -> None:
     plant.roster(ROLES, everything(plant, "south"))
     board = board_of(plant["west"], os.urandom(10))
     sync(plant, "west")
-    [lost] = list(plant.post.there)
-    plant.post.there.clear()
+    [lost] = list(plant.transport.there)
+    plant.transport.there.clear()
     sync(plant, "west", at=now(6))
-    assert plant.post.there == {}
+    assert plant.transport.there == {}
     sync(plant, "west", at=now(8))
-    assert list(plant.post.there) != [lost]
+    assert list(plant.transport.there) != [lost]
     sync(plant, "south", at=now(8))
     assert holds(plant["south"], board.uuid)
 
@@ -274,9 +274,9 @@ def test_a_move_without_receipt_goes_again_under_its_old_id(plant: Plant) -> Non
 def test_what_the_post_takes_no_more_goes_with_a_later_sync(plant: Plant) -> None:
     plant.roster(ROLES, everything(plant, "south"))
     board = board_of(plant["west"], os.urandom(10))
-    plant.post.full = True
+    plant.transport.full = True
     sync(plant, "west")
-    plant.post.full = False
+    plant.transport.full = False
     sync(plant, "west", "south")
     assert holds(plant["south"], board.uuid)
 
@@ -285,30 +285,30 @@ def test_nothing_goes_by_itself_once_the_roster_has_expired(plant: Plant) -> Non
     plant.roster(ROLES, everything(plant, "south"), days=30)
     board = board_of(plant["west"], os.urandom(10))
     sync(plant, "west", at=now(40))
-    assert plant.post.there == {}
+    assert plant.transport.there == {}
     sync(plant, "west")
-    parcels.take_in(plant["south"], plant.post, plant.views("south"), now(6))
+    parcels.take_in(plant["south"], plant.transport, plant.views("south"), now(6))
     assert holds(plant["south"], board.uuid)
 
 
 def test_a_removed_station_gets_nothing(plant: Plant) -> None:
     plant.roster(ROLES, everything(plant, "south"))
     board_of(plant["west"], os.urandom(10))
-    plant.post.full = True
+    plant.transport.full = True
     sync(plant, "west")
-    plant.post.full = False
+    plant.transport.full = False
     plant.roster({"north": "keeper", "west": "line"}, removed={"south": (0, "")})
     sync(plant, "west")
-    assert plant.post.there == {}
+    assert plant.transport.there == {}
 
 
 def test_junk_and_what_is_for_others_is_thrown_away_and_told(plant: Plant) -> None:
     plant.roster(ROLES)
     station = plant["south"]
     for octets in (b"junk", b"{}", b'{"a": 1}', b"", b"a.b.c", os.urandom(100)):
-        plant.post.send(Parcel(os.urandom(4).hex(), station.fingerprint, octets, "2027-01-01T00:00:00Z"))
+        plant.transport.send(Parcel(os.urandom(4).hex(), station.fingerprint, octets, "2027-01-01T00:00:00Z"))
     sync(plant, "south")
-    assert plant.post.there == {}
+    assert plant.transport.there == {}
     assert [alarm.code for alarm in station.plant.alarms.all()] == ["parcel"]
 
 
@@ -322,7 +322,7 @@ def test_what_comes_from_a_removed_station_or_too_late_is_thrown_away_without_an
     if course == "stolen":
         plant.roster({"north": "keeper", "south": "base"}, everything(plant, "south"), removed={"west": (0, "")})
     sync(plant, "south", at=now(8 if course == "expired" else 0))
-    assert plant.post.there == {}
+    assert plant.transport.there == {}
     assert plant["south"].plant.alarms.all() == []
     assert not plant["south"].keys.held(board.uuid)
     assert [entry.outcome for entry in plant["south"].audit_log.entries() if entry.act == "import"] == [
@@ -334,11 +334,11 @@ def test_the_same_parcel_again_gives_the_same_receipt(plant: Plant) -> None:
     plant.roster(ROLES, everything(plant, "south"))
     board = board_of(plant["west"], os.urandom(10))
     sync(plant, "west")
-    [parcel] = list(plant.post.there.values())
+    [parcel] = list(plant.transport.there.values())
     sync(plant, "south")
-    plant.post.there[parcel.id] = parcel  # a cut between import and taking it away, or an administrator
+    plant.transport.there[parcel.id] = parcel  # a cut between import and taking it away, or an administrator
     sync(plant, "south", "west", "west")
-    assert plant.post.there == {}
+    assert plant.transport.there == {}
     assert len(holds(plant["south"], board.uuid)) == 1
 
 
@@ -361,10 +361,10 @@ def test_a_job_travels_sealed_and_comes_out_as_it_was_signed(plant: Plant) -> No
     plant.roster(ROLES)
     members = {"format": document.JOB.format, "id": "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"}
     signed = document.seal(members, plant["north"].vault.identity(), document.JOB)
-    sign_requests.send(plant["north"], plant.post, plant["west"].fingerprint, signed, members["id"])
-    [parcel] = plant.post.there.values()
+    sign_requests.send(plant["north"], plant.transport, plant["west"].fingerprint, signed, members["id"])
+    [parcel] = plant.transport.there.values()
     assert b"teds-job" not in parcel.octets
     sync(plant, "west")
     [(row, octets)] = parcels.received(plant["west"], "job")
     assert (row.peer, octets) == (plant["north"].fingerprint, signed)
-    assert plant.post.there == {}
+    assert plant.transport.there == {}

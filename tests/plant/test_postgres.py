@@ -34,7 +34,7 @@ def login(database: Database) -> Login:
 
 
 @pytest.fixture
-def post(login: Login) -> Iterator[Registry]:
+def transport(login: Login) -> Iterator[Registry]:
     made = registry(login)
     yield made
     made.close()
@@ -67,10 +67,10 @@ def later(days: int = 7) -> datetime:
     return datetime.now(UTC) + timedelta(days=days)
 
 
-def test_pages_that_one_appends_another_reads(post: Registry, login: Login) -> None:
+def test_pages_that_one_appends_another_reads(transport: Registry, login: Login) -> None:
     pages = chain(70)  # more than are asked for at once
-    post.append(pages)
-    post.append(pages[-3:])  # there already
+    transport.append(pages)
+    transport.append(pages[-3:])  # there already
     other = registry(login.database.member())
     look = other.look()
     assert look.registry == login.database.registry
@@ -79,30 +79,30 @@ def test_pages_that_one_appends_another_reads(post: Registry, login: Login) -> N
     other.close()
 
 
-def test_a_page_that_does_not_follow_leaves_none_of_its_push(post: Registry, login: Login) -> None:
+def test_a_page_that_does_not_follow_leaves_none_of_its_push(transport: Registry, login: Login) -> None:
     first, second, _ = chain(3)
     with pytest.raises(ForkError):
-        post.append([first, (2, "00" * 32, second[2])])
-    assert post.look().heads[login.fingerprint][0] == 0
+        transport.append([first, (2, "00" * 32, second[2])])
+    assert transport.look().heads[login.fingerprint][0] == 0
     with pytest.raises(StoreError):
-        post.append([second])
-    post.append([first, second])
+        transport.append([second])
+    transport.append([first, second])
 
 
-def test_a_parcel_goes_to_its_receiver_and_is_taken_away(post: Registry, login: Login) -> None:
+def test_a_parcel_goes_to_its_receiver_and_is_taken_away(transport: Registry, login: Login) -> None:
     to = login.database.member()
     receiver, name = registry(to), str(uuid.uuid4())
-    post.send(name, to.fingerprint, b"sealed", later())
-    post.send(name, to.fingerprint, b"sealed", later())
+    transport.send(name, to.fingerprint, b"sealed", later())
+    transport.send(name, to.fingerprint, b"sealed", later())
     [waiting] = receiver.look().parcels
     assert (waiting.id, waiting.sender, waiting.to, waiting.octets) == (name, login.fingerprint, to.fingerprint, 6)
-    assert [waiting_parcel.id for waiting_parcel in post.look().parcels] == [name]
+    assert [waiting_parcel.id for waiting_parcel in transport.look().parcels] == [name]
     assert receiver.parcel(name) == b"sealed"
     receiver.remove([name])
-    assert post.look().parcels == ()
+    assert transport.look().parcels == ()
     assert receiver.parcel(name) is None
     with pytest.raises(PolicyError):
-        post.send(str(uuid.uuid4()), to.fingerprint, b"", later(40))
+        transport.send(str(uuid.uuid4()), to.fingerprint, b"", later(40))
     receiver.close()
 
 
@@ -116,12 +116,12 @@ def test_two_stations_that_send_to_each_other_at_once_do_not_lock_each_other_out
         there.execute(send, (uuid.uuid4(), bytes.fromhex(login.fingerprint), b"and back", later()))
 
 
-def test_a_roster_that_many_post_comes_once(post: Registry, login: Login) -> None:
+def test_a_roster_that_many_post_comes_once(transport: Registry, login: Login) -> None:
     other = registry(login.database.member())
-    post.post_roster(4, b"the fourth")
+    transport.post_roster(4, b"the fourth")
     other.post_roster(4, b"the fourth")
-    assert post.look().rosters.count(b"the fourth") == 1
-    assert post.look().posted == b"the fourth"
+    assert transport.look().rosters.count(b"the fourth") == 1
+    assert transport.look().posted == b"the fourth"
     assert registry(login.database.member()).look().posted is None
     other.close()
 
@@ -140,16 +140,16 @@ def test_a_push_of_many_pages_is_one_round_trip(far: Registry, way: Relay) -> No
     assert way.sent - before == 1
 
 
-def test_who_listens_is_woken_and_is_not_without_a_reason(post: Registry, login: Login) -> None:
+def test_who_listens_is_woken_and_is_not_without_a_reason(transport: Registry, login: Login) -> None:
     listener = registry(login)
     listener.listen()
     assert not listener.wait(0.05)
-    post.append(chain(1))
+    transport.append(chain(1))
     assert listener.wait(PATIENCE)
     woken: list[bool] = []
     waits = threading.Thread(target=lambda: woken.append(listener.wait(PATIENCE)))
     waits.start()
-    post.post_roster(1, b"one")
+    transport.post_roster(1, b"one")
     waits.join(PATIENCE)
     assert woken == [True]
     listener.close()
@@ -208,11 +208,11 @@ def test_a_server_of_another_name_is_refused(login: Login) -> None:
         registry(login, host="elsewhere.example", hostaddr="127.0.0.1").look()
 
 
-def test_a_closed_station_is_told_that_it_is_no_member(post: Registry, login: Login) -> None:
-    post.look()
+def test_a_closed_station_is_told_that_it_is_no_member(transport: Registry, login: Login) -> None:
+    transport.look()
     login.database.sql(f"update registry.member set open = false where role = '{login.role}'")
     with pytest.raises(NotMemberError):
-        post.append(chain(1))
+        transport.append(chain(1))
 
 
 def test_a_database_without_schema_and_one_of_a_newer_version_are_told(cluster: Cluster, login: Login) -> None:
@@ -287,13 +287,13 @@ def test_a_server_that_dies_during_a_push_has_all_of_it_or_nothing(login: Login,
 def test_no_server_at_all_and_one_that_comes_back() -> None:
     with own_cluster() as cluster:
         database = Database.new(cluster)
-        post = registry(database.member())
-        post.append(chain(1))
+        transport = registry(database.member())
+        transport.append(chain(1))
         cluster.stop()
         with pytest.raises(RegistryError):
-            post.look()
+            transport.look()
         with pytest.raises(RegistryError, match="refused"):
-            post.look()
+            transport.look()
         cluster.start()
-        assert post.look().heads
-        post.close()
+        assert transport.look().heads
+        transport.close()

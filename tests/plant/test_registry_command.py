@@ -199,8 +199,8 @@ def test_the_doctor_says_whose_clock_is_wrong_until_that_station_dates_a_page_we
         with Station.inspect(desk.folder / "south") as south, south.transaction():
             pages = south.plant.pages
             chain = pages.chain(west)
-            n = 1 + max((number for number, *_ in pages.times(chain.chain, 1)), default=0)
-            pages.add(chain.chain, PageRow(n, f"{n:064x}", "", created, "", b"", b"{}", bytes(64)))
+            n = 1 + max((number for number, *_ in pages.times(chain.id, 1)), default=0)
+            pages.add(chain.id, PageRow(n, f"{n:064x}", "", created, "", b"", b"{}", bytes(64)))
         checks = json.loads(desk.run("south", "--json", "doctor").out)["checks"]
         said = [check for check in checks if check["name"] == "registry" and "page" in check["why"]]
         return [f"{item['why']} {item['fix']}" for item in said]

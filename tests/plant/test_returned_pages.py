@@ -62,7 +62,7 @@ class Loss(Office):
             self.database.sql(member_sql(station.fingerprint, verifier(self.secrets[station.fingerprint])))
 
     def pages_here(self, station: Station, of: Station) -> list[str]:
-        return [hash for _, hash, _ in station.plant.pages.names(station.plant.pages.chain(of.fingerprint).chain)]
+        return [hash for _, hash, _ in station.plant.pages.links(station.plant.pages.chain(of.fingerprint).id)]
 
     def handed_in(self, of: Station) -> list[list[str]]:
         return self.database.sql(f"select n, hash from registry.found where author = '\\x{of.fingerprint}' order by n")
@@ -156,13 +156,13 @@ def test_nothing_new_is_one_round_trip_when_pages_were_handed_in(loss: Loss) -> 
     loss.lose(loss.north, loss.south)
     loss.sync(loss.south, loss.north, loss.south, loss.north, loss.south)
     with relay(loss.database.cluster.port) as way:
-        post = loss.post(loss.south, port=way.port)
-        post.registry()
+        transport = loss.transport(loss.south, port=way.port)
+        transport.registry()
         before = way.sent
-        done = plant_room.sync.sync(loss.south, post)
+        done = plant_room.sync.sync(loss.south, transport)
         assert (done.returned, done.fetched, done.remarks) == (0, 0, [])
         assert way.sent - before == 1
-        post.close()
+        transport.close()
 
 
 def test_a_sync_that_was_cut_hands_in_the_rest(loss: Loss) -> None:
@@ -178,7 +178,7 @@ def test_a_sync_that_was_cut_hands_in_the_rest(loss: Loss) -> None:
 def test_forged_pages_and_a_wrong_author_are_passed_over_and_the_member_is_named(loss: Loss) -> None:
     west = loss.leaver("line")
     page = loss.north.plant.pages.get(
-        loss.north.plant.pages.chain(west.fingerprint).chain, 1, loss.pages_here(loss.north, west)[0]
+        loss.north.plant.pages.chain(west.fingerprint).id, 1, loss.pages_here(loss.north, west)[0]
     )
     assert page is not None
     genuine = plant_room.apply_pages.octets_of(page).decode()
@@ -219,10 +219,10 @@ def test_of_a_member_that_floods_with_forged_pages_only_the_first_few_are_read(l
     later = loss.member("later", "base")
     loss.sync(loss.north)
     with relay(loss.database.cluster.port) as way:
-        post = loss.post(later, port=way.port)
-        plant_room.sync.sync(later, post)
+        transport = loss.transport(later, port=way.port)
+        plant_room.sync.sync(later, transport)
         assert way.received < 2_000_000
-        post.close()
+        transport.close()
     assert loss.pages_here(later, west) == loss.pages_here(loss.north, west)
 
 
@@ -241,7 +241,7 @@ def test_another_history_that_a_thief_wrote_gives_way_to_the_rosters_last(loss: 
     loss.remove(west)
     loss.lose(loss.north, loss.south)
     liar = loss.member("liar", "audit")
-    genuine = loss.north.plant.pages.get(chain.chain, 1, first)
+    genuine = loss.north.plant.pages.get(chain.id, 1, first)
     assert genuine is not None
     with loss.login(liar).connect() as connection:
         restore(connection, west.fingerprint, 1, plant_room.apply_pages.octets_of(genuine).decode())
@@ -301,7 +301,7 @@ def test_a_home_from_a_backup_finds_its_own_pages_among_those_handed_in(loss: Lo
     newest = chain.counted[0]
     hash = chain.counted[1]
     with west.transaction():  # as a backup from before its last page has it
-        west._store.execute("DELETE FROM pages WHERE chain = ? AND hash = ?", (chain.chain, hash))
+        west._store.execute("DELETE FROM pages WHERE chain = ? AND hash = ?", (chain.id, hash))
         roster = west.plant.roster
         assert roster is not None
         plant_room.apply_pages.recount(west, chain, roster)

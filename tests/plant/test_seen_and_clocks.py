@@ -24,7 +24,7 @@ def test_a_report_of_pages_that_are_missing_is_shown_until_a_person_has_seen_it(
 
     def report(n: int) -> None:
         south.plant.pages.put_heads(
-            south.plant.pages.chain(witness.fingerprint).chain, {made.north.fingerprint: (n, "ab" * 32)}
+            south.plant.pages.chain(witness.fingerprint).id, {made.north.fingerprint: (n, "ab" * 32)}
         )
 
     report(10_000)
@@ -93,9 +93,9 @@ def test_a_request_and_a_roster_from_the_future_are_not_taken_and_the_message_na
     made.sync(made.north)
     past = datetime.now(UTC) - timedelta(days=2)
     monkeypatch.setattr("teds_provision.plant.membership.now", lambda: past)
-    post = FolderTransport(made.stick)
+    transport = FolderTransport(made.stick)
     with pytest.raises(PolicyError, match="in the future"):
-        plant.membership.found_roster(south, post, None)
-    assert plant.membership.found_roster(made.north, post, None).version == 2, "its own roster shows the time"
+        plant.membership.found_roster(south, transport, None)
+    assert plant.membership.found_roster(made.north, transport, None).version == 2, "its own roster shows the time"
     south.close()
     made.close()

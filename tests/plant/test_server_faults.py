@@ -25,14 +25,14 @@ from tests.plant.test_synced_by_database import Office, roster_with
 pytestmark = pytest.mark.system
 
 
-class Mortal:
+class MortalTransport:
     """A post whose server dies, as by a power cut, before the k-th thing that is asked of it; then it is back."""
 
-    def __init__(self, post: PostgresTransport, cluster: Cluster, step: int) -> None:
-        self._post, self._cluster, self.left = post, cluster, step
+    def __init__(self, transport: PostgresTransport, cluster: Cluster, step: int) -> None:
+        self._transport, self._cluster, self.left = transport, cluster, step
 
     def __getattr__(self, name: str) -> Any:
-        found = getattr(self._post, name)
+        found = getattr(self._transport, name)
         return self._counted(found) if callable(found) else found
 
     def _counted(self, asked: Callable[..., Any]) -> Callable[..., Any]:
@@ -70,11 +70,11 @@ def survived(office: Office, cluster: Cluster, *steps: int) -> int:
 
 
 def died(office: Office, cluster: Cluster, station: Station, step: int) -> bool:
-    post = office.post(station)
-    mortal = Mortal(post, cluster, step)
+    transport = office.transport(station)
+    mortal = MortalTransport(transport, cluster, step)
     with suppress(RegistryError):
         sync(station, mortal)  # type: ignore[arg-type]
-    post.close()
+    transport.close()
     return mortal.left <= 0
 
 

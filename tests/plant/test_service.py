@@ -47,10 +47,10 @@ def by_url(office: Office, station: Station) -> Station:
 
 
 def synced(station: Station) -> None:
-    post = connecting.open_transport(station)
-    assert post is not None
-    sync(station, post)
-    post.close()
+    transport = connecting.open_transport(station)
+    assert transport is not None
+    sync(station, transport)
+    transport.close()
 
 
 def watching(station: Station) -> tuple[PlantWatch, list[dict[str, Any]], list[float]]:

@@ -15,7 +15,7 @@ from teds_provision.protocol.plant.roster import Roster, open_roster, seal_roste
 from teds_provision.station.station import Station
 from tests.bench import make_station
 from tests.plant.plants import CA, NODES, REGISTRY, Reader, roster_of
-from tests.plant.test_fold import DIGEST, DIGEST2, chatter
+from tests.plant.test_merged_claims import DIGEST, DIGEST2, chatter
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
     while waiting:  # a page comes when one before it is here, as a sync asks for them
         chance.shuffle(waiting)
         for page in list(waiting):
-            names = station.plant.pages.names(station.plant.pages.chain(page.station).chain)
+            names = station.plant.pages.links(station.plant.pages.chain(page.station).id)
             if page.number == 1 or any(n == page.number - 1 for n, _, _ in names):
                 roster = station.plant.roster
                 assert roster is not None
@@ -66,7 +66,7 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
     assert roster is not None
     oracle = Reader(roster, [octets for speaker in speakers for octets in speaker.pages])
     seen = merged_views(station, roster, NODES)
-    from teds_provision.protocol.plant.fold import LocalState
+    from teds_provision.protocol.plant.merged_claims import LocalState
 
     for uuid in NODES:
         due = oracle.view(uuid, LocalState(station.fingerprint))

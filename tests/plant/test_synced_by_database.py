@@ -54,16 +54,16 @@ class Office:
                 station.policy.trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
         return made
 
-    def post(self, station: Station, **more: Any) -> PostgresTransport:
+    def transport(self, station: Station, **more: Any) -> PostgresTransport:
         told = parameters(self.database.url, station.fingerprint, self.secrets[station.fingerprint])
         return PostgresTransport(Registry(told | more), "the registry", station.fingerprint)
 
     def sync(self, *stations: Station) -> SyncResult:
         done = SyncResult()
         for station in stations:
-            post = self.post(station)
-            done = sync(station, post)
-            post.close()
+            transport = self.transport(station)
+            done = sync(station, transport)
+            transport.close()
         return done
 
 
@@ -104,13 +104,13 @@ def test_nothing_new_is_one_round_trip(office: Office) -> None:
     south = office.member("south", "base")
     office.sync(office.north, south, office.north, south)
     with relay(office.database.cluster.port) as way:
-        post = office.post(south, port=way.port)
-        post.registry()
+        transport = office.transport(south, port=way.port)
+        transport.registry()
         before = way.sent
-        done = sync(south, post)
+        done = sync(south, transport)
         assert (done.pushed, done.fetched, done.remarks) == (0, 0, [])
         assert way.sent - before == 1
-        post.close()
+        transport.close()
 
 
 def test_a_shared_key_arrives_and_its_receipt_returns(office: Office) -> None:
@@ -158,17 +158,17 @@ def test_a_database_of_yesterday_is_brought_up_to_today(office: Office) -> None:
 
 def test_rows_that_a_stolen_login_wrote_stop_the_push_until_they_are_mended(office: Office) -> None:
     office.sync(office.north)
-    post = office.post(office.north)
-    post.registry()
-    n, digest = post._look.heads[office.north.fingerprint]
-    post.append(office.north.fingerprint, n + 1, digest, "", b"h." + b"x" * 200 + b".s")
+    transport = office.transport(office.north)
+    transport.registry()
+    n, digest = transport._look.heads[office.north.fingerprint]
+    transport.append(office.north.fingerprint, n + 1, digest, "", b"h." + b"x" * 200 + b".s")
     board_of(office.north, os.urandom(10))
     with pytest.raises(NotAuthenticError, match="its key did not sign") as refused:
         office.sync(office.north)
     assert f"--mend north {n + 1}" in refused.value.hint
     office.database.sql(mend_sql(office.north.fingerprint, n + 1))
     assert office.sync(office.north).pushed == 1
-    post.close()
+    transport.close()
 
 
 def test_a_database_without_room_is_told_and_nothing_is_lost(office: Office) -> None:
@@ -192,12 +192,12 @@ def test_a_sync_that_is_cut_anywhere_is_followed_by_the_same_sync(office: Office
     with relay(office.database.cluster.port) as way:
         for after in range(2, 14):
             for station in (office.north, south):
-                post = office.post(station, port=way.port)
+                transport = office.transport(station, port=way.port)
                 way.cut_after = way.sent + after
                 with suppress(RegistryError):
-                    sync(station, post)
+                    sync(station, transport)
                 way.cut_after = 0
-                post.close()
+                transport.close()
     office.sync(office.north, south, office.north)
     assert [key.epoch for key in south.keys.keys_of(board.uuid)] == [1]
     assert office.database.sql("select count(*) from registry.parcel") == [["0"]]
@@ -205,28 +205,28 @@ def test_a_sync_that_is_cut_anywhere_is_followed_by_the_same_sync(office: Office
 
 
 def test_the_doors_that_a_restore_opens_are_seen_by_every_member(office: Office) -> None:
-    post = office.post(office.north)
-    post.registry()
-    assert post.open_doors() == []
+    transport = office.transport(office.north)
+    transport.registry()
+    assert transport.open_doors() == []
     office.database.sql(f"grant temp on database {office.database.name} to public")  # as pg_restore does
-    assert post.open_doors() == ["TEMP for PUBLIC"]
+    assert transport.open_doors() == ["TEMP for PUBLIC"]
     office.database.sql(registry_sql(office.database.registry))
-    assert post.open_doors() == []
-    post.close()
+    assert transport.open_doors() == []
+    transport.close()
 
 
 def test_what_the_database_allows_too_much_is_kept_for_the_status(office: Office) -> None:
-    west, post = office.member("west", "line"), office.post(office.north)
+    west, transport = office.member("west", "line"), office.transport(office.north)
     office.sync(office.north, west)
-    assert plant_room.connecting.check_database(office.north, post) == []
+    assert plant_room.connecting.check_database(office.north, transport) == []
     office.plant.change(plant_room.owner.draft_removal(office.north, "west", "stolen", 0))
-    assert plant_room.connecting.check_database(office.north, post) == ["login of west, which was removed"]
+    assert plant_room.connecting.check_database(office.north, transport) == ["login of west, which was removed"]
     shown = call(office.north.home, "--json", "registry", "status").json
     assert shown["open_doors"] == ["login of west, which was removed"]
     removed = [item.fingerprint for item in office.north.plant.roster.removed]  # type: ignore[union-attr]
     office.database.sql(registry_sql(office.database.registry, removed))
-    assert plant_room.connecting.check_database(office.north, post) == []
-    post.close()
+    assert plant_room.connecting.check_database(office.north, transport) == []
+    transport.close()
 
 
 def test_a_copy_of_a_home_at_work_beside_it_stops_both_until_a_person_decides(office: Office) -> None:
@@ -240,9 +240,9 @@ def test_a_copy_of_a_home_at_work_beside_it_stops_both_until_a_person_decides(of
     with pytest.raises(ForkError, match="a copy of this home is in use"):
         office.sync(south)
     assert office.database.sql("select count(*) from registry.page where n > 1") == [["0"]]
-    post = office.post(south)
-    assert resume(south, post) == 1
-    post.close()
+    transport = office.transport(south)
+    assert resume(south, transport) == 1
+    transport.close()
     office.sync(south)
     with pytest.raises(ForkError):
         office.sync(copy)

@@ -13,8 +13,8 @@ from teds_provision import client
 from teds_provision.api.operations import document
 from teds_provision.cli.main import run
 from teds_provision.errors import NotFoundError
-from teds_provision.ncap.web.answers import answer_refusal
 from teds_provision.ncap.web.guard import RequestRefusedError
+from teds_provision.ncap.web.responses import answer_refusal
 from teds_provision.shapes.problem import Error, Failure, Problem, failure_of, problem_in, problem_of
 
 from ..test_architecture import MODULES, name_of, parsed

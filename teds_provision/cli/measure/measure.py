@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from teds_provision.cli.measure import measure_view
     from teds_provision.measure.display_units import FileUnits
     from teds_provision.measure.request import Requirements
-    from teds_provision.measure.runner import MeasurementEnd
+    from teds_provision.measure.running.measurement import MeasurementEnd
     from teds_provision.measure.running.measurement_job import MeasurementJob
     from teds_provision.measure.sinks.mcap.recover import RecoveryResult
     from teds_provision.station.station import Station
@@ -353,7 +353,7 @@ def _recover(app: App, files: Sequence[str], output: Path | None) -> None:
     if len(files) != 1:
         raise UsageError("Name exactly one recording.", hint="teds-provision measure recover FILE.mcap")
     done = measure_room.sinks.mcap.recover.recover(Path(files[0]), output)
-    until = measure_room.sinks.lines.iso(done.until) if done.until is not None else None
+    until = measure_room.sinks.json_events.iso(done.until) if done.until is not None else None
     result: dict[str, Any] = {
         "recovered": {"messages": done.messages, "until": until},
         "file": files[0],

@@ -13,10 +13,10 @@ from teds_provision import measure as measure_room
 from teds_provision.cli.context import App
 from teds_provision.cli.rendering import shown, tidy
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, StationFacts, why_invalid
-from teds_provision.measure.runner import Watcher
+from teds_provision.measure.running.measurement import Watcher
 from teds_provision.measure.sinks import Sink, ThreadedSink
 from teds_provision.measure.sinks.base import Item
-from teds_provision.measure.sinks.lines import as_line, data_lines, status_line
+from teds_provision.measure.sinks.json_events import as_line, data_lines, status_line
 from teds_provision.sanitize import counted
 from teds_provision.station.station import Station
 from teds_provision.teds import units

@@ -180,7 +180,7 @@ def _wanted(entry: Entry, summary: RecordingSummary, channels: Sequence[int | st
 
 
 def _events(shown: Block | GroupRows, summary: RecordingSummary) -> Iterator[str]:
-    lines = measure_room.sinks.lines
+    lines = measure_room.sinks.json_events
     events = (
         lines.data_lines(shown, summary.facts)
         if isinstance(shown, measure_room.blocks.Block)

@@ -1,4 +1,4 @@
-"""Reads JSON lines as ``sinks/text.py`` writes them; what ``measure --json`` printed is read as well."""
+"""Reads JSON lines as ``sinks/json_lines.py`` writes them; what ``measure --json`` printed is read as well."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeRe
 from teds_provision.measure.recordings.columns import Rows, Streams, raw_kind
 from teds_provision.measure.recordings.json_lines import report_of
 from teds_provision.measure.recordings.source import MOST, ROWS, Entry, Recording, facts_of, station_of
-from teds_provision.measure.sinks.lines import facts_as_json, iso, status_line
+from teds_provision.measure.sinks.json_events import facts_as_json, iso, status_line
 from teds_provision.measure.sinks.text import heads_of, names_of, note_of
 from teds_provision.sanitize import printable
 

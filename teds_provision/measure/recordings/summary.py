@@ -10,7 +10,7 @@ import numpy as np
 
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, Note
 from teds_provision.measure.recordings.source import MOST, Entry, Recording
-from teds_provision.measure.sinks.lines import facts_as_json, iso
+from teds_provision.measure.sinks.json_events import facts_as_json, iso
 
 NOTES = 100
 _COUNTED = ("samples", "lost", "late", "bad", "invalid")

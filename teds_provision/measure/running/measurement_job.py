@@ -27,7 +27,7 @@ from teds_provision.errors import TedsProvisionError
 from teds_provision.measure.blocks import SetPointCommand, StationFacts
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.request import MeasurementRequest, Requirements
-from teds_provision.measure.runner import Measurement, MeasurementEnd, Watcher
+from teds_provision.measure.running.measurement import Measurement, MeasurementEnd, Watcher
 from teds_provision.measure.sinks import CommandTaker, Sink, open_sink
 from teds_provision.measure.sinks.foxglove import ARRAYS
 from teds_provision.measure.sinks.shown import SHOWN

@@ -16,18 +16,19 @@ from teds_provision.measure.display_units import FileUnits
 from teds_provision.measure.exposure import Exposure
 from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, as_sink_failure
 from teds_provision.measure.sinks.foxglove import ARRAYS, foxglove_sink
+from teds_provision.measure.sinks.json_lines import JsonLinesSink
 from teds_provision.measure.sinks.mcap.recording import McapSink
 from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
 from teds_provision.measure.sinks.ros.sourced import ros2_sink
 from teds_provision.measure.sinks.shown import SHOWN, ShownJsonLinesSink, ShownTextSink, ShownWideSink
-from teds_provision.measure.sinks.text import JsonLinesSink, TextSink
+from teds_provision.measure.sinks.text import TextSink
 from teds_provision.measure.sinks.wide import WIDE, WideSink
 
 __all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "in_units", "open_sink", "without_scalars"]
 
 if TYPE_CHECKING:
-    from teds_provision.measure.sinks import foxglove_server, lines, mcap
+    from teds_provision.measure.sinks import foxglove_server, json_events, mcap
 else:
     __getattr__ = lazy(__name__)
 

@@ -20,7 +20,7 @@ from teds_provision.errors import StoreError, TedsProvisionError
 from teds_provision.files import sync_folder
 from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, NodeReport, Note, StationFacts
 from teds_provision.measure.sinks.base import Item, ThreadedSink, as_sink_failure
-from teds_provision.measure.sinks.lines import iso
+from teds_provision.measure.sinks.json_events import iso
 from teds_provision.portable import CLOSING, lock
 
 FLUSH = 0.1  # seconds that a piece may wait in this process

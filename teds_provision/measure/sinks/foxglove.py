@@ -18,7 +18,7 @@ from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, GroupRo
 from teds_provision.measure.exposure import Exposure
 from teds_provision.measure.sinks.base import CommandTaker, Item, ThreadedSink
 from teds_provision.measure.sinks.foxglove_server import USUAL, FoxgloveServer, MeasurementTopics
-from teds_provision.measure.sinks.lines import facts_as_json
+from teds_provision.measure.sinks.json_events import facts_as_json
 from teds_provision.measure.sinks.mcap.recording import (
     FLOAT,
     FLOAT_TYPE,

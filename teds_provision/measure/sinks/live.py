@@ -42,7 +42,7 @@ from teds_provision.measure.blocks import (
 )
 from teds_provision.measure.sinks.base import BUDGET, ROWS, CommandTaker, Item, ThreadedSink
 from teds_provision.measure.sinks.joints import INTERFACES, Joint, joints_of, state_of
-from teds_provision.measure.sinks.lines import facts_as_json
+from teds_provision.measure.sinks.json_events import facts_as_json
 from teds_provision.measure.sinks.names import Topics, slug
 from teds_provision.measure.sinks.vectors import (
     VARIANCE_NOTE,

@@ -36,7 +36,7 @@ from teds_provision.files import read_limited
 from teds_provision.lazy import how_to_install, late
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, StationFacts
 from teds_provision.measure.sinks.base import TICK, CommandTaker, Item, ThreadedSink
-from teds_provision.measure.sinks.lines import status_line
+from teds_provision.measure.sinks.json_events import status_line
 from teds_provision.measure.sinks.names import Topics, slug
 from teds_provision.teds.units import WrittenUnit, display_unit, short_unit
 

@@ -6,7 +6,8 @@ from teds_provision.measure.blocks import ChannelFacts, StationFacts
 from teds_provision.measure.display_units import FileUnits, UnitConversion
 from teds_provision.measure.sinks.base import Item
 from teds_provision.measure.sinks.files import FileSink
-from teds_provision.measure.sinks.text import JsonLinesSink, TextSink
+from teds_provision.measure.sinks.json_lines import JsonLinesSink
+from teds_provision.measure.sinks.text import TextSink
 from teds_provision.measure.sinks.wide import WideSink
 
 SHOWN = "shown:"

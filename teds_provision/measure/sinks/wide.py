@@ -14,7 +14,7 @@ import numpy as np
 
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
 from teds_provision.measure.sinks.base import Item
-from teds_provision.measure.sinks.lines import iso
+from teds_provision.measure.sinks.json_events import iso
 from teds_provision.measure.sinks.text import TextSink, heads_of
 from teds_provision.sanitize import printable
 

@@ -22,10 +22,10 @@ from teds_provision.errors import NotFoundError, StoreError, TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.live import LiveClient
 from teds_provision.ncap.web import metrics, simulation, wot
-from teds_provision.ncap.web.answers import ASKED, answer_bug, answer_error, answer_refusal, changing
 from teds_provision.ncap.web.clause12 import Clause12
 from teds_provision.ncap.web.guard import CALLER, SAFE, Caller, RequestRefusedError
 from teds_provision.ncap.web.resources import Resources, routes_of_parts
+from teds_provision.ncap.web.responses import ASKED, answer_bug, answer_error, answer_refusal, changing
 from teds_provision.ncap.web.tokens import Tokens
 from teds_provision.shapes.problem import Error, Problem
 

@@ -20,7 +20,7 @@ from starlette.routing import Route
 
 from teds_provision.errors import NotFoundError, TedsProvisionError, UsageError
 from teds_provision.ncap.daemon import Daemon
-from teds_provision.ncap.web.answers import reading
+from teds_provision.ncap.web.responses import reading
 from teds_provision.sanitize import printable
 
 NO_ERROR, NO_SUCH, NO_VALUE, BAD_ARGUMENT, FAILED = 0, 1, 2, 3, 4

@@ -34,8 +34,8 @@ from teds_provision.ncap.nodes.directory import for_reader
 from teds_provision.ncap.nodes.update_actions import UpdateRequest
 from teds_provision.ncap.service_part import ServicePart
 from teds_provision.ncap.sinks import for_readers
-from teds_provision.ncap.web.answers import body_of, changing, moving, reading
 from teds_provision.ncap.web.guard import CALLER, Caller
+from teds_provision.ncap.web.responses import body_of, changing, moving, reading
 from teds_provision.provisioning.update import WAIT_SECONDS
 from teds_provision.station.store import AuditFilter, is_failure
 from teds_provision.station.store.records import iso

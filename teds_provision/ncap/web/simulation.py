@@ -20,8 +20,8 @@ from teds_provision.errors import LinkError, TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.nodes.simulation import MOST_OCTETS, CheckedLines, FedChannel, Feed, Pace, fed_channels
 from teds_provision.ncap.nodes.virtual import Virtual, opened_folder, short_path
-from teds_provision.ncap.web.answers import changing, status_of
 from teds_provision.ncap.web.guard import CALLER, Caller, RequestRefusedError
+from teds_provision.ncap.web.responses import changing, status_of
 
 _STARTING: Final = 10.0  # seconds that a transducer's process has to start
 _AGAIN: Final = 0.2

@@ -18,7 +18,7 @@ from teds_provision.describe.described_node import described_node
 from teds_provision.describe.thing_description import thing_description
 from teds_provision.errors import TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
-from teds_provision.ncap.web.answers import reading
+from teds_provision.ncap.web.responses import reading
 
 PATH: Final = "/.well-known/wot"
 _MEDIA_TYPE: Final = "application/ld+json"

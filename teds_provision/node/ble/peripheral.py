@@ -15,7 +15,8 @@ from typing import Any, Final
 
 from teds_provision.errors import TedsProvisionError
 from teds_provision.node.ble.address import StaticAddress
-from teds_provision.node.handler import BleHandler, WorkerPool
+from teds_provision.node.handler import BleHandler
+from teds_provision.node.worker_pool import WorkerPool
 from teds_provision.protocol.messages import ble
 from teds_provision.protocol.repetition import Repetition
 
@@ -42,10 +43,10 @@ _LOG: Final = logging.getLogger(__name__)
 class CentralState:
     """One connection: its session (by name), its stored reply, what it has enabled. Used in the loop alone."""
 
-    def __init__(self, number: int, connection: Any, crew: WorkerPool) -> None:
+    def __init__(self, number: int, connection: Any, workers: WorkerPool) -> None:
         self.number, self.connection = number, connection
         self.name = f"{BUS}:{number:x}"
-        self.turns = crew.turns()
+        self.jobs = workers.new_queue()
         self.assembly = ble.BleAssembly(_LONGEST)
         self.repetition = Repetition()
         self.waiting = 0
@@ -208,7 +209,7 @@ class Peripheral:
             line.gone = True
             del self._lines[line.number]
             line.repetition.forget()
-            line.turns.put(lambda: self._node.lost(line.name))
+            line.jobs.put(lambda: self._node.lost(line.name))
             self._news.set()
 
     def restarted(self) -> None:
@@ -230,7 +231,7 @@ class Peripheral:
         if line is not None:
             line.hears = notify
             if not notify:
-                line.turns.put(lambda: self._node.unheard(line.name))
+                line.jobs.put(lambda: self._node.unheard(line.name))
 
     # -- commands --------------------------------------------------------------------------------------------------
 
@@ -243,7 +244,7 @@ class Peripheral:
         line.waiting += 1
         loop, tick = asyncio.get_running_loop(), self._node.tick()
         job = self._job(line, received, tick, loop)
-        line.turns.put(job)
+        line.jobs.put(job)
 
     def _job(
         self, line: CentralState, received: ble.ReceivedMessage, tick: int, loop: asyncio.AbstractEventLoop
@@ -279,7 +280,7 @@ class Peripheral:
         """Handle a Drive message: 00 ‖ message."""
         line = self._line_of(connection)
         if line is not None and value[:1] == b"\0":
-            line.turns.put(lambda: self._node.drive(line.name, bytes(value[1:])))
+            line.jobs.put(lambda: self._node.drive(line.name, bytes(value[1:])))
 
 
 def _finish_turns(lines: Sequence[CentralState]) -> None:
@@ -287,7 +288,7 @@ def _finish_turns(lines: Sequence[CentralState]) -> None:
     until = time.monotonic() + _END_SECONDS
     for line in lines:
         ended = threading.Event()
-        line.turns.put(ended.set)
+        line.jobs.put(ended.set)
         ended.wait(max(0.0, until - time.monotonic()))
 
 

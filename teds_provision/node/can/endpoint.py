@@ -1,7 +1,7 @@
 """One node on a CAN bus: a StationState for each base station, its answer to everyone, its Announces.
 
 Nothing here is thread-safe: the server of the bus calls it under its lock; only :meth:`StationState.answer` and
-:meth:`StationState.begin_anew` run in the turns of its station.
+:meth:`StationState.begin_anew` run in the jobs of its station.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from typing import Final, NamedTuple
 
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.isotp import Pair
-from teds_provision.node.handler import JobQueue, MeasuringHandler, NodeHandler, WorkerPool
+from teds_provision.node.handler import MeasuringHandler, NodeHandler
+from teds_provision.node.worker_pool import JobQueue, WorkerPool
 from teds_provision.protocol.announce import AddressClaim, Announce, ButtonPresses, uuid_crc
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import Repetition
@@ -45,8 +46,8 @@ class StationState:
     still sends.
     """
 
-    def __init__(self, endpoint: CanEndpoint, station: int, turns: JobQueue) -> None:
-        self.endpoint, self.station, self.turns = endpoint, station, turns
+    def __init__(self, endpoint: CanEndpoint, station: int, jobs: JobQueue) -> None:
+        self.endpoint, self.station, self.jobs = endpoint, station, jobs
         self.name = link_name(station)
         self.pairs: dict[int, Pair] = {}
         self.waiting = 0
@@ -58,7 +59,7 @@ class StationState:
         """Queue a request; a station that asks on and on without waiting loses what does not fit."""
         if self.waiting < _MOST_WAITING:
             self.waiting += 1
-            self.turns.put(job)
+            self.jobs.put(job)
 
     def begin_anew(self) -> None:
         """Start over: the pair of addresses is another one, or the bus was lost; session and stored reply are gone."""
@@ -92,11 +93,11 @@ class CanEndpoint:
         self,
         handler: NodeHandler,
         counts_as_tapped: Callable[[], bool],
-        crew: WorkerPool,
+        workers: WorkerPool,
         send: Callable[[CanEndpoint, Frame], None],
         measuring: MeasuringHandler | None = None,
     ) -> None:
-        self.handler, self.counts_as_tapped, self._workers = handler, counts_as_tapped, crew
+        self.handler, self.counts_as_tapped, self._workers = handler, counts_as_tapped, workers
         self._send = send
         self.measuring = measuring
         self.address = handler.can_address()
@@ -126,11 +127,11 @@ class CanEndpoint:
         """Return the pair of ``own`` and ``station``, made if there is none yet."""
         state = self.stations.get(station)
         if state is None:
-            state = self.stations[station] = StationState(self, station, self._workers.turns())
+            state = self.stations[station] = StationState(self, station, self._workers.new_queue())
         pair = state.pairs.get(own)
         if pair is None:
             if state.pairs:
-                state.turns.put(state.begin_anew)
+                state.jobs.put(state.begin_anew)
             state.pairs = {at: old for at, old in state.pairs.items() if old.sending}
             pair = state.pairs[own] = Pair(own, station, lambda frame: self._send(self, frame))
         return state, pair
@@ -148,7 +149,7 @@ class CanEndpoint:
         for state in self.stations.values():
             if state.pairs:
                 state.pairs.clear()
-                state.turns.put(state.begin_anew)
+                state.jobs.put(state.begin_anew)
 
     def restart(self) -> None:
         """Begin again as after a start of the board: at the durable address, without sessions."""
@@ -162,4 +163,4 @@ class CanEndpoint:
         stations, self.stations = self.stations, {}
         for state in stations.values():
             state.gone = True
-            state.turns.put(state.begin_anew)
+            state.jobs.put(state.begin_anew)

@@ -1,4 +1,4 @@
-"""The nodes' end of a CAN bus: one receiving loop for all nodes of the process, and a crew of threads behind it."""
+"""The nodes' end of a CAN bus: one receiving loop for all nodes of the process, and a pool of threads behind it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, Reassembly, addresses, physical_id, read_single, single
 from teds_provision.links.can.spec import FIRST_STATION, LAST_NODE, LAST_STATION, parse_spec
 from teds_provision.node.can.endpoint import CanEndpoint, EndpointRequest, StationState, link_name
-from teds_provision.node.handler import MeasuringHandler, NodeHandler, WorkerPool
+from teds_provision.node.handler import MeasuringHandler, NodeHandler
+from teds_provision.node.worker_pool import WorkerPool
 from teds_provision.protocol.announce import Announce, is_announce
 from teds_provision.protocol.messages.frames import IDENTIFY, Reason, Reply, refusal
 from teds_provision.protocol.operation.can_frames import drive_address, trigger_station

@@ -316,9 +316,9 @@ def send(app: App, which: str, files: Path | None, dry_run: bool) -> None:
     to = plant.sign_requests.receivers(station, found)
     if not dry_run:
         station.unlock()
-        post = plant.sign_requests.transport_for(station, files)
-        app.closing(post.close)
-        plant.sign_requests.send_job(station, post, found)
+        transport = plant.sign_requests.transport_for(station, files)
+        app.closing(transport.close)
+        plant.sign_requests.send_job(station, transport, found)
     names = [roster.name_of(receiver) for receiver in to]
     sent = f"{'Would send' if dry_run else 'Sent'} {found.id[:8]} to {', '.join(names)}."
     app.emit({"id": found.id, "to": to}, sent if to else f"{found.id[:8]} is for this station alone: nothing to send.")
@@ -437,9 +437,9 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     station = app.station()
     ids = {plant.jobs.find_job(station, job).id for job in jobs}
     station.unlock()
-    post = plant.sign_requests.transport_for(station, files)
-    app.closing(post.close)
-    inbox = plant.sign_requests.Inbox(station, post, SIGN_REQUEST)
+    transport = plant.sign_requests.transport_for(station, files)
+    app.closing(transport.close)
+    inbox = plant.sign_requests.Inbox(station, transport, SIGN_REQUEST)
     app.closing(inbox.close)
     stop = provisioning.meeting.IdleStop(None)
     signal.signal(signal.SIGTERM, lambda *_: stop.request_stop())
@@ -448,7 +448,7 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     app.note(f"Signing for {len(ids)} job{'' if len(ids) == 1 else 's'}; Ctrl-C ends it.")
     while True:
         station.unlock()  # ends with vault-locked if another command changed passphrase and master key
-        for answered in plant.office.answer_all(station, post, inbox, ids, stop=stop.is_set):
+        for answered in plant.office.answer_all(station, transport, inbox, ids, stop=stop.is_set):
             _print_answer(app, station, answered)
         if stop.is_set():
             return

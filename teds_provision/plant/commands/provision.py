@@ -79,8 +79,8 @@ class LineOptions:
             line.scans = plant.line.Scans(sys.stdin, app.note)
             threading.Thread(target=line.scans.listen, name="scanner", daemon=True).start()
         if found is not None and found.office not in (None, base.identity.fingerprint):
-            post = plant.sign_requests.transport_for(base, self.files)
-            line.office = office = plant.sign_requests.RemoteOffice(base, post, links.timeout)
+            transport = plant.sign_requests.transport_for(base, self.files)
+            line.office = office = plant.sign_requests.RemoteOffice(base, transport, links.timeout)
             app.closing(office.close)
         return line
 

@@ -398,17 +398,17 @@ def connect(app: App, url: str | None, files: Path | None, roster_file: Path | N
     if (files is None) == (url is None):
         raise click.UsageError("Give a URL, or --files DIR.")
     station = app.station()
-    post: Transport
+    transport: Transport
     if url is not None:
         station.unlock()
-        post = plant.connecting.database(station, plant.connecting.absolute(url))
+        transport = plant.connecting.database(station, plant.connecting.absolute(url))
     else:
         assert files is not None
-        post = plant.folder_transport.FolderTransport(files)
+        transport = plant.folder_transport.FolderTransport(files)
     octets = None if roster_file is None else read_file(roster_file).strip()
-    found = plant.membership.found_roster(station, post, octets)
+    found = plant.membership.found_roster(station, transport, octets)
     if url is not None:
-        plant.connecting.require_registry(post, found.registry)
+        plant.connecting.require_registry(transport, found.registry)
     joined = station.plant.joined
     same = joined is not None and joined.registry == found.registry
     if joined is not None and not same:
@@ -433,7 +433,7 @@ def connect(app: App, url: str | None, files: Path | None, roster_file: Path | N
     with station.lock("registry connect", app.note):
         place = plant.membership.FILES + str(files.resolve()) if files else plant.connecting.absolute(url or "")
         events = plant.owner.join(station, found, url=place, events=past)
-    post.close()
+    transport.close()
     app.emit({**result, "events": events}, f"Joined {found.name}. Next: teds-provision registry sync")
 
 
@@ -459,7 +459,7 @@ def disconnect(app: App, yes: bool, dry_run: bool) -> None:
     app.emit({"registry": held.registry}, f"Left {held.name}.")
 
 
-def _post(station: Station, files: Path | None) -> tuple[Transport, bool]:
+def _transport(station: Station, files: Path | None) -> tuple[Transport, bool]:
     """Return the transport, and True if it is the one by which this station joined."""
     joined = plant.connecting.open_transport(station)
     if files is not None:
@@ -482,12 +482,12 @@ _files = click.option("--files", type=_FOLDER, metavar="DIR", help="Transfer fol
 def sync(app: App, files: Path | None) -> None:
     """Exchange pages with the other stations. If interrupted, run it again."""
     station = app.station()
-    post, connected = _post(station, files)
+    transport, connected = _transport(station, files)
     try:
-        done = plant.sync.sync(station, post, connected=connected)
-        doors = plant.connecting.check_database(station, post)
+        done = plant.sync.sync(station, transport, connected=connected)
+        doors = plant.connecting.check_database(station, transport)
     finally:
-        post.close()
+        transport.close()
     alarms = [alarm for alarm in station.plant.alarms.all() if not alarm.seen]
     result = {
         "pushed": done.pushed,
@@ -725,11 +725,11 @@ def accept(app: App, name: str, page: str | None, files: Path | None, yes: bool,
     station = app.station()
     held = plant.apply_pages.require_roster(station)
     member = plant.owner.require_member(held, name)
-    post = (
+    transport = (
         plant.folder_transport.FolderTransport(files) if files is not None else plant.connecting.open_transport(station)
     )
     if dry_run:
-        n, hash = plant.membership.branch(station, member.fingerprint, page, post)
+        n, hash = plant.membership.branch(station, member.fingerprint, page, transport)
         app.emit(
             {"done": 0, "n": n, "hash": hash, "plan": True}, f"Plan: page {n} ({hash[:16]}) would be accepted here."
         )
@@ -737,7 +737,7 @@ def accept(app: App, name: str, page: str | None, files: Path | None, yes: bool,
     app.confirm(f"Accept this history of {member.name}?", yes=yes, named="--page")
     station.unlock()
     with plant.sync.alone(station):
-        n, hash = plant.membership.accept(station, member.fingerprint, page, post)
+        n, hash = plant.membership.accept(station, member.fingerprint, page, transport)
         plant.apply_pages.apply_claims(station)
     app.emit({"done": 1, "n": n, "hash": hash}, f"Page {n} ({hash[:16]}) and its successors count here.")
 
@@ -755,14 +755,14 @@ def resume(app: App, files: Path | None, yes: bool, dry_run: bool) -> None:
     First find out who else uses a copy of this home. If you cannot, remove this station instead.
     """
     station = app.station()
-    post, _ = _post(station, files)
+    transport, _ = _transport(station, files)
     if dry_run:
-        there = len(plant.sync.strange(station, post))
+        there = len(plant.sync.strange(station, transport))
         app.emit({"done": 0, "adopts": there, "plan": True}, f"Plan: {_count(there, 'page')} would be adopted.")
         return
     app.note("If a copy of this home is in use elsewhere, stop it first. If in doubt, have this station removed.")
     app.confirm("Is this the only home with this station's key?", yes=yes)
-    done = plant.sync.resume(station, post)
+    done = plant.sync.resume(station, transport)
     app.emit({"done": done}, f"Adopted: {_count(done, 'page')}. Next: teds-provision registry sync")
 
 

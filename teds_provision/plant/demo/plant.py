@@ -137,9 +137,9 @@ class _Story:
             with demo.steps.step("registry connect") as step:
                 self._sync("north", show=False)
                 station = self[name]
-                post = self._post(station)
-                found = plant.membership.found_roster(station, post, None)
-                post.close()
+                transport = self._transport(station)
+                found = plant.membership.found_roster(station, transport, None)
+                transport.close()
                 plant.owner.join(station, found, url=None, events=list(plant.backlog.backlog(station)))
                 step.detail = f"{name}, roster {found.version}"
 
@@ -167,20 +167,20 @@ class _Story:
 
     def _sync(self, *names: str, show: bool = True) -> None:
         for name in names:
-            post = self._post(self[name])
+            transport = self._transport(self[name])
             try:
                 if not show:
-                    plant.sync.sync(self[name], post)
+                    plant.sync.sync(self[name], transport)
                     continue
                 with self.demo.steps.step("registry sync") as step:
-                    done = plant.sync.sync(self[name], post)
+                    done = plant.sync.sync(self[name], transport)
                     parcels = f", {done.parcels_out} parcels out, {done.parcels_in} in"
                     moved = parcels if done.parcels_in or done.parcels_out else ""
                     step.detail = f"{name}: {done.pushed} pages out, {done.fetched} in{moved}"
             finally:
-                post.close()
+                transport.close()
 
-    def _post(self, station: Station) -> Transport:
+    def _transport(self, station: Station) -> Transport:
         if self.server is None:
             folder = self.demo.folder / "stick"
             folder.mkdir(exist_ok=True)

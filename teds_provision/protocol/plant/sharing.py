@@ -12,7 +12,7 @@ from datetime import datetime, timedelta
 from typing import Final
 
 from teds_provision.protocol.fingerprints import same_key
-from teds_provision.protocol.plant.fold import MergedClaims
+from teds_provision.protocol.plant.merged_claims import MergedClaims
 from teds_provision.protocol.plant.roster import Roster, Share
 
 SILENT: Final = timedelta(days=7)

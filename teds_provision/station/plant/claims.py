@@ -102,7 +102,7 @@ class Claims:
         self._store.execute_many(
             "INSERT OR IGNORE INTO digests VALUES(?, ?, ?, ?, ?)",
             [
-                (digest, chain.chain, n, int(vouched), self._row_macs.note(*_digest(digest, chain.station, n, vouched)))
+                (digest, chain.id, n, int(vouched), self._row_macs.note(*_digest(digest, chain.station, n, vouched)))
                 for digest, n, vouched in rows
             ],
         )
@@ -146,9 +146,7 @@ class Claims:
     def put_lifting(self, hash: str, chain: Chain) -> None:
         """Keep that a station lifts a ban (by H), on a page that counts."""
         mac = self._row_macs.note(*_lifting(hash, chain.station))
-        self._store.execute(
-            "INSERT OR IGNORE INTO statements VALUES(?, ?, 1, 1, NULL, '', ?)", (hash, chain.chain, mac)
-        )
+        self._store.execute("INSERT OR IGNORE INTO statements VALUES(?, ?, 1, 1, NULL, '', ?)", (hash, chain.id, mac))
         self._store.execute(
             "INSERT OR IGNORE INTO to_judge SELECT uuid FROM statements"
             " WHERE hash = ? AND lifts = 0 AND uuid IS NOT NULL",

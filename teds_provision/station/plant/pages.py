@@ -25,7 +25,7 @@ class Chain:
     ``accepted``: the branch that an operator chose if there are two histories. ``waits``: why it is not read on.
     """
 
-    chain: int
+    id: int
     station: str
     counted: tuple[int, str] = (0, "")
     folded: tuple[int, str] = (0, "")
@@ -78,30 +78,30 @@ class Pages:
     def put_chain(self, chain: Chain) -> None:
         """Keep how far a chain counts."""
         accepted = chain.accepted or (None, None)
-        values = (chain.chain, chain.station, *chain.counted, *chain.folded, *accepted, chain.waits)
+        values = (chain.id, chain.station, *chain.counted, *chain.folded, *accepted, chain.waits)
         self._store.execute(
             f"INSERT INTO chains({_CHAIN}) VALUES({places(values)}) ON CONFLICT(chain) DO UPDATE SET "
             + ", ".join(f"{name} = excluded.{name}" for name in _CHAIN.split(", ")[2:]),
             values,
         )
 
-    def add(self, chain: int, page: PageRow) -> None:
+    def add(self, chain_id: int, page: PageRow) -> None:
         """Keep a page; the same again changes nothing."""
         content = zlib.compress(page.content, _LEVEL)
         self._store.execute(
             "INSERT OR IGNORE INTO pages VALUES(?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (chain, page.n, page.hash, page.previous, page.created, page.home, page.header, content, page.signature,
+            (chain_id, page.n, page.hash, page.previous, page.created, page.home, page.header, content, page.signature,
              utc_now()),
         )  # fmt: skip
 
-    def names(self, chain: int) -> list[tuple[int, str, str]]:
+    def links(self, chain_id: int) -> list[tuple[int, str, str]]:
         """Return number, H and ``previous`` of every page of a chain, both histories if there are two."""
-        return self._store.execute("SELECT n, hash, previous FROM pages WHERE chain = ? ORDER BY n, hash", (chain,))
+        return self._store.execute("SELECT n, hash, previous FROM pages WHERE chain = ? ORDER BY n, hash", (chain_id,))
 
-    def times(self, chain: int, most: int) -> list[tuple[int, str, str, str]]:
+    def times(self, chain_id: int, most: int) -> list[tuple[int, str, str, str]]:
         """Return number, H, ``created`` and ``home`` of the newest pages of a chain, newest first."""
         return self._store.execute(
-            "SELECT n, hash, created, home FROM pages WHERE chain = ? ORDER BY n DESC, hash LIMIT ?", (chain, most)
+            "SELECT n, hash, created, home FROM pages WHERE chain = ? ORDER BY n DESC, hash LIMIT ?", (chain_id, most)
         )
 
     def newest(self) -> list[tuple[str, str]]:
@@ -111,28 +111,28 @@ class Pages:
         )
         return [(station, created) for station, created, _ in found]
 
-    def get(self, chain: int, n: int, hash: str) -> PageRow | None:
+    def get(self, chain_id: int, n: int, hash: str) -> PageRow | None:
         """Return one page."""
         rows = self._store.read(
             _page,
             "SELECT n, hash, previous, created, home, header, content, signature FROM pages"
             " WHERE chain = ? AND n = ? AND hash = ?",
-            (chain, n, hash),
+            (chain_id, n, hash),
         )
         return rows[0] if rows else None
 
-    def each(self, chain: int, after: int = 0) -> Iterator[PageRow]:
+    def each(self, chain_id: int, after: int = 0) -> Iterator[PageRow]:
         """Give the pages of a chain above a number, both histories, one at a time."""
-        for n, hash, _ in self.names(chain):
-            if n > after and (page := self.get(chain, n, hash)) is not None:
+        for n, hash, _ in self.links(chain_id):
+            if n > after and (page := self.get(chain_id, n, hash)) is not None:
                 yield page
 
-    def put_heads(self, chain: int, heads: Mapping[str, tuple[int, str]]) -> None:
+    def put_heads(self, chain_id: int, heads: Mapping[str, tuple[int, str]]) -> None:
         """Keep the heads that a station reports as verified, the greatest of each chain."""
         self._store.execute_many(
             "INSERT INTO heads VALUES(?, ?, ?, ?) ON CONFLICT(chain, about) DO UPDATE SET n = excluded.n,"
             " hash = excluded.hash WHERE excluded.n > heads.n",
-            [(chain, about, n, hash) for about, (n, hash) in heads.items()],
+            [(chain_id, about, n, hash) for about, (n, hash) in heads.items()],
         )
 
     def heads(self) -> list[tuple[str, str, int, str]]:

@@ -312,7 +312,7 @@ class Plant:
         record, chain = self.record(), self.pages.chains().get(self._identity.fingerprint)
         if record is None or record.url is None or chain is None:
             return waiting
-        pages = self.pages.each(chain.chain, record.acknowledged)
+        pages = self.pages.each(chain.id, record.acknowledged)
         return waiting + sum(len(json.loads(page.content).get("events", ())) for page in pages)
 
     def drop_events(self, ids: Iterable[str]) -> None:

@@ -17,8 +17,8 @@ from bumble.host import Host
 from teds_provision.node.ble.address import StaticAddress
 from teds_provision.node.ble.peripheral import Peripheral
 from teds_provision.node.flash_file import FlashFile
-from teds_provision.node.handler import WorkerPool
 from teds_provision.node.virtual import VirtualNode
+from teds_provision.node.worker_pool import WorkerPool
 from tests.links.ble.air import STATION, Air
 from tests.pace import PATIENCE
 
@@ -73,7 +73,7 @@ async def switched_off(node: Node, folder: Path) -> None:
     peripheral._workers.run(lambda: busy_until(done))
     off = asyncio.create_task(peripheral.power_off())
     await asyncio.wait_for(gone.wait(), PATIENCE)
-    await until(lambda: peripheral._workers._ended or len(line.turns._jobs) > 1)
+    await until(lambda: peripheral._workers._ended or len(line.jobs._jobs) > 1)
     assert node.lost_links == []
     done.set()
     await asyncio.wait_for(off, PATIENCE)

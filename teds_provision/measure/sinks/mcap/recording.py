@@ -25,7 +25,7 @@ from teds_provision.errors import TedsProvisionError
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
 from teds_provision.measure.sinks.base import Item
 from teds_provision.measure.sinks.files import FLUSH, FileSink
-from teds_provision.measure.sinks.lines import facts_as_json, iso
+from teds_provision.measure.sinks.json_events import facts_as_json, iso
 from teds_provision.measure.sinks.mcap.recover import recover
 from teds_provision.measure.sinks.mcap.writer import MESSAGE, MESSAGE_HEAD, McapWriter
 from teds_provision.measure.sinks.names import Topics

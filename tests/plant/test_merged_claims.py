@@ -1,4 +1,4 @@
-"""The fold: one view of the same pages, whatever order they came in, and no liar that makes a good node bad."""
+"""Merged claims: one view of the same pages, whatever order they came in, and no liar that makes a good node bad."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from teds_provision.protocol.keys import SoftwareKey, fingerprint, reset_message
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.chain import counting
 from teds_provision.protocol.plant.claim import Claim
-from teds_provision.protocol.plant.fold import LocalState
+from teds_provision.protocol.plant.merged_claims import LocalState
 from teds_provision.protocol.plant.roster import Place, Roster, open_roster
 from tests.plant.plants import NODES, NOW, Reader, Speaker, roster_of, shuffled, speaker
 from tests.plant.test_documents import CA, KAT, octets_of
