@@ -44,7 +44,7 @@ class Rows:
     """Prints lines: what was measured, what it came to, its aim and whether that is met."""
 
     def tell(self, what: str, value: float, unit: str, *, aim: float | None = None, least: bool = False) -> None:
-        """One row; ``least``: the aim is a floor, not a ceiling."""
+        """Print one row; ``least``: the aim is a floor, not a ceiling."""
         good = aim is None or (value >= aim if least else value <= aim)
         sign = "≥" if least else "≤"
         told = "" if aim is None else f"aim {sign} {aim:g}: {'met' if good else 'MISSED'}"
@@ -93,7 +93,7 @@ def finished(process: subprocess.Popen[str]) -> str:
 
 
 def start_up(rows: Rows) -> None:
-    """Median of ten, beside the least that a click program can take."""
+    """Time the start, median of ten, beside the least that a click program can take."""
 
     def median(*command: str) -> float:
         times = []
@@ -143,14 +143,14 @@ def processor_time() -> float:
 
 
 def timed(home: Path, *words: str) -> float:
-    """Seconds of a command that has to succeed."""
+    """Return the seconds of a command that has to succeed."""
     began = time.perf_counter()
     finished(started(home, *words))
     return time.perf_counter() - began
 
 
 def start_to_end(rows: Rows) -> None:
-    """Processor time of commands that need no node, beside that of a bare ``import click``."""
+    """Measure processor time of commands that need no node, beside that of a bare ``import click``."""
     with tempfile.TemporaryDirectory() as name:
         folder, home = Path(name, "images"), Path(name, "home")
         fill_images(folder, home, 1)
@@ -206,7 +206,7 @@ def fixed_cost(rows: Rows) -> None:
 
 
 def one_command(rows: Rows) -> None:
-    """``provision`` from start to verdict, Argon2id and all."""
+    """Time ``provision`` from start to verdict, with Argon2id."""
     for via, link, extra in (
         ("nfc", f"udp:127.0.0.1:{free_port()}", ("--pace",)),
         ("can", f"udp_multicast:239.74.163.9?port={free_port()}&pace=1", ()),
@@ -230,7 +230,7 @@ def one_command(rows: Rows) -> None:
 
 
 def zeroing(rows: Rows) -> None:
-    """``calibrate zero`` over CAN at 500 kbit/s, from start to verdict: read, signed, written, verified, read again."""
+    """Time ``calibrate zero`` over CAN at 500 kbit/s, from start to verdict: read, sign, write, verify, read again."""
     bus = f"udp_multicast:239.74.163.9?port={free_port()}&pace=1"
     for slow in (0.0, SLOW):
         delay = ("--crypto-delay", str(slow * 1000)) if slow else ()
@@ -256,7 +256,7 @@ def zeroing(rows: Rows) -> None:
 
 
 def watching(rows: Rows) -> None:
-    """``provision --watch``, the next board put down as soon as the line about the last one is out."""
+    """Time ``provision --watch``; the next board comes as soon as the line about the last one is out."""
     aims = {("nfc", 0.0): 15_000, ("nfc", SLOW): 2_200, ("can", 0.0): 30_000, ("can", SLOW): 3_500}
     for (via, slow), aim in aims.items():
         link = f"udp:127.0.0.1:{free_port()}" if via == "nfc" else f"udp_multicast:239.74.163.9?port={free_port()}"
@@ -300,7 +300,7 @@ def _passed(line: dict[str, object]) -> bool:
 
 
 def eight_readers(rows: Rows) -> None:
-    """One ``--watch`` over eight readers against one reader; then eight commands on one store."""
+    """Time one ``--watch`` over eight readers against one reader; then eight commands on one store."""
     slow = ("--crypto-delay", str(SLOW * 1000))
 
     def side_by_side(home: Path, count: int) -> float:
@@ -339,7 +339,7 @@ def eight_readers(rows: Rows) -> None:
 
 
 def whole_bus(rows: Rows, count: int) -> None:
-    """``provision --all`` on a bus of ``count`` slow nodes in one process."""
+    """Time ``provision --all`` on a bus of ``count`` slow nodes in one process."""
     for name, options, aim in (("500 kbit/s", "&pace=1", 65.0), ("FD 500k/2M", "&pace=1&fd=1", 15.0)):
         link = f"udp_multicast:239.74.163.9?port={free_port()}{options}"
         delay = ("--crypto-delay", str(SLOW * 1000))

@@ -63,13 +63,13 @@ def crowd(link: str, count: int) -> Iterator[Nodes]:
 
 
 def worked(pid: int) -> float:
-    """Seconds of processor time of a running process."""
+    """Return the seconds of processor time of a running process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS
 
 
 def provisioned(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kind: str) -> None:
-    """``provision --all``."""
+    """Measure ``provision --all``."""
     listed = home.parent / "list.csv"
     listed.write_text("uuid\n" + "".join(f"{uuid}\n" for uuid in nodes.uuids))
     finished(started(home, "whitelist", "import", str(listed)))
@@ -103,7 +103,7 @@ def provisioned(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kin
 
 
 def measured(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kind: str) -> None:
-    """``ncap run --measure all``, and power for all nodes at once."""
+    """Measure ``ncap run --measure all``, with power for all nodes at once."""
     nodes.ask("off")
     with ExitStack() as stack:
 

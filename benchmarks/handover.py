@@ -47,7 +47,7 @@ def make(home: Path, name: str) -> Station:
 
 
 def fill(station: Station, count: int) -> None:
-    """Nodes with a proven key each, as after provisioning."""
+    """Fill a store with nodes that have a proven key each, as after provisioning."""
     with station.transaction():
         for number in range(count):
             uuid, key = number.to_bytes(10, "big"), number.to_bytes(16, "big")
@@ -69,7 +69,7 @@ def timed(work: Callable[[], object]) -> tuple[float, object]:
 
 
 def bare(payload: bytes, north: jwk.JWK, south: jwk.JWK) -> tuple[float, float]:
-    """Seconds that jwcrypto takes to sign and seal, and to open and verify, JSON to JSON."""
+    """Return the seconds that jwcrypto takes to sign and seal, and to open and verify, JSON to JSON."""
     members = json.loads(payload)
     sealed = ""
 
@@ -99,7 +99,7 @@ _TABLES = {"nodes": 1, "whitelist": 1, "keys": 0, "key_slots": 0, "holders": 0, 
 
 
 def rest(south: Station, empty: Station, count: int) -> tuple[float, float]:
-    """Seconds of the processor for the other parts of an export and an import: AES-GCM, HMAC, SQLite."""
+    """Return processor seconds of the other parts of an export and an import: AES-GCM, HMAC, SQLite."""
     rows = {table: south._store.execute(f"SELECT * FROM {table}") for table in _TABLES}
     cipher, context, key = AESGCM(bytes(32)), bytes(60), bytes(16)
     sealed = cipher.encrypt(bytes(12), key, context)
@@ -128,7 +128,7 @@ def rest(south: Station, empty: Station, count: int) -> tuple[float, float]:
 
 
 def jose_layer(payload: bytes) -> tuple[float, float]:
-    """Seconds that our own JOSE layer takes for the same, JSON to JSON."""
+    """Return the seconds that our own JOSE layer takes for the same, JSON to JSON."""
     members = json.loads(payload)
     north, south = SoftwareKey(1), SoftwareKey(2)
     sealed = b""
@@ -195,7 +195,7 @@ def _export(station: Station, order: ExportOrder, bundle: Path) -> object:
 
 
 def memory(place: Path, north: Station, count: int) -> None:
-    """Peak of what Python allocates in one export and one import."""
+    """Print the peak of what Python allocates in one export and one import."""
     south = make(place / "memory", "memory")
     for station, other in ((north, south), (south, north)):
         station.policy.trust(TrustRecord(other.name, "station", other.point, other.fingerprint))

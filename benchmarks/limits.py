@@ -31,7 +31,7 @@ _BLOCK = 16
 
 
 def classic(sizes: Sizes) -> float:
-    """All frames of these exchanges on a classic bus of 500 kbit/s, flow control included."""
+    """Return the seconds of all frames of these exchanges on a classic bus of 500 kbit/s, with flow control."""
     bits = fmean(classic_bits(_IDENTIFIER, octets[:8]) for octets in _SEALED)
     return sum(_classic_frames(size + 1) for size in _each(sizes)) * bits / BITRATE
 
@@ -71,7 +71,7 @@ def type4_in_two_steps(sizes: Sizes) -> float:
 
 
 def type4_finding() -> float:
-    """From the first short frame to the initial message, and what the service's selection and its end cost."""
+    """Return the seconds from the first short frame to the initial message, with the service's selection and end."""
     initial = message.encode([tnep.ServiceParameters(tnep.SERVICE, 4, 15, 2000).record(), tnep.id_record(bytes(23))])
     activation = ((b"\x26", 2), (b"\x93\x20", 5), (bytes(7), 1), (b"\xe0\x80", 5))  # a UID of four octets
     application = ((13, 2), (7, 2), (5, 17), (7, 2), *((5, octets + 2) for octets in _cut(2 + len(initial))))
@@ -85,7 +85,7 @@ def type4_finding() -> float:
 
 
 def type4_waits(exchanges: int) -> float:
-    """t_wait between each request and the first look for its answer, selecting the service included."""
+    """Return the sum of t_wait between each request and the first look for its answer, with the service's selection."""
     return (exchanges + 1) * tnep.ServiceParameters(tnep.SERVICE, 4, 15, 2000).t_wait
 
 

@@ -47,7 +47,7 @@ REQUESTS, BOARDS = 200, 40
 
 
 def evidence(folder: Path, count: int) -> Path:
-    """So many documents, each of a board with a key of its own; the CA's key beside them."""
+    """Make ``count`` evidence documents, each of a board with its own key; the CA's key is beside them."""
     owner = alone(folder / "home")
     owner.unlock()
     credentials, profile = owner.credentials(), load_profile(ANGLE)
@@ -80,7 +80,7 @@ def evidence(folder: Path, count: int) -> Path:
 
 
 def verify_all(files: Path, ca: Path) -> tuple[float, float, str]:
-    """Seconds on the wall and of the processor, and the last line."""
+    """Return seconds on the wall and of the processor, and the last line."""
     command = [sys.executable, "-m", "teds_provision", "-q", "evidence", "verify", str(files), "--ca", str(ca)]
     before, began = _used(), time.perf_counter()
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -93,7 +93,7 @@ def _used() -> float:
 
 
 def bare_check() -> float:
-    """Processor seconds of one check by pyca/cryptography, its key loaded: the least that this program could need."""
+    """Return processor seconds of one check by pyca/cryptography, its key loaded: the least that this program needs."""
     key = SoftwareKey.generate()
     message, point = b"x" * 32, public_key(key.point)
     raw = key.sign(message)
@@ -105,7 +105,7 @@ def bare_check() -> float:
 
 
 def office(folder: Path, count: int) -> tuple[float, float]:
-    """Signatures a second of an office, on the wall and of the processor."""
+    """Return an office's signatures a second, on the wall and of the processor."""
     owner = alone(folder / "office")
     owner.unlock()
     own = owner.identity.fingerprint
@@ -132,7 +132,7 @@ def office(folder: Path, count: int) -> tuple[float, float]:
 
 
 def boards(folder: Path, count: int) -> tuple[float, float]:
-    """Processor seconds of a board without a line, and with a job and evidence; in turn, in one store each."""
+    """Return processor seconds of a board without a line, and with job and evidence; in turn, in one store each."""
     plain, line = alone(folder / "plain"), alone(folder / "line")
     plain.unlock()
     line.unlock()

@@ -50,7 +50,7 @@ class Ran(NamedTuple):
 
 @contextmanager
 def plant_of_two(folder: Path, server: Cluster) -> Iterator[tuple[Path, Path, Path]]:
-    """Homes: an office (keeper, sign), its line station (line), and a station alone that signs itself."""
+    """Make homes: an office (keeper, sign), its line station (line), and a station alone that signs itself."""
 
     def ask(prompt: str, confirm: bool) -> str:
         return PASSPHRASE
@@ -88,7 +88,7 @@ def make_job(office: Path, line: Path, boards: int) -> str:
 
 
 def processor(*processes: int) -> float:
-    """Processor seconds that these processes and what they started have used so far, ended children included."""
+    """Return the processor seconds of these processes and all that they started, ended children included."""
     total = 0
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
@@ -131,7 +131,7 @@ def run(home: Path, readers: int, boards: int, words: Sequence[str], node_words:
 
 
 def main(words: list[str] | None = None) -> None:
-    """Both, in turn, twice; the better of each."""
+    """Measure both in turn, twice, and print the better of each."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--readers", type=int, default=8)
     parser.add_argument("--boards", type=int, default=64)

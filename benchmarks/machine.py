@@ -35,7 +35,7 @@ def checks_a_second(cores: int) -> float:
 
 
 def fsync() -> float:
-    """Median seconds until 4 KiB, appended to a file, are safe on the disk of the benches (``BENCH_DISK``)."""
+    """Return median seconds until 4 KiB, appended to a file, are safe on the disk of the benches (``BENCH_DISK``)."""
     with tempfile.TemporaryFile(dir=os.environ.get("BENCH_DISK")) as file:
 
         def append() -> None:
@@ -47,7 +47,7 @@ def fsync() -> float:
 
 
 def wake() -> float:
-    """Median seconds from an octet written to a pipe to the answer of the process that sleeps on its other end."""
+    """Return median seconds from an octet written to a pipe to the answer of the process sleeping on its other end."""
     echo = "import os\nwhile os.read(0, 1): os.write(1, b'.')"
     with subprocess.Popen([sys.executable, "-c", echo], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdin is not None

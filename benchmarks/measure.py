@@ -42,7 +42,7 @@ KNOTS, VALUES, LOW, HIGH = np.array([0.0, 30000.0, 65535.0]), np.array([0.0, 5.0
 
 
 def sheet() -> Sheet:
-    """One channel of interest, with a table."""
+    """Return the datasheet of one channel with a table."""
     profile = load_profile("tactile-finger-sensor")
     calibration = read_calibrations("raw,value,channel\n0,0,1\n30000,5,1\n65535,10,1\n", "bench.csv", profile)
     uuid = bytes(9) + b"\1"
@@ -68,7 +68,7 @@ class Stream:
         self.heard = ReceivedStream(receiver, assembly, interpreter, clock, threading.Lock(), self.blocks.append)
 
     def run(self, together: int) -> float:
-        """CPU seconds for all messages, so many at a time."""
+        """Return CPU seconds for all messages, ``together`` at a time."""
         began = time.thread_time()
         at, span = self.base + SECOND, self.plan.span
         for number, message in enumerate(self.messages, 1):
@@ -82,7 +82,7 @@ class Stream:
 
 
 def floor(messages: list[bytes], together: int, compute: Callable[[np.ndarray], object]) -> float:
-    """CPU seconds of AES-CCM and numpy alone."""
+    """Return CPU seconds of AES-CCM and numpy alone."""
     sealer = DatagramSealer(stream_key(KEY, 1))
     began = time.thread_time()
     for at in range(0, len(messages), together):
@@ -93,7 +93,7 @@ def floor(messages: list[bytes], together: int, compute: Callable[[np.ndarray], 
 
 
 def bare(raw: np.ndarray) -> object:
-    """One multiplication."""
+    """Compute one multiplication."""
     return raw * 1.5
 
 

@@ -60,12 +60,12 @@ STEP, LAGS = 1e-4, 50_000  # seconds of a bin of the lags, and how many bins
 
 
 def node_address(node: int) -> int:
-    """CAN address of a node, 0 to 19."""
+    """Return the CAN address of a node, 0 to 19."""
     return 0x20 + node
 
 
 def plan_of(stream: int) -> StreamPlan:
-    """One of the two streams of each node."""
+    """Return the plan of one of the two streams of each node."""
     return StreamPlan.for_channels(stream, tuple((number, 2) for number in HALVES[stream]), n=N, period=PERIOD)
 
 
@@ -233,7 +233,7 @@ class Machine:
 
 
 def run(nodes: int, seconds: float, folder: Path, targets: Sequence[str] = TARGETS) -> Load:
-    """One size."""
+    """Run the load of one size."""
     load = Load(nodes, seconds)
     specs = [f"udp_multicast:239.74.163.{20 + number}?port={free_port()}&fd=1" for number in range(2)]
     sinks = [open_sink(name if ":" in name else str(folder / name)) for name in targets]
@@ -301,7 +301,7 @@ def _cpu() -> float:
 
 
 def _by_thread() -> dict[str, float]:
-    """CPU seconds of each kind of thread since it began."""
+    """Return CPU seconds of each kind of thread since it began."""
     kinds = {"can ": "receiving", "hearing": "opening and calibrating", "sink": "sinks", "MainThread": "rows"}
     found = dict.fromkeys([*kinds.values(), "DDS's own"], 0.0)
     names = {thread.native_id: thread.name for thread in threading.enumerate()}

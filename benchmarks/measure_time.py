@@ -154,7 +154,7 @@ class Bench:
 
 
 def _first_row(file: Path) -> float:
-    """When the first row of values stands in the file (monotonic)."""
+    """Wait for the first row of values in the file, and return its time (monotonic)."""
     while True:
         rows = [line for line in file.read_text().splitlines() if line and not line.startswith(("#", "time,"))]
         if rows:

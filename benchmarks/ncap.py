@@ -48,7 +48,7 @@ def whole_bus(home: Path, count: int) -> Iterator[str]:
 
 @contextmanager
 def daemon(home: Path, link: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """`ncap run`, its lines read and thrown away; gives its process and URL."""
+    """Run `ncap run`, discard its lines, and yield its process and URL."""
     process = started(home, "ncap", "run", "--http", "127.0.0.1:0", "--can", link)
     assert process.stdout is not None
     ready = json.loads(process.stdout.readline())
@@ -61,7 +61,7 @@ def daemon(home: Path, link: str) -> Iterator[tuple[subprocess.Popen[str], str]]
 
 
 def until(found: Any, seconds: float = 300.0) -> float:
-    """Seconds until it is so."""
+    """Return the seconds until ``found`` is true."""
     began = time.perf_counter()
     while not found():
         if time.perf_counter() - began > seconds:
@@ -71,7 +71,7 @@ def until(found: Any, seconds: float = 300.0) -> float:
 
 
 def memory(process: subprocess.Popen[str]) -> float:
-    """MiB that it has in RAM."""
+    """Return the MiB that a process has in RAM."""
     lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith("VmRSS")).split()[1]) / 1024
 
@@ -90,7 +90,7 @@ def deaf_client(url: str, token: str) -> socket.socket:
 
 
 def listen(url: str, token: str, stack: ExitStack, count: int, stop: threading.Event) -> list[int]:
-    """So many clients that read all they get, on one thread; the list counts their octets."""
+    """Start ``count`` clients that read all they get, on one thread; the list counts their octets."""
     heard = [0]
     sockets = []
     for _ in range(count):

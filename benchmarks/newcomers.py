@@ -113,11 +113,11 @@ class Power:
             node.board.stop()
 
     def announced(self, names: Sequence[str]) -> float:
-        """When the first of these announced itself."""
+        """Return when the first of these announced itself."""
         return min(self._on[name][0].first for name in names)
 
     def missed(self, names: Sequence[str]) -> int:
-        """Messages that these could not send in time."""
+        """Return the messages that these could not send in time."""
         return sum(self._on[name][1].tim.missed for name in names)
 
 
@@ -243,7 +243,7 @@ def temporary() -> Iterator[Path]:
 
 
 def made(station: Station, folder: Path, count: int) -> dict[str, bytes]:
-    """So many provisioned nodes, by name; their addresses do not meet."""
+    """Make ``count`` provisioned nodes, by name; no two have one address."""
     (folder / "calibration.csv").write_text(CALIBRATION)
     found: dict[str, bytes] = {}
     for number, address in zip(range(count), range(1, LAST_ADDRESS + 1), strict=False):
@@ -296,11 +296,11 @@ class Scene:
         until(lambda: not self.measured() & {self.uuids[name].hex() for name in names})
 
     def measured(self) -> set[str]:
-        """UUIDs of who is in."""
+        """Return the UUIDs of the measured nodes."""
         return set(self.here.measurements()[0]["uuids"])
 
     def lost_until_now(self, names: Sequence[str]) -> tuple[int, int]:
-        """Messages of these that were lost, late or bad, and those that their own process left out."""
+        """Return messages of these that were lost, late or bad, and those that their own process left out."""
         time.sleep(1.5)  # reports come once a second
         mine = {self.uuids[name].hex() for name in names}
         nodes = [report for report in self.here.measurements()[0]["nodes"] if report["uuid"] in mine]
@@ -310,7 +310,7 @@ class Scene:
 
 @contextmanager
 def scene(rows: Rows, folder: Path, count: int, rate: float, *, fd: bool) -> Iterator[Scene]:
-    """All of it; nodes are off."""
+    """Yield station, broker and nodes, which are off."""
     if MOSQUITTO is None:
         raise SystemExit("mosquitto is not installed: apt-get install mosquitto")
     link = f"udp_multicast:239.74.163.12?port={free_port()}{'&fd=1' if fd else ''}&bitrate={BITRATE}&pace=1"
@@ -348,7 +348,7 @@ def scene(rows: Rows, folder: Path, count: int, rate: float, *, fd: bool) -> Ite
 
 
 def one_after_the_other(on: Scene, joins: int) -> None:
-    """One joins twenty, again and again."""
+    """Measure one node that joins twenty, again and again."""
     base, joiner = [f"n{number}" for number in range(BASE)], f"n{BASE}"
     before = on.lost_until_now(base)
     address, taken, wired = default_can_address(on.uuids[joiner]), [], []
@@ -367,7 +367,7 @@ def one_after_the_other(on: Scene, joins: int) -> None:
 
 
 def together(on: Scene) -> None:
-    """Twenty join twenty."""
+    """Measure twenty that join twenty."""
     base = [f"n{number}" for number in range(BASE)]
     more = [f"n{number}" for number in range(BASE, 2 * BASE)]
     before = on.lost_until_now(base)
@@ -383,7 +383,7 @@ def _tell_losses(on: Scene, names: Sequence[str], before: tuple[int, int], what:
 
 
 def many(on: Scene, count: int, seconds: float, kind: str) -> None:
-    """So many are switched on together; then what the clocks of all of them take of the bus."""
+    """Measure ``count`` that are switched on together; then the bus time of all their clocks."""
     names = [f"n{number}" for number in range(count)]
     began, announced, came = on.joins(names)
     talk, data = on.wire.seconds(began, came)

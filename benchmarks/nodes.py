@@ -114,7 +114,7 @@ def ended(process: subprocess.Popen[str]) -> dict[str, float]:
 
 
 def all_at_once(options: argparse.Namespace, place: Path) -> None:
-    """So many nodes on one bus; their UUIDs in one line when they listen."""
+    """Run the nodes on one bus; print their UUIDs in one line when they listen."""
     server = CanServer(options.link)
     nodes = [made(place / str(number), options.crypto_delay / 1000) for number in range(options.many)]
     for node in nodes:

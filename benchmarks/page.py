@@ -39,7 +39,7 @@ FRAMES = """(seconds) => new Promise((done) => {
 
 
 def resident() -> int:
-    """Octets of this process that lie in memory."""
+    """Return the octets of this process that are in memory."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmRSS"):
             return int(line.split()[1]) * 1024
@@ -47,7 +47,7 @@ def resident() -> int:
 
 
 def ring(channels: int) -> int:
-    """Octets that the past of so many channels takes, each of a stream of its own, an hour of it filled."""
+    """Return the octets of the history of that many channels, each with its own stream and an hour filled."""
     before, past, now = resident(), History(), float(int(time.time()))
     at = np.concatenate([now - HOUR + np.arange(HOUR), now + np.arange(6000) / 100])
     ticks = np.arange(len(at), dtype=np.uint64)
@@ -63,13 +63,13 @@ def ring(channels: int) -> int:
 
 
 def frames(page: Page, seconds: float) -> str:
-    """Median and 99th of a hundred of the times between frames."""
+    """Return median and 99th percentile of the times between frames."""
     times = sorted(page.evaluate(FRAMES, seconds))
     return f"median {times[len(times) // 2]:.1f} ms, p99 {times[int(len(times) * 0.99)]:.1f} ms, {len(times)} frames"
 
 
 def many_nodes(browser: Browser, lab: Lab, nodes: int) -> list[float]:
-    """Milliseconds from the start of the load until the first nodes are drawn, of five loads."""
+    """Return ms from the start of the load until the first nodes are drawn, of five loads."""
     listed = [{"uuid": f"beef{number:016x}", "name": f"joint {number}"} for number in range(nodes)]
     file = lab.folder / "crowd.json"
     file.write_text(json.dumps({"whitelist": listed}))
@@ -84,7 +84,7 @@ def many_nodes(browser: Browser, lab: Lab, nodes: int) -> list[float]:
 
 
 def live(browser: Browser, lab: Lab, channels: int, seconds: float) -> None:
-    """Frames of an empty page, then of one with so many live channels."""
+    """Print the frames of an empty page, then of one with that many live channels."""
     with opened(browser, lab, route="virtual") as page:
         print(f"empty page, {seconds:g} s: {frames(page, seconds)}", flush=True)
     with client.connect(home=lab.station.home) as station:

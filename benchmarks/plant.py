@@ -45,7 +45,7 @@ Pages = list[tuple[int, str, bytes]]
 
 
 def chain(key: SoftwareKey, pages: int, events: int) -> Pages:
-    """Signed pages of one station, each with so many events."""
+    """Return signed pages of one station, each with that many events."""
     made: Pages = []
     before = ""
     for n in range(1, pages + 1):
@@ -62,7 +62,7 @@ def chain(key: SoftwareKey, pages: int, events: int) -> Pages:
 
 
 def at_once(works: list[Callable[[], None]]) -> float:
-    """Seconds until all are done."""
+    """Return the seconds until all are done."""
     gate = threading.Barrier(len(works) + 1)
 
     def run(work: Callable[[], None]) -> None:
@@ -118,7 +118,7 @@ def main() -> None:
 
 
 def _local(boards: int) -> None:
-    """Boards in memory: with both ends, and with every COMMIT; the ratio is the median of the pairs."""
+    """Measure boards in memory, with both ends and with every COMMIT; the ratio is the median of the pairs."""
     with tempfile.TemporaryDirectory(prefix="plant-local-") as folder:
         stations = make_station(Path(folder, "alone"), "alone"), alone(Path(folder, "joined"))
         orders = []
@@ -190,7 +190,7 @@ def _take_in(folder: Path) -> None:
 
 
 def _peak() -> float:
-    """MB that this process took at most; getrusage would count its parent's before the exec."""
+    """Return the most MB that this process took; getrusage would count its parent's before the exec."""
     (line,) = [
         splitline for splitline in Path("/proc/self/status").read_text().splitlines() if splitline.startswith("VmHWM")
     ]
@@ -235,7 +235,7 @@ def _pushed(posts: list[postgres.Registry], chains: list[Pages], size: argparse.
 
 
 def _woken(posts: list[postgres.Registry], keys: list[SoftwareKey]) -> None:
-    """One listens, another pushes: from the begin of the push until the page is read here."""
+    """Time a push to a listener: from its beginning until the page is read there."""
     listener, reader, writer = posts[0], posts[1], posts[2]
     listener.listen()
     while listener.wait(0.2):

@@ -92,7 +92,7 @@ def recording(path: Path, samples: int) -> None:
 
 
 def run(code: str, *words: object) -> tuple[float, float, float]:
-    """Wall seconds, CPU seconds and MB of a program."""
+    """Return wall seconds, CPU seconds and MB of a program."""
     began = time.monotonic()
     process = Popen([sys.executable, "-c", code, *map(str, words)], stdout=DEVNULL)
     _, status, used = os.wait4(process.pid, 0)

@@ -219,7 +219,7 @@ def main(sizes: tuple[int, ...]) -> None:
 
 
 def print_table(sizes: tuple[int, ...], rows: dict[str, Row], taken: dict[str, dict[int, Taken]]) -> None:
-    """One line a command: seconds at each size, memory at the largest, the exponent, and the verdict on its aim."""
+    """Print one row per command: seconds at each size, memory at the largest, the exponent, the verdict on its aim."""
     print("command".ljust(18) + "".join(f"{size:>10}" for size in sizes) + "       CPU        MB  exponent  aim")
     nothing = taken["--version"]
     for name, entry in taken.items():

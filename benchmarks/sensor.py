@@ -76,13 +76,13 @@ def bus(*, socketcand: bool) -> Iterator[str]:
 
 
 def thrown_away() -> int:
-    """Datagrams for which no socket of this machine had room, so far (UDP RcvbufErrors)."""
+    """Return the datagrams for which no socket of this machine had room, so far (UDP RcvbufErrors)."""
     head, values = [line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")]
     return int(values[head.index("RcvbufErrors")]) if "RcvbufErrors" in head else 0
 
 
 def seconds_of_a_message(octets: int, *, fd: bool, bitrate: int) -> float:
-    """How long the frames of one message occupy the bus; its octets are random, as cipher is."""
+    """Return how long the frames of one message occupy the bus; its octets are random, as ciphertext is."""
     total = 0.0
     for segment, data in cut(random.randbytes(octets), fd=fd):
         identifier = 0x1CFF0021 | segment << 8
@@ -102,13 +102,13 @@ def provisioned(folder: Path, link: str, home: Path) -> None:
 
 
 def rows_of(file: Path) -> int:
-    """Rows of values in a text file."""
+    """Return the rows of values in a text file."""
     with file.open(encoding="utf-8") as lines:
         return sum(1 for line in lines if not line.startswith("#")) - 1
 
 
 def measured(name: str, link: str, *, fd: bool, bitrate: int, table: float, seconds: int) -> None:
-    """One bus: provision the node, measure it, and print a line."""
+    """Provision a node on one bus, measure it, and print a line."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         home, node, run = folder / "home", folder / "node", folder / "run.csv"

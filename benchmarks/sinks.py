@@ -39,13 +39,13 @@ STATION = StationFacts("bench", group="all")
 
 
 def layout(nodes: int = 20) -> list[tuple[str, tuple[int, ...]]]:
-    """Nodes of 25 channels, each in two streams."""
+    """Return nodes of 25 channels, each in two streams."""
     halves = (tuple(range(1, 14)), tuple(range(14, 26)))
     return [(f"{node:020x}", half) for node in range(1, nodes + 1) for half in halves]
 
 
 def facts(nodes: int = 20) -> list[ChannelFacts]:
-    """Of all channels."""
+    """Return the facts of all channels."""
     return [
         ChannelFacts(uuid, f"node {uuid[-2:]}", n, f"ch {n}", unit="N", period=0.01)
         for uuid, part in layout(nodes)
@@ -54,12 +54,12 @@ def facts(nodes: int = 20) -> list[ChannelFacts]:
 
 
 def verdict(*, met: bool) -> str:
-    """Of an aim."""
+    """Return the verdict on an aim."""
     return "met" if met else "MISSED"
 
 
 def tick(k: int, start: float, n: int = 2, nodes: int = 20) -> Iterator[Block]:
-    """Blocks of n instants of every stream, as the hearing thread makes them each 20 ms."""
+    """Yield blocks of n instants of every stream, as the receiver thread makes them each 20 ms."""
     chance = np.random.default_rng(k)
     for number, (uuid, channels) in enumerate(layout(nodes)):
         raw = chance.integers(0, 65536, (n, len(channels))).astype(np.uint64)
@@ -70,7 +70,7 @@ def tick(k: int, start: float, n: int = 2, nodes: int = 20) -> Iterator[Block]:
 
 
 def recorders(folder: Path, seconds: float, nodes: int) -> None:
-    """Each recorder as fast as it goes."""
+    """Measure each recorder as fast as it goes."""
     blocks = [list(tick(k, 1.8e9, nodes=nodes)) for k in range(int(seconds * RATE / 2))]
     rate = nodes * CHANNELS * RATE
     for suffix in ("csv", "jsonl", "mcap"):
@@ -167,7 +167,7 @@ class Master:
 
 
 def topics_of_ros2(seconds: float, nodes: int) -> None:
-    """Over Cyclone DDS."""
+    """Measure topics over Cyclone DDS."""
     domain = 90 + (os.getpid() + nodes) % 100
     code = READER.format(root=str(Path(__file__).parents[1]), domain=domain, seconds=seconds)
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as reader:
@@ -175,7 +175,7 @@ def topics_of_ros2(seconds: float, nodes: int) -> None:
 
 
 def topics_of_ros1(folder: Path, seconds: float, nodes: int) -> None:
-    """Over rospy, where Debian's is installed."""
+    """Measure topics over rospy, if Debian's is installed."""
     if not Path("/usr/bin/rosmaster").exists():
         print("ROS 1  is not installed here (apt install python3-rosmaster python3-rospy python3-sensor-msgs)")
         return
@@ -205,7 +205,7 @@ def paced(sink: Sink, keys: tuple[tuple[str, int], ...], rows: int, nodes: int) 
 
 
 def topics(name: str, sink: Sink, reader: subprocess.Popen[str], seconds: float, nodes: int) -> None:
-    """Rows and scalars of so many nodes at their times, and how late the reader had the rows."""
+    """Publish rows and scalars of that many nodes at their times, and print how late the reader had the rows."""
     assert reader.stdout is not None
     _line(reader.stdout, "ready")
     known = facts(nodes)

@@ -32,7 +32,7 @@ Set = list[bytes]
 
 
 def example_set(seed: int = 1) -> Set:
-    """Meta, TransducerChannel, Calibration and Security TEDS of one node."""
+    """Return Meta, TransducerChannel, Calibration and Security TEDS of one node."""
     chance = random.Random(seed)
     octets = chance.randbytes
     meta = {"UUID": octets(10), "OholdOff": 0.5, "SHoldOff": 0.1, "TestTime": 5.0, "MaxChan": 1}
@@ -130,7 +130,7 @@ def _tuples(
 
 
 def seconds_per_set(work: Callable[[], object], *, rounds: int = 7, repeats: int = 300) -> float:
-    """Median over rounds of the seconds for one call."""
+    """Return the median over rounds of the seconds for one call."""
     times = []
     for _ in range(rounds):
         start = time.perf_counter()
@@ -222,7 +222,7 @@ def peak() -> float:
 
 
 def import_time(rounds: int = 15) -> dict[str, float]:
-    """Milliseconds that importing the package costs over bare Python, median of several processes."""
+    """Return the ms that importing the package costs over bare Python, median of several processes."""
     with tempfile.TemporaryDirectory() as cache:  # compiled once, as installed
         environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
         environment["PYTHONPYCACHEPREFIX"] = cache

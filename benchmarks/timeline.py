@@ -35,13 +35,13 @@ def table(line: Line, runs: list[Run]) -> None:
 
 
 def took(run: Run, number: int) -> float:
-    """Seconds of an exchange."""
+    """Return the seconds of an exchange."""
     span = run.timed.spans[number]
     return span.ended - span.began
 
 
 def then(run: Run, number: int) -> float:
-    """Seconds from its end to the next one; 0 after the last."""
+    """Return the seconds from its end to the next one; 0 after the last."""
     spans = run.timed.spans
     return spans[number + 1].began - spans[number].ended if number + 1 < len(spans) else 0.0
 

@@ -53,7 +53,7 @@ def fill(folder: Path, home: Path, count: int) -> None:
 
 
 def ours(folder: Path, home: Path) -> tuple[float, float, str]:
-    """Seconds on the wall and of the processor, and the last line."""
+    """Return seconds on the wall and of the processor, and the last line."""
     command = [sys.executable, "-m", "teds_provision", "--home", str(home), "verify", str(folder)]
     before, began = _used(), time.perf_counter()
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -36,7 +36,7 @@ def parsed(path: Path) -> ast.Module:
 
 
 def modules(parse: Callable[[Path], ast.Module] = parsed) -> dict[str, Module]:
-    """Every module of the package by its dotted name; ``parse`` may keep the trees."""
+    """Return every module of the package by its dotted name; ``parse`` may keep the trees."""
     found: dict[str, tuple[Path, ast.Module]] = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
@@ -147,7 +147,7 @@ def _imports_ours(node: ast.AST) -> TypeGuard[ast.Import | ast.ImportFrom]:
 
 
 def complex_functions(found: dict[str, Module]) -> list[str]:
-    """Functions of cyclomatic complexity C or worse (11 and more, as radon counts)."""
+    """Return functions of cyclomatic complexity C or worse (11 and more, as radon counts)."""
     from radon.complexity import cc_visit_ast  # noqa: PLC0415  only this figure needs it
 
     result = []
@@ -160,7 +160,7 @@ def complex_functions(found: dict[str, Module]) -> list[str]:
 
 
 def drawers() -> list[tuple[int, str]]:
-    """Files side by side in each folder, the fullest first (``__init__`` not counted)."""
+    """Return the number of files in each folder, the fullest first (``__init__`` not counted)."""
     count = Counter(
         str(path.parent.relative_to(PACKAGE.parent)) for path in PACKAGE.rglob("*.py") if path.stem[0] != "_"
     )
@@ -168,7 +168,7 @@ def drawers() -> list[tuple[int, str]]:
 
 
 def functions(found: dict[str, Module]) -> int:
-    """Functions and methods, those inside others counted."""
+    """Return the number of functions and methods, those inside others included."""
     return sum(
         isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         for module in found.values()
@@ -177,7 +177,7 @@ def functions(found: dict[str, Module]) -> int:
 
 
 def used_once(found: dict[str, Module]) -> list[str]:
-    """Private functions of at most six lines that are called in one place of their file: ``file:line name``.
+    """Return private functions of at most six lines that are called in one place of their file: ``file:line name``.
 
     Not those that are given as a value, and not those that a class demands or overrides: a name is all that they have.
     """
@@ -207,7 +207,7 @@ def _called(node: ast.Call) -> str:
 
 
 def shared_names(found: dict[str, Module]) -> list[str]:
-    """Names of classes in several files; an answer of the API is the half of the class beside it, and not counted."""
+    """Return names of classes in several files; an answer of the API belongs to the class beside it."""
     homes: dict[str, list[str]] = {}
     for module in found.values():
         for node in module.tree.body:
@@ -218,7 +218,7 @@ def shared_names(found: dict[str, Module]) -> list[str]:
 
 
 def lines(found: dict[str, Module]) -> list[tuple[int, str]]:
-    """Lines of each room, the longest first."""
+    """Return the lines of each room, the longest first."""
     count: Counter[str] = Counter()
     for module in found.values():
         parts = module.path.relative_to(PACKAGE).parts

@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def commands(group: click.Group = cli, path: str = "") -> Iterator[tuple[str, click.Command]]:
-    """Every command with its path (``whitelist add``); the program itself under ""."""
+    """Yield every command with its path (``whitelist add``); the program itself under ""."""
     yield path, group
     context = click.Context(group)
     for name in group.list_commands(context):
@@ -63,7 +63,7 @@ def option_names() -> str:
 
 
 def parameter_names() -> tuple[list[str], list[str]]:
-    """Rows of the options that have another name in the code, and of those that may be given several times."""
+    """Return rows of the options that have another name in the code, and of those that may be given several times."""
     parameters, several = [], []
     for path, command in commands():
         options = options_of(command)
@@ -109,7 +109,7 @@ _CONFIGURATION_END = (
 
 
 def configuration() -> str:
-    """docs/configuration.md: every option, variable and key on one page."""
+    """Return docs/configuration.md: every option, variable and key on one page."""
     lines = [
         "# Configuration",
         "",
@@ -174,7 +174,7 @@ def _roff(text: str) -> str:
 
 
 def man_page() -> str:
-    """One page with every command, in the form of man(7)."""
+    """Return one page with every command, in the form of man(7)."""
     out = ['.TH TEDS\\-PROVISION 1 "" "teds\\-provision" "User Commands"', ".SH NAME"]
     out += ["teds\\-provision \\- identify, key, sign and write the datasheets of smart transducers"]
     for path, command in commands():

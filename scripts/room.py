@@ -17,7 +17,7 @@ WHOLE_RUNS = {"cli", "ncap", "measure", "provisioning"}
 
 
 def rooms() -> dict[str, set[str]]:
-    """Which rooms import each room, itself among them."""
+    """Return which rooms import each room, itself among them."""
     found = house.modules()
     result: dict[str, set[str]] = {}
     for name, module in found.items():

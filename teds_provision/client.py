@@ -211,12 +211,12 @@ class Client:
     # -- resources ---------------------------------------------------------------------------------------------------
 
     def status(self) -> Status:
-        """Version, links, detection, sinks, clock, budget."""
+        """Return version, links, detection, sinks, clock and budget."""
         found: Status = self.request("GET", "/status")
         return found
 
     def set_detection(self, mode: Mode) -> Mode:
-        """``transparent`` or ``whitelist``."""
+        """Set detection to ``transparent`` or ``whitelist`` and return it."""
         found: Mode = self.request("PUT", "/detection", {"mode": mode})["mode"]
         return found
 
@@ -230,7 +230,7 @@ class Client:
         return list(self.request("POST", "/discover", {})["nodes"])
 
     def nodes(self) -> list[Node]:
-        """Every node, asked for a thousand at a time."""
+        """Return every node; they are fetched a thousand at a time."""
         found: dict[str, Node] = {}
         offset = 0
         while True:
@@ -241,7 +241,7 @@ class Client:
                 return list(found.values())
 
     def node(self, node: str) -> Node:
-        """One node, by UUID, prefix or name."""
+        """Return one node, by UUID, prefix or name."""
         found: Node = self.request("GET", f"/nodes/{quote(node, safe='')}")
         return found
 

@@ -65,7 +65,7 @@ def whole_file(path: Path, *, replace: bool, mode: int = PRIVATE) -> Iterator[Bi
 
 @contextmanager
 def whole_draft(path: Path, *, replace: bool, mode: int = PRIVATE) -> Iterator[tuple[Path, BinaryIO]]:
-    """Like :func:`whole_file`, with the file's present name, for those who write it by its name."""
+    """Open a draft as :func:`whole_file` does, and yield its present path too, for callers that write by name."""
     if not path.name:  # "" and "/"
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if replace and path.exists() and not (path.is_file() or path.is_dir()):  # a rename would end a device: /dev/null
@@ -236,7 +236,7 @@ def _failing_as(path: Path, failure: type[TedsProvisionError]) -> Iterator[None]
 
 
 def _read(descriptor: int, most: int) -> bytes:
-    """So many octets at most of an open file, which is closed; raises OSError."""
+    """Read at most ``most`` octets of an open file and close it; raises OSError."""
     parts: list[bytes] = []
     try:  # by the system's own calls: half of the cost of open(), for thousands of files
         while most and (part := os.read(descriptor, min(most, _PIECE))):

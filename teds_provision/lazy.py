@@ -172,7 +172,7 @@ def _as_it_came(requirement: str) -> list[str]:
 
 
 def _uv_tool(receipt: pathlib.Path, requirements: tuple[str, ...]) -> str:
-    """``uv tool install`` with what its receipt has, and these."""
+    """Return the ``uv tool install`` command with what its receipt has, plus these requirements."""
     try:
         text = tomllib.loads(receipt.read_text(encoding="utf-8"))["tool"]
         listed = {requirement["name"]: requirement for requirement in text["requirements"]}

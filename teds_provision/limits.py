@@ -73,7 +73,7 @@ def check_count(count: int, limit: int, what: str) -> None:
 
 
 def load_json(text: str | bytes, what: str, *, octets: int = LIMITS.teds_file, file: str = "") -> Any:
-    """JSON that a stranger wrote: bounded in size, values, depth and digits, each name once in its object.
+    """Parse untrusted JSON: bounded in size, values, depth and digits, each name once in its object.
 
     ``what`` names it in errors, with its article: "the image"; with ``file`` they name file and line. Raises
     BadDataError.
@@ -135,7 +135,7 @@ def check_toml(text: str, file: str) -> None:
 
 
 def load_toml(text: str, file: str) -> dict[str, Any]:
-    """TOML that a stranger wrote, bounded in size, keys, depth and digits; raises BadDataError, ``file`` before it."""
+    """Parse untrusted TOML, bounded in size, keys, depth and digits; raises BadDataError, ``file`` before it."""
     check_toml(text, file)
     try:
         data = tomllib.loads(text)
@@ -155,7 +155,7 @@ def check_xml(text: bytes, what: str) -> None:
 
 
 def whole_number(text: str, what: str) -> int:
-    """Integer of a text of decimal digits; raises BadDataError for another text and for more digits than are read."""
+    """Return the integer of decimal digits; raises BadDataError for any other text and for too many digits."""
     digits = text.strip()
     if len(digits) > LIMITS.integer_digits or not re.fullmatch(r"[+-]?[0-9]+", digits):
         shown = digits if len(digits) <= 40 else f"{digits[:12]}… ({len(digits)} characters)"
@@ -164,7 +164,7 @@ def whole_number(text: str, what: str) -> int:
 
 
 def _parsed(text: str | bytes) -> Any:
-    """As ``json.loads`` does it, which would make another decoder for every document."""
+    """Parse as ``json.loads`` does, but with one decoder: json.loads would make another for every document."""
     if isinstance(text, str) and text.startswith("\ufeff"):
         return json.loads(text)  # it says what is wrong there
     return _decoder().decode(

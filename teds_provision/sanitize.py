@@ -21,7 +21,7 @@ def printable(text: str) -> str:
 
 
 def sanitize(text: str) -> str:
-    """Lines for a terminal, without the control characters that others put in; line breaks and tabs stay."""
+    """Return text for a terminal without control characters of others; line breaks and tabs stay."""
     if text.isprintable():
         return text
     return "".join(character if character.isprintable() or character in "\n\t" else "?" for character in text)
@@ -40,7 +40,7 @@ def sanitize_json(text: str) -> str:
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
-    """``1 entry``, ``2 entries``: a number with its noun; ``plural`` where an s is not enough."""
+    """Return a number with its noun: ``1 entry``, ``2 entries``; ``plural`` where an s is not enough."""
     return f"{number} {noun if number == 1 else plural or f'{noun}s'}"
 
 

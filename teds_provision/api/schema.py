@@ -163,7 +163,7 @@ def fit(schema: Schema, value: Any, where: str = "") -> Any:
 
 
 def _kind_of(value: Any, kinds: list[str]) -> str | None:
-    """Which of these types a value has; JSON Schema counts 1.0 as an integer, and true as no number."""
+    """Return which of these types a value has; in JSON Schema 1.0 is an integer, and true is no number."""
     whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
     there = {
         "null": value is None,

@@ -98,7 +98,7 @@ class Merge:
             )
 
     def _groups(self) -> None:
-        """Measurement groups: those that are missing here; their members as a newer copy has them.
+        """Merge the measurement groups: add those that are missing here, replace members by those of a newer copy.
 
         What an older copy has and this store lacks was deleted since.
         """
@@ -122,7 +122,7 @@ class Merge:
                 self.back["whitelist"] += 1
 
     def _pin(self, known: WhitelistEntry | None, uuid: bytes) -> str | None:
-        """Fingerprint of the key that this store ties a node to: that of its entry, else of what it showed."""
+        """Return the fingerprint that a node is tied to: its entry's, else that of the key it showed, else None."""
         if known is not None and known.fingerprint is not None:
             return known.fingerprint
         node = self.live.nodes.get(uuid)
@@ -171,7 +171,7 @@ class Merge:
             self.back[f"trust in {record.role} {record.name}"] += 1
 
     def _decisions(self) -> None:
-        """CAs whose trust a person ended, and bans that one lifted.
+        """Merge the CAs whose trust a person ended, and the bans that a person lifted.
 
         What an older copy has and this store lacks may have been taken back since.
         """
@@ -186,7 +186,7 @@ class Merge:
                 self.back["bans lifted"] += 1
 
     def _facts(self) -> None:
-        """Facts of the station that init had not reached here, and certificates; the keystore is this machine's."""
+        """Merge certificates and the station's facts that init had not reached here; the keystore is this machine's."""
         here, there = self.live.identity.record(), self.copy.identity.record()
         if there is not None and (here is None or here.point is None):
             kept = there if here is None else replace(there, keystore=here.keystore, keystore_why=here.keystore_why)
@@ -199,7 +199,7 @@ class Merge:
                 self.back["certificates"] += 1
 
     def _marks(self) -> None:
-        """Whose CA a node keeps, a rotation that is due: from a newer copy, or with a key that is missing here.
+        """Merge key flags (the CA that a node keeps, a due rotation) of a newer copy, or with a key missing here.
 
         What an older copy has and this store lacks may have been settled since.
         """

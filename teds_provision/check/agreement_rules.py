@@ -70,7 +70,7 @@ class StrangerStation:
         return Credentials(self.station, self.ca.sign(station_key_message(self.station.point)), self.ca.point)
 
     def request(self, *, certified: bool = True, one_time: bytes = b"", message: bytes = b"") -> bytes:
-        """Payload of a Request of theirs; ``message`` is what SIG104 signs in place of the right one."""
+        """Return the payload of a Request of the stranger; SIG104 signs ``message`` in place of the right one."""
         signer = self.ca if certified else self.station
         signature = signer.sign(message or station_key_message(self.station.point))
         one_time = one_time or SoftwareKey.generate().point
@@ -596,7 +596,7 @@ def rotation_keeps(probe: Probe) -> str:
 
 
 def _teds_of(probe: Probe) -> dict[BlockId, bytes]:
-    """Every TEDS, the Security TEDS too if it is signed: an initial one has the epoch, which changes."""
+    """Return every TEDS, the Security TEDS only if it is signed: an initial one has the epoch, which changes."""
     signed = probe.security().signed
     return {block: probe.teds(block) for block in probe.listed() if signed or block != SECURITY}
 

@@ -70,11 +70,11 @@ class _Stranger:
         return self._transaction
 
     def send(self, data: bytes, *, node: int | None = None) -> None:
-        """One frame to the node, or to another address."""
+        """Send one frame to the node, or to another address."""
         self._frames.send(physical_id(node or self.node, self.own), padded(data, fd=self.fd), fd=self.fd)
 
     def everyone(self, data: bytes) -> None:
-        """One functional frame."""
+        """Send one functional frame."""
         self._frames.send(FUNCTIONAL | self.own, data, fd=self.fd)
 
     def flow(self, status: int, block: int = 0, gap: int = 0) -> None:
@@ -167,7 +167,7 @@ def _body(transaction: int, command: Command, octets: int = 0) -> bytes:
 
 
 def _long_write(fd: bool) -> Command:
-    """Refused with 3 outside a session, whatever its length."""
+    """Return a Write that is longer than one frame; outside a session it is refused with 3."""
     return write_teds(0, 12, 0, bytes(_LONG[fd] - 12))
 
 

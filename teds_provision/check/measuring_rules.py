@@ -363,7 +363,7 @@ def _messages(
     *,
     stale: DatagramSealer | None = None,
 ) -> list[bytes]:
-    """Whole data messages of this session's stream, in the order in which they come; fewer after ``seconds``."""
+    """Return whole data messages of this session's stream in order of arrival; fewer after ``seconds``."""
     assembly, came = StreamAssembly(length, fd=frames.fd), list[bytes]()
     until = probe.now() + seconds
     while len(came) < count and (left := until - probe.now()) > 0:

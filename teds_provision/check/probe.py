@@ -246,7 +246,7 @@ class Probe:
         return free[number - 1]
 
     def now(self) -> float:
-        """Monotonic seconds."""
+        """Return monotonic seconds."""
         return time.monotonic()
 
     def move(self, address: int) -> None:
@@ -322,7 +322,7 @@ class Probe:
         return session
 
     def opening_counter(self) -> bytes:
-        """C of Open, 8 octets; raises RuleBrokenError."""
+        """Return c of Open, 8 octets; raises RuleBrokenError."""
         counter = self.good(security_command(Function.OPEN))
         holds(len(counter) == 8, f"Open (128.3) without payload: c has {len(counter)} octets, 8 are due.")
         return counter
@@ -376,7 +376,7 @@ class Probe:
         return inner
 
     def _slip_of_sealed(self, session: StationSession) -> Slip | None:
-        """How the node would take a Sealed frame: each slip is tried, under counters of their own."""
+        """Return the slip that explains how the node opens Sealed frames; each is tried under counters of its own."""
 
         def takes(payload: bytes) -> bool:
             return self.plain(security_command(Function.SEALED, payload)).ok

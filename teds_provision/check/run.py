@@ -66,7 +66,7 @@ class CheckReport:
     explained: ExplainedRequest | str | None = None
 
     def count(self, result: str) -> int:
-        """How many rules ended so."""
+        """Return the number of rules with this result."""
         return sum(check.result == result for check in self.checks)
 
 
@@ -144,7 +144,7 @@ class _Run:
         return CheckReport(self._node.uuid, checks, self._lost, self._explained)
 
     def _explain(self) -> None:
-        """Before any rule: a node that cannot agree gets the figures that lead to why."""
+        """Compute, before any rule, why a node cannot agree; its figures go into the results of the rules."""
         if not self._explaining:
             return
         try:
@@ -153,7 +153,7 @@ class _Run:
             self._explained = str(no)
 
     def _in_factory_state(self, ours: bool) -> None:
-        """Rules of factory state, and of the way from there to a key and back; a node of ours is reset for them."""
+        """Run the rules of factory state, and of the way to a key and back; a node of ours is reset for them."""
         why = (self._reset() if self._factory else _ONLY_FACTORY) if ours else ""
         if why:
             for stage in Stage:

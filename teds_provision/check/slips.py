@@ -132,7 +132,7 @@ class Agreement:
         return self.one_time.ecdh(self.en) + self.station.ecdh(self.en)
 
     def transcripts(self) -> list[Way]:
-        """T as the profile has it, and as slips make it."""
+        """Return T as the profile has it, and as slips make it."""
         label, digest = b"TEDS1 transcript\0", hashlib.sha256(self.teds).digest()
         request, nonce, epoch, en, uuid, node = self.request, self.nonce, self.epoch, self.en, self.uuid, self.node
         rest = en + uuid + node
@@ -225,7 +225,7 @@ class Agreement:
         return security.initial(shown.node_key, shown.node_key_signature, sequence=shown.sequence, key_epoch=number)
 
     def secrets(self) -> list[Way]:
-        """Z as the profile has it, and as slips make it."""
+        """Return Z as the profile has it, and as slips make it."""
         first, second = self.one_time.ecdh(self.en), self.station.ecdh(self.en)
         own = self.one_time.ecdh(self.node), self.station.ecdh(self.node)
         return _ways(
@@ -241,7 +241,7 @@ class Agreement:
         )
 
     def material(self, shared: bytes, script: bytes) -> list[Way]:
-        """OKM. The profile takes 48 octets; 64 begin with the same 48, and let M of 48 octets be tried."""
+        """Return OKM: the profile takes 48 octets; 64 begin with the same 48, so that M of 48 octets can be tried."""
         nonce, label = self.nonce, b"TEDS1 link key\0"
         return _ways(
             _hkdf(shared, nonce, label + script, 64),
@@ -261,7 +261,7 @@ class Agreement:
         )
 
     def tags(self, okm: bytes, script: bytes) -> Iterator[Way]:
-        """TagN from OKM: what M is, then how the tag is made."""
+        """Yield TagN from OKM: each choice of M, and each way to make the tag."""
         keys = _ways(
             okm[16:48],
             m_of_48_octets=(okm[16:64], "M has 48 octets; OKM[16:48] are 32"),
@@ -335,7 +335,7 @@ def _confirmations(key: bytes, own: bytes, other: bytes, script: bytes) -> list[
 
 
 def confirmations(confirmation: bytes, script: bytes) -> list[tuple[Slip, bytes]]:
-    """Other tags of a station that a node may wait for, given M and T."""
+    """Return wrong station tags that a node may expect, given M and T, with the slip behind each."""
     ways = _confirmations(confirmation, b"station", b"node", script)
     return [(slip, tag) for slip, tag in ways if slip is not None]
 

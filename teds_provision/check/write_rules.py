@@ -206,7 +206,7 @@ def staging_shared(probe: Probe) -> str:
 
 
 def stored_blocks(probe: Probe) -> dict[BlockId, bytes]:
-    """Every TEDS that the node lists but the Security TEDS, read now."""
+    """Read every TEDS that the node lists except the Security TEDS."""
     return {block: probe.teds(block) for block in probe.listed() if block != SECURITY}
 
 

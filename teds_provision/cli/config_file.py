@@ -118,7 +118,7 @@ def _from(folder: Path, path: str) -> str:
 
 
 def home_of(home: Path | None) -> Path:
-    """Folder of the store: the option's, else the platform's user data folder."""
+    """Return the folder of the store: the option's, else the platform's user data folder."""
     if home is not None:
         return home.expanduser()
     from platformdirs import user_data_path

@@ -61,7 +61,7 @@ class LazyGroup(click.Group):
     teachers: ClassVar[list[Callable[[click.Command], None]]] = []
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names in the order of the table."""
+        """Return the names in the order of the table."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -244,7 +244,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _help_width() -> int:
-    """Columns of a help text: the terminal's less two, as click reckons it, without the libraries of archives.
+    """Return the columns of a help text: the terminal's less two, as click computes it, without the archive libraries.
 
     click asks shutil, which loads bz2 and lzma: a tenth of the time of ``--help``.
     """

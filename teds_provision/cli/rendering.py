@@ -32,7 +32,7 @@ _STYLES = {NOTHING: "dim", SKIPPED: "dim", FAILED: "red"}
 
 
 def count_of(number: int) -> str:
-    """``1 node``, ``2 nodes``."""
+    """Return the number with its noun: ``1 node``, ``2 nodes``."""
     return f"{number} node{'' if number == 1 else 's'}"
 
 
@@ -162,7 +162,7 @@ class LineReporter:
 
 
 def line_of(step: StepResult) -> str:
-    """``✓ agree       0.05 s  key epoch 1``."""
+    """Return the line of a step: ``✓ agree       0.05 s  key epoch 1``."""
     mark = _MARKS.get(step.result, "✓")
     detail = step.detail if step.result != NOTHING else f"{NOTHING}{': ' if step.detail else ''}{step.detail}"
     whose = f"{step.of}: " if step.of else ""
@@ -241,7 +241,7 @@ _UNITS = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days", "w": "weeks
 
 
 def duration(text: str) -> float:
-    """Seconds of a time span as people give it: ``90s``, ``15m``, ``2h``; raises UsageError."""
+    """Parse a time span as people write it (``90s``, ``15m``, ``2h``) and return seconds; raises UsageError."""
     found = re.fullmatch(r"(\d{1,6})\s*([smhdw])", text.strip().lower())
     if found is None:
         raise UsageError(f"{text!r} is not a valid time span.", hint="Use 90s, 15m or 2h.")

@@ -85,7 +85,7 @@ class Demo:
 
 
 def provision_over(demo: Demo, station: Station, via: str, uuid: bytes, order: BuildOrder) -> ProvisionResult:
-    """Every step of provisioning, from one station over one link; raises unless the node is authentic at the end."""
+    """Run every step of provisioning, from one station over one link; raises unless the node ends up authentic."""
     with meet(station, demo.over(via), uuid, demo.reporter) as node:
         done = provision(station, node, order, operator=AcceptingOperator(), reporter=demo.reporter)
     require_authentic(done.verified)
@@ -159,7 +159,7 @@ _HALF_WAY = 0.5
 
 
 def calibrations(folder: Path) -> dict[str, Path]:
-    """Calibration files of today for both nodes: straight lines over the whole raw range."""
+    """Write calibration files of today for both nodes: straight lines over the whole raw range. Return them by name."""
     today = datetime.now(UTC).date().isoformat()
     angle = folder / "angle.csv"
     angle.write_text(f"# date: {today}\nraw,value [degree]\n0,0\n65535,360\n")
@@ -187,7 +187,7 @@ def calibrate_sensor(demo: Demo, station: Station, calibration: Path) -> None:
 
 
 def measure_group(demo: Demo, station: Station, uuids: tuple[bytes, ...]) -> None:
-    """Both nodes at once: sessions, datasheets verified, claims, streams, calibrated values in a file."""
+    """Measure both nodes together: sessions, verified datasheets, claims, streams, calibrated values in a file."""
     file = demo.folder / "run.csv"
     station.groups.create("robot", list(uuids))
     with demo.steps.step("measure") as step:
@@ -222,7 +222,7 @@ def _last_row(file: Path) -> str:
 
 
 def _told(column: str, value: str) -> str:
-    """``hand/opening [m]`` and ``0.04`` as ``opening 0.04 m``."""
+    """Return a column and its value as people read it: ``hand/opening [m]`` and ``0.04`` as ``opening 0.04 m``."""
     name, _, unit = column.rpartition("/")[2].partition(" [")
     return f"{name} {float(value):.4g} {unit.rstrip(']')}" if value != "none" else f"{name} none"
 

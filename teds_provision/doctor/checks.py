@@ -102,6 +102,6 @@ def intact(name: str, whole: str, part: str, sample: RowSample) -> Finding:
 
 
 def exit_code(found: list[tuple[Room, Finding]]) -> int:
-    """0 unless a check failed; else 7 for store or vault, 5 for a link that was asked for, 1 for the machine."""
+    """Return 0 unless a check failed; else 7 for store or vault, 5 for a link that was asked for, 1 for the machine."""
     rooms = {room for room, finding in found if finding.result == "failed"}
     return 7 if "store" in rooms else 5 if "link" in rooms else 1 if rooms else 0

@@ -25,7 +25,7 @@ _SHOWN: Final = 5
 
 @check("config", "machine")
 def config(system: System) -> Iterator[Finding]:
-    """Is config.toml what it should be: TOML, with keys that some command knows."""
+    """Check config.toml: it is TOML, with keys that some command knows."""
     path = system.home / "config.toml"
     if not path.exists():
         yield Finding("config", "skipped", "There is no config.toml.")

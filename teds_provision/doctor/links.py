@@ -132,7 +132,7 @@ def pcsc(system: System) -> Iterator[Finding]:
 
 @check("serial ports", "machine")
 def serial_ports(system: System) -> Iterator[Finding]:
-    """May this user open the serial ports that a reader or a CAN adapter could be behind."""
+    """Check that this user may open the serial ports that a reader or a CAN adapter could be behind."""
     ports = sorted(path for kind in ("USB", "ACM", "AMA") for path in system.at("/dev").glob(f"tty{kind}*"))
     if not ports:
         yield Finding("serial ports", "skipped", "There is no serial port that a reader could use.")
@@ -192,7 +192,7 @@ def nfc(system: System) -> Iterator[Finding]:
 
 @check("can interfaces", "machine")
 def can_interfaces(system: System) -> Iterator[Finding]:
-    """Every CAN interface of the kernel: is it up, and at which bit rate."""
+    """Check every CAN interface of the kernel: that it is up, and its bit rate."""
     found = False
     for interface in sorted(system.at("/sys/class/net").glob("*")):
         try:
@@ -349,7 +349,7 @@ def _blocked(system: System) -> Iterator[Finding]:
 
 @check(_BLUETOOTH, "link")
 def bluetooth(system: System) -> Iterator[Finding]:
-    """System bus, bluetoothd, its adapters: switched on, central role, connections that are held."""
+    """Check system bus, bluetoothd and its adapters: power, central role, connections that are held."""
     if system.root != Path("/") and "DBUS_SYSTEM_BUS_ADDRESS" not in system.environment:
         yield Finding(_BLUETOOTH, "skipped", "These checks are running on another machine's files.")
         return

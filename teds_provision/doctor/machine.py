@@ -28,7 +28,7 @@ _TOLERANCE_SECONDS: Final = 120
 
 @check("python", "machine")
 def python(system: System) -> Iterator[Finding]:
-    """Is this Python new enough."""
+    """Check that this Python is new enough."""
     version = platform.python_version()
     enough = sys.version_info[:2] >= _MIN_PYTHON
     fix = "" if enough else "Install Python 3.11 or newer and recreate the virtual environment."
@@ -37,7 +37,7 @@ def python(system: System) -> Iterator[Finding]:
 
 @check("libraries", "machine")
 def libraries(system: System) -> Iterator[Finding]:
-    """Are the libraries there, new enough, and not shadowed."""
+    """Check that the libraries are installed, new enough, and not shadowed."""
     present, missing, old = [], [], []
     for name, least in _LIBRARIES.items():
         try:
@@ -74,14 +74,14 @@ def _shadowed() -> Iterator[Finding]:
 
 @check("argon2id", "machine")
 def argon2id(system: System) -> Iterator[Finding]:
-    """Can this OpenSSL derive keys from passphrases."""
+    """Check that this OpenSSL can derive keys from passphrases."""
     SealingKey.derive("a self-test, no secret", costs=THROWAWAY)
     yield Finding("argon2id", "ok", "Passphrases work.")
 
 
 @check("libusb", "machine")
 def libusb(system: System) -> Iterator[Finding]:
-    """Is the C library of USB readers there."""
+    """Check that the C library of USB readers loads."""
     for name in _LIBUSB:
         try:
             ctypes.CDLL(name)
@@ -96,7 +96,7 @@ def libusb(system: System) -> Iterator[Finding]:
 
 @check("clock", "machine")
 def clock(system: System) -> Iterator[Finding]:
-    """Is the time one that a signature may carry: plausible, and not before what was signed already."""
+    """Check that the time can stand in a signature: plausible, and not before anything signed already."""
     now = datetime.now(UTC)
     fix = "sudo timedatectl set-ntp true, or: sudo date --utc --set '2026-01-31 12:00'"
     if not _FIRST_YEAR <= now.year <= _LAST_YEAR:
@@ -128,7 +128,10 @@ def _last_entry(system: System) -> datetime | None:
 
 
 def _drift(system: System) -> float | None:
-    """Seconds that the hardware clock is ahead; it is assumed to run in UTC, else a whole time zone shows."""
+    """Return the seconds that the hardware clock is ahead, None if unknown.
+
+    It is assumed to run in UTC; if that is off by more, in local time.
+    """
     try:
         seconds = int(system.at("/sys/class/rtc/rtc0/since_epoch").read_text())
     except (OSError, ValueError):

@@ -36,7 +36,7 @@ _INIT: Final = "teds-provision init"
 
 @check("home", "store")
 def home(system: System) -> Iterator[Finding]:
-    """Is the home this user's alone, and each file in it too. Looked at before anything opens (and mends) it."""
+    """Check that home and each file in it belong to this user alone, before anything opens (and repairs) it."""
     if not system.home.is_dir():
         yield Finding("home", "skipped", f"There is no station in {system.home} yet.", _INIT)
         return
@@ -64,7 +64,7 @@ def _open_to_others(path: Path) -> bool:
 
 @check("disk", "store")
 def disk(system: System) -> Iterator[Finding]:
-    """Is there room to write."""
+    """Check that there is room to write."""
     where = next(path for path in (system.home, *system.home.absolute().parents) if path.is_dir())
     free = shutil.disk_usage(where).free
     enough = free >= _MIN_FREE
@@ -74,7 +74,7 @@ def disk(system: System) -> Iterator[Finding]:
 
 @check("store", "store")
 def store(system: System) -> Iterator[Finding]:
-    """Is the store whole, does its audit log hold, does anyone hold it, and is there a backup."""
+    """Check that the store is intact, that its audit log verifies, whether it is in use, and that there is a backup."""
     if not has_store(system.home):
         yield Finding("store", "skipped", _NO_STATION, _INIT)
         return
@@ -151,7 +151,7 @@ def keyring(system: System) -> Iterator[Finding]:
 
 @contextmanager
 def _quiet_logging() -> Iterator[None]:
-    """Backends log what they could not load; that is the finding's business."""
+    """Silence the backends, which log what they could not load: the finding reports it."""
     import logging
 
     logger = logging.getLogger("keyring")

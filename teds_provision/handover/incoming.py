@@ -150,7 +150,7 @@ class ImportedRows:
         )
 
     def _marks(self, taken: Iterable[PlannedNode]) -> dict[bytes, dict[str, Any]]:
-        """Rotations that are due after a move; the CA that each node keeps, or keeps once its new key is proven."""
+        """Return key flags by UUID: rotations due after a move, and the CA that a node keeps, or will once proven."""
         ca, own = self.bundle.ca, self.station.ca
         marks: dict[bytes, dict[str, Any]] = {}
         for planned in taken:
@@ -373,7 +373,7 @@ class _Judge:
             self.held.setdefault(key.uuid, {})[key.key_id] = (key.state, key.epoch)
 
     def _obstacle(self, node: BundledNode) -> str:
-        """Why the node itself is not taken, "" for nothing."""
+        """Return why the node itself is not imported, "" if it is."""
         pin = self.pins.get(node.uuid)
         key, why = self.denied.get(node.uuid, (None, ""))
         if why and (key is None or same_key(key, fingerprint(node.node_key))):
@@ -386,7 +386,7 @@ class _Judge:
         return ""
 
     def _stale_key(self, node: BundledNode) -> str:
-        """Why the key that it comes with is not taken beside those that are held, "" for nothing."""
+        """Return why its key is not added to those that are held, "" if it is."""
         held = self.held.get(node.uuid, {})
         if node.kid in held:
             return ""
@@ -480,7 +480,7 @@ def prove_node(station: Station, node: Conversation) -> NodeProof:
 
 
 def proven_of(station: Station, uuids: Iterable[bytes]) -> set[bytes]:
-    """Those of many nodes with which a session was opened under the key that is held, and no rotation is due."""
+    """Return those of many nodes whose held key opened a session and has no rotation due."""
     proven: set[bytes] = set()
     for page in chunks(uuids):
         active = {key.uuid for key in station.keys.get_many(page) if key.state == "active"}

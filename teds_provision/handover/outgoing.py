@@ -105,7 +105,7 @@ class Selection:
         return chosen, [(uuid, obstacle) for uuid, obstacle in why.items() if obstacle]
 
     def fitting(self) -> Chosen:
-        """Those of the nodes that were named which can go."""
+        """Return those of the named nodes that can be exported."""
         return [self.keys[uuid] for uuid in sorted(set(self.order.nodes or ())) if not self._obstacle(uuid)]
 
     def _named(self, nodes: tuple[bytes, ...]) -> dict[bytes, str]:
@@ -175,7 +175,7 @@ class Selection:
 
 
 def _keys(station: Station, wanted: tuple[bytes, ...] | None) -> Iterator[tuple[bytes, str, int, str]]:
-    """UUID, key id, epoch and state of the keys of the nodes that are wanted, or of all."""
+    """Return UUID, key id, epoch and state of the keys of the wanted nodes, or of all."""
     if wanted is None:
         return station.keys.all_key_names()
     records = (key for page in chunks(wanted) for key in station.keys.get_many(page))
@@ -183,7 +183,7 @@ def _keys(station: Station, wanted: tuple[bytes, ...] | None) -> Iterator[tuple[
 
 
 def _why_nodes_stay(station: Station, wanted: tuple[bytes, ...] | None) -> dict[bytes, str]:
-    """Why each node of the wanted ones, or of all, cannot go, whatever its key is; "" for nothing."""
+    """Return why each of the wanted nodes, or of all, cannot be exported whatever its key; "" if it can."""
     known: Iterable[Sequence[NodeRecord | ExportEligibility]] = (
         chunks(station.nodes.all_shown_keys())
         if wanted is None
@@ -250,7 +250,7 @@ class ExportResult:
 
 
 def plan_export(station: Station, order: ExportOrder, now: datetime | None = None) -> ExportPlan:
-    """:func:`plan_exports` for what fits into one bundle; raises UsageError for more."""
+    """Plan one bundle as :func:`plan_exports` does; raises UsageError if it takes more than one."""
     plans = plan_exports(station, order, now=now)
     if len(plans) > 1:
         raise UsageError("These are too many nodes for one bundle.", hint="Export them in several bundles.")
@@ -463,7 +463,7 @@ def _signature(station: Station, ca: bytes, receiver: TrustRecord) -> bytes:
 
 
 def _other_holders(station: Station, nodes: Chosen, receivers: tuple[TrustRecord, ...]) -> tuple[str, ...]:
-    """Stations besides the receivers that hold any of these keys since an earlier copy."""
+    """Return the stations, other than the receivers, that hold any of these keys since an earlier copy."""
     chosen = {node.uuid for node in nodes}
     found = {holder.fingerprint for holder in station.keys.holders() if holder.uuid in chosen}
     return tuple(sorted(found - {record.fingerprint for record in receivers}))
@@ -557,12 +557,12 @@ def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...]) -> Han
 
 
 def _files_before(plan: ExportPlan) -> tuple[str, ...]:
-    """Digests of the files that this very handover gave in earlier runs."""
+    """Return the digests of the files that earlier runs of this handover wrote."""
     return BundleNotes.from_json(plan.earlier.nodes).files if plan.earlier else ()
 
 
 def _record_holders(station: Station, plan: ExportPlan, peers: tuple[str, ...]) -> None:
-    """Who holds the keys from now on: each receiver of a copy beside us; of a move, that is, the receiver alone."""
+    """Record who holds the keys from now on: each receiver of a copy too; after a move, the receiver alone."""
     now, uuids_of_nodes = utc_now(), [node.uuid for node in plan.nodes]
     if plan.mode == "copy":
         station.bulk.put(BulkRows(holders=[Holder(uuid, peer, now) for uuid in uuids_of_nodes for peer in peers]))

@@ -86,7 +86,7 @@ def content_digest(
 
 
 def digest_of(bundle: Bundle) -> str:
-    """:func:`content_digest` of an opened bundle."""
+    """Return :func:`content_digest` of an opened bundle."""
     ascending = sorted(bundle.nodes, key=attrgetter("uuid"))
     nodes = ((node.uuid, node.kid, node.epoch) for node in ascending)
     return content_digest(bundle.sender, bundle.to, bundle.mode, bundle.ca, nodes)

@@ -494,7 +494,7 @@ def _cas_of(station: Station, record: TrustRecord) -> tuple[bytes, ...]:
 
 
 def _brought_cas(station: Station) -> dict[bytes, set[str]]:
-    """CAs that came in bundles, each with the fingerprints of the stations that sent one."""
+    """Return the CAs that came in bundles, each with the fingerprints of the stations that sent it."""
     brought: dict[bytes, set[str]] = {}
     for row in station.handovers.all():
         if row.direction == "in":

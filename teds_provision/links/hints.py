@@ -23,7 +23,7 @@ class Charging:
     raw: dict[str, dict[str, int | str]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, object]:
-        """As ``identify``, ``nodes`` and ``mode`` show it."""
+        """Return the members that ``identify``, ``nodes`` and ``mode`` show."""
         return {
             "state": self.state,
             "battery_percent": self.battery_percent,

@@ -220,7 +220,7 @@ class DeadlineLink(Protocol):
     """A link on which a request can be given up soon: what it orders would be too late afterwards."""
 
     def exchange_within(self, frame: bytes, seconds: float) -> bytes:
-        """As ``exchange``; repeated after a quarter and a half of ``seconds``, given up at their end.
+        """Exchange as ``exchange`` does; repeat after a quarter and a half of ``seconds``, give up at their end.
 
         operation.md section 2, "No late orders".
         """

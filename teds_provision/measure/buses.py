@@ -80,7 +80,7 @@ class Buses:
         return self._buses[port.place]
 
     def all(self) -> Sequence[MeasuredBus]:
-        """Every bus."""
+        """Return every bus."""
         return tuple(self._buses.values())
 
     def bus_of(self, sighting: Sighting) -> MeasuredBus:

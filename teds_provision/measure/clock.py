@@ -145,7 +145,7 @@ class ClockMap:
             self._refit(tick)
 
     def host(self, ticks: NDArray[np.uint64]) -> NDArray[np.float64]:
-        """Host time (monotonic, seconds) of ticks."""
+        """Return the host times (monotonic, seconds) of ticks."""
         self._handed_out = True
         signed = ticks.astype(np.int64)
         slope: NDArray[Any] = self._offset + self._skew * (signed - self._origin)
@@ -156,11 +156,11 @@ class ClockMap:
         return whole
 
     def host_of(self, tick: int) -> float:
-        """Host time (monotonic, seconds) of one tick."""
+        """Return the host time (monotonic, seconds) of one tick."""
         return float(self.host(np.array([tick], dtype=np.uint64))[0])
 
     def tick_at(self, host: int) -> int:
-        """Node's tick at a host time (monotonic ns), by the present line."""
+        """Return the node's tick at a host time (monotonic ns), by the present line."""
         guess = host - round(self._offset)
         return host - round(self._line(guess))
 
@@ -170,7 +170,7 @@ class ClockMap:
         return TickBounds(max(0, host + ahead.low), host + ahead.high)
 
     def ahead(self, host: int) -> TickBounds:
-        """By what the node's tick may be ahead of the host's time (monotonic ns), at that time."""
+        """Return the bounds by which the node's tick may be ahead of a host time (monotonic ns) at that time."""
         # The tick itself is the line's; what skew adds to its offset changes this doubt by some ns in a minute.
         doubt = self._rate * abs(host - self._offset - self._when) + 1.0
         low, high = self._low - doubt, self._high + doubt
@@ -207,7 +207,7 @@ class ClockMap:
         return self._low - doubt, self._high + doubt
 
     def _narrow(self, tick: int, low: float, high: float) -> None:
-        """Evidence of a tick: what was known by then widens with its age, and the narrower of the two counts."""
+        """Narrow the bounds by the evidence of a tick; the known bounds widen with age, and the narrower ones count."""
         now = max(tick, self._when)
         known, new = self._rate * (now - self._when), self._rate * (now - tick)
         self._low = max(self._low - known, low - new)
@@ -244,7 +244,7 @@ class ClockMap:
         return (min(middle, edge) if self._hull.count else middle), skew
 
     def _skew_of(self, at: NDArray[Any], offsets: NDArray[Any], errors: NDArray[Any]) -> float:
-        """Of a weighted line through exchanges, held within the drift."""
+        """Return the skew of a weighted line through exchanges, held within the drift."""
         # A round trip's excess over the quickest one is delay that fell on one way or the other: weak evidence.
         weights = 1.0 / (errors - 0.9 * errors.min() + 1_000.0) ** 2
         middle, level = np.average(at, weights=weights), np.average(offsets, weights=weights)
@@ -379,11 +379,11 @@ class HostClock:
         return self.present[1] - before[1]
 
     def since(self, number: int) -> float:
-        """Seconds to add to a stamp that was made by an earlier setting."""
+        """Return the seconds to add to a stamp that was made by an earlier setting."""
         return self.present[1] - self._walls[number].offset
 
     def now(self) -> float:
-        """Unix seconds by this clock."""
+        """Return unix seconds by this clock."""
         return time.monotonic() + self.present[1]
 
 

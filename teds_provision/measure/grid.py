@@ -109,7 +109,7 @@ class Grid:
         return GroupRows(self.group, self.channels, times, value, age, self._test)
 
     def began_apart(self) -> float:
-        """Seconds between the first samples of the stream that began first and of the one that began last."""
+        """Return the seconds between the first samples of the earliest and of the latest stream."""
         began = [stream.began for stream in self._streams.values() if not math.isnan(stream.began)]
         return max(began) - min(began) if began else 0.0
 

@@ -36,7 +36,7 @@ class AppliedSetPoint:
     raw: Any
 
     def as_json(self) -> dict[str, Any]:
-        """As `set --json` has it."""
+        """Return the object that `set --json` prints."""
         return {"channel": self.channel, "value": self.value, "unit": self.unit, "raw": self.raw}
 
 

@@ -77,7 +77,7 @@ class StreamInterpreter:
         return tuple(InvalidValues(channel, why, count) for (channel, why), count in self._invalid.copy().items())
 
     def blocks(self, messages: Sequence[StreamMessage]) -> list[Block]:
-        """Messages as blocks: one for all that follow on from each other, and another one after each gap."""
+        """Return messages as blocks: one for each run of consecutive messages, a new one after each gap."""
         if not messages:
             return []
         if len(messages) == 1:
@@ -216,7 +216,7 @@ def _exact_as_float(column: np.ndarray) -> bool:
 
 
 def _together(columns: Sequence[np.ndarray]) -> np.ndarray:
-    """Columns as one array of a dtype that holds each raw value exactly."""
+    """Return columns as one array of a dtype that holds each raw value exactly."""
     kinds = {column.dtype for column in columns}
     numbers = all(kind.kind != "O" for kind in kinds)
     if numbers and len(kinds) == 1:

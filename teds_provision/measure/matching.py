@@ -178,7 +178,7 @@ class UnsignedNodes:
     text: str = "unverified"
 
     def why_not(self, station: Station, uuid: bytes) -> str:
-        """As :meth:`NodeMatch.why_not`."""
+        """Return why not, as :meth:`NodeMatch.why_not` does."""
         if station.measurements.detection != "transparent":
             return "detection is not transparent"
         judged = verdict_of(station, uuid)
@@ -198,7 +198,7 @@ class ListedNodes:
     text: str = "adopted"
 
     def why_not(self, station: Station, uuid: bytes) -> str:
-        """As :meth:`NodeMatch.why_not`."""
+        """Return why not, as :meth:`NodeMatch.why_not` does."""
         judged = verdict_of(station, uuid) if uuid in self.uuids else None
         return "" if judged is not None and judged.verified.verdict == "authentic" else "it was not adopted here"
 

@@ -365,7 +365,7 @@ class NodeSupervisor:
                 self._end(bus, trusted, sighting.address, answers=answers or self._stop.is_set())
 
     def _measure(self, bus: MeasuredBus, trusted: VerifiedSession, address: int) -> None:
-        """Clock, Operate, Subscribe; every stream is heard from then on."""
+        """Set the clock, claim channels (Operate) and subscribe; every stream is received from then on."""
         self.streams.new_session()
         for _ in range(AT_FIRST):
             self.streams.tell_time(trusted)
@@ -386,7 +386,7 @@ class NodeSupervisor:
         self.ready.set()
 
     def _actuators(self, trusted: VerifiedSession) -> list[Channel]:
-        """Actuators that set points may come for: of a signed datasheet on the whitelist, with a way to raw values."""
+        """Return actuators that may get set points: signed datasheet, on the whitelist, with a way to raw values."""
         if (
             trusted.unsigned
             or trusted.unverified
@@ -482,7 +482,7 @@ class NodeSupervisor:
         )
 
     def _keep(self, bus: MeasuredBus, trusted: VerifiedSession, standing: NodeStanding) -> None:
-        """Clock every lease / 3 until the end, or until the node is lost, or may not be measured any more."""
+        """Send Clock every third of a lease until the end, or until the node is lost or may no longer be measured."""
         rest = BackgroundReread(self._station, trusted, bus, by=self._request.by) if trusted.kept else None
         try:
             self._watch(bus, trusted, standing, rest)
@@ -582,7 +582,7 @@ class NodeSupervisor:
     # -- telling ---------------------------------------------------------------------------------------------------
 
     def report(self) -> NodeReport:
-        """How the node does now."""
+        """Return the state of the node as it is now."""
         sums = self.streams.summed()
         errors = [totals.clock_error for totals in sums if totals.clock_error is not None]
         return NodeReport(

@@ -91,7 +91,7 @@ class BusShare:
             self.lock.notify_all()
 
     def leave(self, uuid: bytes) -> None:
-        """As :meth:`drop_node`, and what it takes is free."""
+        """Drop the node as :meth:`drop_node` does, and free its share."""
         with self.lock:
             self.taken.pop(uuid, None)
         self.drop_node(uuid)
@@ -120,7 +120,7 @@ class NodePlans:
     slowed: str = ""
 
     def periods(self) -> dict[int, float]:
-        """Seconds between the samples of each channel."""
+        """Return the seconds between the samples of each channel."""
         return {
             number: stream_plan.subscribe.period / 1e9
             for stream_plan in self.streams
@@ -224,7 +224,7 @@ def _groups(channels: Sequence[Channel], rate: float | None, kind: StreamKind | 
 
 
 def _at_the_slowest(paced: _Paced) -> _Paced:
-    """Every channel at the longest period of all; events, which have none, stay as they are."""
+    """Return the channels all at the longest period; events, which have none, are unchanged."""
     slowest = max((period for period, how in paced if how != StreamKind.EVENT), default=0)
     together: _Paced = {}
     for (period, how), members in paced.items():
@@ -244,7 +244,7 @@ def _cut(paced: _Paced) -> list[_Group]:
 
 
 def period_of(channel: Channel, rate: float | None, *, at_most: bool = False) -> int:
-    """Nanoseconds between samples: of the rate, never below the datasheet's SPeriod; whole microseconds if need be."""
+    """Return the ns between samples: of the rate, not below SPeriod; whole microseconds if it has to be."""
     stated = round(channel.period * 1e9) if math.isfinite(channel.period) and channel.period > 0 else 0
     if rate is None:
         return min(stated or UNSTATED, LONGEST)
@@ -287,7 +287,7 @@ def _load(plan: StreamPlan, bus: BusTime) -> float:
 
 
 def _gap(plans: Sequence[StreamPlan], bus: BusTime) -> int | None:
-    """Microseconds between the node's data frames: what spreads them and still lets all leave in time."""
+    """Return the µs between the node's data frames that spread them and let all leave in time, None for none."""
     unit = sum(share(bus.airtime.frames(plan.length), 1, plan.subscribe.n, plan.subscribe.period) for plan in plans)
     if unit > MILLION:
         return None

@@ -41,7 +41,7 @@ class Requirements:
             self._coming.update(uuids)
 
     def drop_node(self, uuid: bytes) -> None:
-        """One that will not show any, after all."""
+        """Drop a node that will not show any requirement after all."""
         with self._turn:
             self._coming.discard(uuid)
             self._turn.notify_all()

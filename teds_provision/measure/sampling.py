@@ -45,7 +45,7 @@ class Sample:
     text: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """As `sample --json` has it."""
+        """Return the object that `sample --json` prints."""
         members = {
             key: getattr(self, key) for key in ("channel", "name", "value", "unit", "raw", "uncertainty", "valid")
         }
@@ -69,7 +69,7 @@ def shown_json(value: float | None, uncertainty: float | None, unit: WrittenUnit
 
 
 def take_samples(trusted: VerifiedSession, numbers: Sequence[int]) -> list[Sample]:
-    """Fresh values of these channels (none: every sensor), taken together as far as one reply holds them."""
+    """Return fresh values of these channels (none: every sensor), sampled together as far as one reply holds them."""
     channels = sensors_of(trusted.sheet.channels, numbers, None)
     interpreters = _interpreters(trusted.sheet, [channel.number for channel in channels])
     clock, wall = ClockMap(), WallClock.now()
@@ -101,7 +101,7 @@ def _moment(clock: ClockMap, wall: WallClock, tick: int) -> float:
 
 
 def _interpreters(sheet: Sheet, asked: Sequence[int]) -> dict[int, ChannelInterpreter]:
-    """Of the asked channels, then of those that their calibration takes as well."""
+    """Return the interpreters of these channels, then of those that their calibration needs."""
     found = {number: ChannelInterpreter(sheet, number) for number in asked}
     more = {other for interpreter in found.values() for other in interpreter.others}
     known = {channel.number for channel in sheet.channels}

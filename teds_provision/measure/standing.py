@@ -67,7 +67,7 @@ def why_not_measured(station: Station, uuid: bytes) -> str:
 
 
 def require_whitelisted(station: Station, uuid: bytes) -> None:
-    """Actuators move only for nodes on the whitelist (operation.md section 7); raises PolicyError."""
+    """Raise PolicyError unless the node is on the whitelist: only then actuators move (operation.md section 7)."""
     if station.pins.entry(uuid) is None:
         raise PolicyError(
             f"Node {uuid.hex()} is not on the whitelist, so its actuators are not moved.",
@@ -93,7 +93,7 @@ class NodeStanding:
         self.ended: TedsProvisionError | None = None
 
     def require_measurable(self) -> None:
-        """As the function of this name; the error is also kept in ``ended``."""
+        """Check as the function of this name does; the error is also kept in ``ended``."""
         try:
             require_measurable(self._station, self._uuid)
         except (NotAuthenticError, PolicyError) as error:

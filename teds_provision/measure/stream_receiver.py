@@ -124,7 +124,7 @@ class ReceivedStream:
         self.clock.arrival(tick + self._last_instant, at)
 
     def _hand_on(self, messages: list[StreamMessage], blocks: list[Block]) -> None:
-        """Messages whose tag and time are right."""
+        """Pass on messages whose tag and time are right."""
         if messages:
             self.heard = time.monotonic()
         if self._test_pattern:

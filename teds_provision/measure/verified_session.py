@@ -39,7 +39,7 @@ _WORDS: dict[ChannelKind, Kind] = {
 
 
 def facts_of(sheet: Sheet, channel: Channel, *, name: str, fingerprint: str, period: float | None) -> ChannelFacts:
-    """Facts of one channel; ``name`` of the node, ``fingerprint`` of its Security TEDS (64 hex digits).
+    """Return the facts of one channel; ``name`` is the node's, ``fingerprint`` its Security TEDS's (64 hex digits).
 
     Values, limits and uncertainty are in the SI unit of the datasheet; ``period`` in seconds, which events do not have.
     """
@@ -195,7 +195,7 @@ def exchange_clock(node: Conversation, clock: ClockMap) -> ClockReply:
 
 
 def ask_clock(node: Conversation) -> tuple[ClockReply, Exchange]:
-    """One Clock command, for a map that others read meanwhile.
+    """Run one Clock command, for a map that others read meanwhile; return reply and exchange.
 
     What this process took over sealing, opening and waking up is not the link's delay: a link that knows when the first
     copy left and when the reply was whole is believed (operation.md section 5).

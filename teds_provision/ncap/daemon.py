@@ -148,7 +148,7 @@ class Daemon:
 
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
-        """Links, measurements and the eye on the store, for the length of the block; then all let go, in order."""
+        """Run links, measurements and the store's observer for the length of the block; then end them in order."""
         if self.settings.detection is not None and self.settings.detection != self.detection:
             self.set_detection(self.settings.detection)
         self.directory.refresh()
@@ -172,7 +172,7 @@ class Daemon:
             self._end()
 
     def _end(self) -> None:
-        """Actuators safe first, then claims released and files closed, then links, then the virtual nodes."""
+        """End in order: actuators safe, then claims released and files closed, then links, then the virtual nodes."""
         self._stop.set()
         self.updates.stop()
         for part in self.parts.values():
@@ -231,7 +231,7 @@ class Daemon:
         )
 
     def _start_virtuals(self) -> None:
-        """Virtual transducers hang on a bus of their own, which is a link like others."""
+        """Watch the bus of the virtual transducers, which is a link like others, unless it is watched already."""
         with self._guard:
             if all(watch.place != self.virtuals.place for watch in self.watches):
                 watch = self._watch(self.virtuals.place)
@@ -311,7 +311,7 @@ class Daemon:
     # -- what the API asks -------------------------------------------------------------------------------------------
 
     def status(self) -> dict[str, Any]:
-        """api.md, `/status`."""
+        """Return the object of api.md, `/status`."""
         links = [self._link(watch) for watch in self.watches]
         return {
             "version": __version__,
@@ -431,7 +431,7 @@ class Daemon:
     # -- groups ------------------------------------------------------------------------------------------------------
 
     def groups(self) -> list[dict[str, Any]]:
-        """Every group, and whether it is measured."""
+        """Return every group, and whether it is measured."""
         return [
             {
                 "name": group.name,
@@ -448,7 +448,7 @@ class Daemon:
         self._group_changed(name)
 
     def change_group(self, name: str, uuids: list[str]) -> None:
-        """Other members; raises NotFoundError, FrozenError while it is measured."""
+        """Replace the members of a group; raises NotFoundError, and FrozenError while it is measured."""
         wanted = {bytes.fromhex(uuid) for uuid in uuids}
         with self.station.lock("group change"):
             present = set(self.station.groups.get(name).uuids)

@@ -103,7 +103,7 @@ class _Bins:
         return np.array([segment for _, segment in self._starts], np.int64)[at]
 
     def _forget(self, first: int, last: int) -> None:
-        """Empty these bins and those between them."""
+        """Empty the bins from ``first`` to ``last``."""
         slots = np.arange(first, last + 1) % self.size if last - first < self.size else slice(None)
         self._low[slots] = np.nan
         self._high[slots] = 0 if self.coarse else np.nan
@@ -295,13 +295,13 @@ class History:
     # -- what is asked -----------------------------------------------------------------------------------------------
 
     def __len__(self) -> int:
-        """How many channels have a past."""
+        """Return the number of channels with a history."""
         return len(self._channels)
 
     def channel_history(
         self, uuid: str, channel: int, since: float | None = None, until: float | None = None, points: int = 600
     ) -> dict[str, Any]:
-        """At most ``points`` bins of a channel between two moments (unix seconds; None: an hour ago, now).
+        """Return at most ``points`` bins of a channel between two moments (unix seconds; None: an hour ago, now).
 
         ``bin`` is their width in s, ``time`` their beginnings; a bin in which nothing happened is left out. ``low`` and
         ``high`` are SI values, None where none was valid, or raw numbers in a segment that is ``raw`` (no calibration).

@@ -59,7 +59,7 @@ class LiveClient:
         self.dropped = 0
 
     def values(self, text: str) -> None:
-        """Newest wins."""
+        """Replace the values that wait: the newest win."""
         if self._values is not None:
             self._dropped += 1
             self.dropped += 1
@@ -263,7 +263,7 @@ def thinned(
 
 
 def _parted(times: NDArray[Any], values: NDArray[Any], before: float) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Angles with a gap wherever one is more than half a turn from the one before it."""
+    """Return angles with a gap wherever one is more than half a turn from the one before it."""
     if not len(times):
         return times, values
     with np.errstate(invalid="ignore"):

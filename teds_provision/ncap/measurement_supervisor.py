@@ -183,7 +183,7 @@ class MeasurementSupervisor:
             self._consider(running, uuid)
 
     def look_who_is_meant(self) -> None:
-        """Who may be measured, or what an expression names, changed in this process: a group, a key, a datasheet."""
+        """Re-evaluate who may be measured, after this process changed a group, a key or a datasheet."""
         with self._lock:
             for running in self._running.values():
                 running.asked_anew = True
@@ -502,7 +502,7 @@ class MeasurementSupervisor:
         return self._station.datasheets.datasheet(bytes.fromhex(uuid))
 
     def sinks(self) -> list[dict[str, Any]]:
-        """Every sink with what became of what it was given."""
+        """Return every sink with the counts of what it was given."""
         return [sink_json(key, sink) for key, sink in self._open_sinks()]
 
     def _open_sinks(self) -> list[tuple[str, Sink]]:
@@ -510,7 +510,7 @@ class MeasurementSupervisor:
         return [(key, sink) for key, job in jobs for sink in job.sinks]
 
     def budget(self) -> dict[str, Any]:
-        """Messages a second that go to ROS and MQTT now, and how many are known to be carried."""
+        """Return the messages a second that go to ROS and MQTT now, and how many are known to be carried."""
         now, sent = time.monotonic(), sum(sink.stats.messages for _, sink in self._open_sinks() if sink.budgeted)
         before, count = self._messages
         if now - before >= 1.0:
@@ -596,7 +596,7 @@ class MeasurementSupervisor:
             return [running for running in self._running.values() if running.phase is not Phase.OVER]
 
     def _pause(self) -> float | None:
-        """Seconds until the next look, None while nothing runs."""
+        """Return the seconds until the next look, None while nothing runs."""
         pauses = []
         for running in self._active():
             if running.phase is Phase.ENDING or running.membership.arrived:
@@ -837,7 +837,7 @@ class MeasurementSupervisor:
         return self._of(uuid) is not None or uuid in self._loans or self._is_for_another(running, uuid)
 
     def _taken(self, running: RunningMeasurement) -> int:
-        """How many nodes that are meant and there are another measurement's."""
+        """Return how many of its nodes are present and belong to another measurement."""
         with self._lock:
             others = list(running.membership.elsewhere)
         return sum(self._directory.seen(uuid).present and self._is_elsewhere(running, uuid) for uuid in others)

@@ -44,11 +44,11 @@ class Names:
         self._directory.touch()
 
     def topic(self, uuid: str, channel: int) -> str:
-        """Whole topic of a channel."""
+        """Return the whole topic of a channel."""
         return self._topics_of(uuid, self._now()).channel(uuid, channel)
 
     def all(self) -> list[dict[str, Any]]:
-        """Every channel with its topic, and what was chosen for it; channel 0 is the node's part."""
+        """Return every channel with its topic, and the name chosen for it; channel 0 is the node's part."""
         now, chosen = self._now(), self._station.measurements.names
         found = []
         for uuid in self._directory.uuids():
@@ -113,7 +113,7 @@ class Names:
         return topics
 
     def _topics_of(self, uuid: str, now: Topics) -> Topics:
-        """As its running measurement publishes them, else as the next one will."""
+        """Return the topics of a node: those that its running measurement publishes, else those of the next one."""
         facts = self._in_use(uuid)
         if facts is None:
             return now

@@ -77,7 +77,7 @@ def own_source(station_id: str) -> int:
 
 
 def parse_http(text: str) -> tuple[str, int]:
-    """``HOST:PORT``, ``[::1]:PORT`` or ``PORT`` alone (this machine); raises UsageError."""
+    """Parse ``HOST:PORT``, ``[::1]:PORT`` or ``PORT`` alone (this machine); raises UsageError."""
     host, colon, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]") if colon else "127.0.0.1"
     if not port.isdecimal() or int(port) > 0xFFFF or not host:

@@ -51,7 +51,7 @@ class MeasuringHandler(Protocol):
         mtu: int = 23,
         hears: bool = True,
     ) -> bytes:
-        """As NodeHandler.request, for a frame whose last part came by CAN FD or not, at the tick ``received``.
+        """Run a command frame like NodeHandler.request. Its last part came at the tick ``received``, ``fd`` by CAN FD.
 
         ``mtu`` and ``hears`` are those of a BLE connection; see SessionPort.
         """

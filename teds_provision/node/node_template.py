@@ -50,7 +50,7 @@ def from_file(path: Path) -> NodeTemplate:
 
 
 def _placed(path: Path) -> dict[BlockId, bytes]:
-    """TEDS of a file by place, without Security TEDS; a profile is read beside what it extends."""
+    """Return the TEDS of a file by place, without Security TEDS; a profile is read with those that it extends."""
     octets = read_limited(path, LIMITS.teds_file, "file of TEDS")
     try:
         return placed(octets, path=path)

@@ -94,7 +94,7 @@ class _Core:
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        """Inside a command: what is done here holds up nothing that cannot wait."""
+        """Release the lock inside a command, so that the block delays nothing that cannot wait."""
         self._state.release()
         try:
             yield

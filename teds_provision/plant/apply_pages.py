@@ -285,7 +285,7 @@ class _LocalRows(NamedTuple):
         return cls(station.pins.get_many(uuids), station.nodes.get_many(uuids), keys)
 
     def own(self, station: Station, uuid: bytes, hashes: Sequence[tuple[str, str]]) -> LocalState:
-        """``hashes``: H and text of the statements about it."""
+        """Return this station's state of a node; ``hashes`` are H and text of the statements about it."""
         entry, node = self.entries.get(uuid), self.nodes.get(uuid)
         pin, assurance = (entry.fingerprint, entry.assurance) if entry is not None else (None, "")
         if assurance == "registry":
@@ -410,7 +410,7 @@ def _own(station: Station, kid: str) -> bytes | None:
 
 
 def heads_digest(station: Station) -> tuple[str, int]:
-    """First 16 digits of the SHA-256 over the newest page that counts of every chain, and how many chains.
+    """Return 16 digits of the SHA-256 over the newest counted page of every chain, and the number of chains.
 
     Two stations that have all pages have the same one.
     """

@@ -49,7 +49,7 @@ def backlog(station: Station) -> Iterator[PastEvent]:
 
 
 def _handed(station: Station, keys: dict[bytes, KeyRecord]) -> Iterator[PastEvent]:
-    """Keys that left and came, by the handovers that are remembered."""
+    """Yield events of the keys that left and arrived, by the recorded handovers."""
     for row in station.handovers.all():
         notes = BundleNotes.from_json(row.nodes)
         refused = {uuid for uuid, _ in notes.refused}
@@ -69,14 +69,14 @@ def _handed(station: Station, keys: dict[bytes, KeyRecord]) -> Iterator[PastEven
 
 
 def firmware_reports(station: Station) -> Iterator[PastEvent]:
-    """Firmware that nodes reported in a session, as it is kept here."""
+    """Yield events of the firmware that nodes reported in a session, as recorded here."""
     for record in station.firmware_reports.all():
         if (stated := plant_event(record)) is not None:
             yield "firmware", record.uuid, {"runs": stated.members, "at": record.at}
 
 
 def signed_here(station: Station, uuid: bytes) -> Iterator[tuple[int, int, str]]:
-    """Epoch, sequence and digest of every remembered datasheet of a node that verifies under this station's own key."""
+    """Yield epoch, sequence and digest of every recorded datasheet of a node that this station signed."""
     draft = station.datasheets.draft(uuid)
     images: list[Image] = [record.image for record in station.datasheets.history(uuid)]
     images += [draft.image] if draft is not None and draft.stage == "signed" else []
@@ -96,5 +96,5 @@ def signed_here(station: Station, uuid: bytes) -> Iterator[tuple[int, int, str]]
 
 
 def count(events: list[PastEvent]) -> dict[str, int]:
-    """How many events of each act."""
+    """Return the number of events of each act."""
     return dict(Counter(act for act, _, _ in events))

@@ -26,7 +26,7 @@ _AHEAD = timedelta(minutes=5)
 
 @check("registry", "store")
 def registry(system: System) -> Iterator[Finding]:
-    """Roster, last sync, what waits and what is to be decided; nothing for a station that joined none."""
+    """Check roster, last sync, what waits and what is to be decided; nothing for a station that joined none."""
     if not has_store(system.home):
         return
     with Station.inspect(system.home) as station:
@@ -52,7 +52,7 @@ def registry(system: System) -> Iterator[Finding]:
 
 
 def _clocks(roster: Roster, newest: Iterable[tuple[str, str]], now: datetime) -> Iterator[Finding]:
-    """Whose clock is wrong, by the date of each member's newest page.
+    """Check the members' clocks by the date of each one's newest page.
 
     A page from beyond the roster's end was dated by a wrong clock there; a nearer one may mean that this one is slow.
     """

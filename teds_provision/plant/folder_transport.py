@@ -61,7 +61,7 @@ class FolderTransport:
         return found
 
     def pages(self, station: str, after: int) -> Iterator[CarriedPage]:
-        """Every page of a station, ascending, those at or below ``after`` too: one of them may be another history's."""
+        """Yield every page of a station, ascending, those up to ``after`` too: one may be of another history."""
         for n, path in self._numbered(self._folder / station):
             octets = self._read(path, PAGE.most)
             if octets is not None:
@@ -101,7 +101,7 @@ class FolderTransport:
             raise self._failed(error) from error
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no file stays open."""
 
     # -- files -----------------------------------------------------------------------------------------------------
 

@@ -189,5 +189,5 @@ def require_profile(station: Station, job: Job, path: Path) -> None:
 
 
 def digest_of_file(path: Path) -> str:
-    """SHA-256 of a small file, 64 hex digits; raises NotFoundError, BadDataError."""
+    """Return the SHA-256 of a small file, 64 hex digits; raises NotFoundError, BadDataError."""
     return hashlib.sha256(read_limited(path, _MAX_PROFILE_OCTETS, "file")).hexdigest()

@@ -323,7 +323,7 @@ class LineRun:
             self.station.plant.line.put_unit(replace(kept, passed=unit.attempt))
 
     def calibration_digest(self, uuid: bytes) -> str | None:
-        """SHA-256 of the calibration file that a board got, None for none."""
+        """Return the SHA-256 of the calibration file that a board got, None for none."""
         return self._digests.get(uuid)
 
 

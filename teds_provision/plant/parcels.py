@@ -192,7 +192,7 @@ class _Reader:
         return later
 
     def _unproven_of(self, sender: str, page: Sequence[bytes]) -> dict[bytes, list[str]]:
-        """Keys that came from this sender and were never proven, by node."""
+        """Return the keys that came from this sender and were never proven, by node."""
         held: dict[bytes, list[str]] = {}
         for key in self.station.keys.get_many(page):
             if key.state == "pending" and key.source == "import":
@@ -289,7 +289,7 @@ class _Reader:
 
 
 def _inner(octets: bytes, station: Station) -> tuple[str, bytes]:
-    """``typ`` and octets of what is sealed in a small parcel; "" for bundles and what is not sealed."""
+    """Return ``typ`` and octets of what a small parcel seals; "" for a bundle and for what is not sealed."""
     if not octets.startswith(b"{") or len(octets) > SMALL:
         return "", b""
     inner = jose.decrypt(octets, station.vault.identity(), cty=CONTENT_TYPE, max_octets=SMALL)
@@ -351,7 +351,7 @@ def send_out(station: Station, transport: Transport, views: Views, now: datetime
 
 
 def waiting_out(station: Station) -> int:
-    """How many parcels were made and not receipted."""
+    """Return how many parcels were made and not receipted."""
     return sum(row.kind != "receipt" for row in station.plant.parcels.all("out", "ready", "sent"))
 
 
@@ -441,7 +441,7 @@ def _make_copies(station: Station, roster: Roster, views: Views, now: datetime) 
 def _due(
     station: Station, roster: Roster, views: Views, receiver: str, quiet: set[str]
 ) -> tuple[list[bytes], list[bytes]]:
-    """Nodes of which a receiver gets a copy from here; those that stations do not agree on apart."""
+    """Return the nodes of which a receiver gets a copy from here, and apart those that stations disagree about."""
     me, parcels = station.fingerprint, station.plant.parcels
     shares = [share for share in roster.share if receiver in sharing.receivers(roster, me, share)]
     clear: list[bytes] = []
@@ -486,7 +486,7 @@ def _delete(station: Station, uuid: bytes, epoch: int) -> None:
 
 
 def silent_stations(station: Station, roster: Roster, now: datetime) -> set[str]:
-    """Members, but this one, of which no page came that was made within the last seven days."""
+    """Return the other members that made no page within the last seven days, by the pages that arrived."""
     created = dict[str, datetime | None]()
     for digits, seen in station.plant.pages.chains().items():
         if roster.member(digits) is not None and digits != station.fingerprint:

@@ -251,7 +251,7 @@ class Registry:
         )
 
     def pages(self, after: Mapping[str, int]) -> Iterator[tuple[str, int, bytes]]:
-        """Pages of these stations above these numbers, ascending: station, number in the database, octets."""
+        """Yield pages of these stations above these numbers, ascending: station, number in the database, octets."""
         for station, n in after.items():
             last, more = n, True
             while more:

@@ -179,7 +179,7 @@ def _why_due(
 
 
 def _beyond(station: Station, roster: Roster) -> dict[tuple[bytes, int, str], set[str]]:
-    """Keys (UUID, epoch, key id) that who left names on pages that do not count: later ones, and another history's."""
+    """Return keys (UUID, epoch, key id) on uncounted pages of removed members: later pages, or another history."""
     found: dict[tuple[bytes, int, str], set[str]] = {}
     for removed in roster.removed:
         chain = station.plant.pages.chains().get(removed.fingerprint)
@@ -199,7 +199,7 @@ def _beyond(station: Station, roster: Roster) -> dict[tuple[bytes, int, str], se
 
 
 def _first_removals(station: Station) -> dict[str, datetime]:
-    """Since when the removal of each station that left is known here."""
+    """Return since when this station knows of each removal."""
     since: dict[str, datetime] = {}
     for row in station.plant.rosters():
         for fingerprint in _removed_in(row.octets, station.ca):

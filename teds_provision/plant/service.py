@@ -177,7 +177,7 @@ class PlantWatch:
         return {"nodes": first[:MOST_SHOWN], "more": len(first) > MOST_SHOWN}
 
     def jobs(self) -> list[dict[str, Any]]:
-        """api.md, `/jobs`."""
+        """Return the object of api.md, `/jobs`."""
         found = []
         for row in self._station.plant.line.jobs():
             with suppress(NotAuthenticError):  # of a keeper that no roster names any more

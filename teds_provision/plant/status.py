@@ -67,7 +67,7 @@ class PlantStatus:
 
 
 def moment(roster: Roster) -> datetime:
-    """Now, and never before the roster was made: a clock that was put back changes nothing."""
+    """Return the present time, but none before the roster was made: a clock that was put back changes nothing."""
     return max(now(), roster.created)
 
 

@@ -67,7 +67,7 @@ class SyncResult:
 
 @contextmanager
 def alone(station: Station) -> Iterator[None]:
-    """One sync at a time in a home: a second waits 10 s, then StoreLockedError."""
+    """Hold the lock of one sync per home for the block: a second one waits 10 s, then StoreLockedError."""
     lock = StoreLock(station.home, command="registry sync", notice=station.notice, file=LOCK_FILE)
     with lock:
         yield
@@ -280,7 +280,7 @@ def take_back(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
 
 
 def _know_again(station: Station, page: Page) -> None:
-    """Epochs, sequences and units that this station gave before it was put back: none of them is given out twice."""
+    """Restore epochs, sequences and units that this station gave before it was put back: none is given twice."""
     reached: dict[bytes, tuple[int, int]] = {}
     signed: set[bytes] = set()
     for event_read in map(event.read, page.events):

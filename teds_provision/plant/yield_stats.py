@@ -76,7 +76,7 @@ class StationYield:
         return round(self.first / self.reported, 4) if self.reported else None
 
     def to_json(self) -> dict[str, Any]:
-        """One station of ``job status``."""
+        """Return one station of ``job status``."""
         steps = {name: {"median": middle, "worst": worst} for name, (middle, worst) in self.steps.items()}
         members: dict[str, Any] = {
             "station": self.station,
@@ -92,7 +92,7 @@ class StationYield:
 
 
 def attempts_of(station: Station, job: str, files: Iterable[bytes] = ()) -> list[Attempt]:
-    """Every attempt that is known of a job: own evidence, evidence of others (``files``), and the pages of others.
+    """Return every known attempt of a job: own evidence, evidence of others (``files``), and the pages of others.
 
     A file that is no evidence of this job raises BadDataError, or is passed over.
     """
@@ -169,7 +169,7 @@ def yield_stats(station: Station, job: Job, attempts: Iterable[Attempt]) -> list
 
 
 def to_csv(station: Station, attempts: Iterable[Attempt]) -> str:
-    """Every attempt as a line of CSV."""
+    """Return every attempt as a row of CSV."""
     roster = station.plant.roster
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

@@ -36,7 +36,7 @@ _VERSION: Final = 1
 
 
 def uuid_crc(uuid: bytes) -> int:
-    """CRC-32 (IEEE 802.3) of a UUID."""
+    """Return the CRC-32 (IEEE 802.3) of a UUID."""
     return zlib.crc32(uuid)
 
 
@@ -170,7 +170,7 @@ class AddressClaim:
         self._move_due = None
 
     def due(self, now: float) -> float | None:
-        """Monotonic time at which the next Announce is to leave, None for none.
+        """Return the monotonic time at which the next Announce is due, None for none.
 
         One beyond the twenty of a minute is left out.
         """

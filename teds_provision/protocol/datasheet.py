@@ -35,7 +35,7 @@ def can_be_stored(block: BlockId) -> bool:
 
 
 def digests(blocks: Mapping[BlockId, bytes]) -> dict[BlockId, bytes]:
-    """SHA-256 of every TEDS (Length to Checksum inclusive), the Security TEDS left out."""
+    """Return the SHA-256 of every TEDS (Length to Checksum inclusive) except the Security TEDS."""
     return {key: hashlib.sha256(teds).digest() for key, teds in blocks.items() if key != (0, AccessCode.SECURITY)}
 
 
@@ -60,7 +60,7 @@ def sign_datasheet(teds: SecurityTeds, uuid: bytes, credentials: Credentials) ->
 
 
 def passes_own_check(block: BlockId, teds: bytes) -> bool:
-    """Length and Checksum are right and the TEDSID's class is the access code."""
+    """Return True if Length and Checksum are right and the TEDSID's class is the access code."""
     try:
         return frame.teds_class(frame.unframe(teds)) == block[1]
     except BadDataError:
@@ -109,7 +109,7 @@ def signs(teds: SecurityTeds, message: bytes) -> bool:
 
 @lru_cache(maxsize=16)
 def _signed(station: bytes, message: bytes, signature: bytes) -> bool:
-    """Of what was just read and of what is kept, which are the same as a rule: checked once."""
+    """Verify a signature once: what was just read and what is stored are usually the same."""
     return verify(station, message, signature)
 
 

@@ -58,12 +58,12 @@ class Flash:
         return self.security_teds() if block == SECURITY else self.blocks.get(block)
 
     def present(self) -> list[BlockId]:
-        """Every TEDS on the node, ascending."""
+        """Return every TEDS on the node, ascending."""
         return sorted({*self.blocks, SECURITY})
 
 
 def in_factory_state(flash: Flash) -> Flash:
-    """No key, no CA, no station, initial Security TEDS; identity, epoch, sequence, address and other TEDS stay."""
+    """Return the flash without key, CA and station, with an initial Security TEDS; all else is unchanged."""
     blocks = {block: teds for block, teds in flash.blocks.items() if block != SECURITY}
     return replace(flash, key=None, ca=None, station=None, provisioned=False, blocks=blocks)
 

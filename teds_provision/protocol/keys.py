@@ -31,7 +31,7 @@ class PrivateKey(Protocol):
         """P(x): the uncompressed SEC 1 point of the public key, 65 octets."""
 
     def sign(self, message: bytes) -> bytes:
-        """SIG(key, message): ECDSA with SHA-256, r ‖ s, 64 octets, s in the lower half of the group order."""
+        """Return SIG(key, message): ECDSA with SHA-256, r ‖ s, 64 octets, s in the lower half of the group order."""
 
     def sign_digest(self, digest: bytes) -> bytes:
         """Return the same signature, of a message whose SHA-256 the caller made piece by piece."""
@@ -74,17 +74,17 @@ class SoftwareKey:
         return self._key.private_numbers().private_value.to_bytes(32, "big")
 
     def sign(self, message: bytes) -> bytes:
-        """SIG(key, message), see :class:`PrivateKey`."""
+        """Return SIG(key, message), see :class:`PrivateKey`."""
         der = self._key.sign(message, ec.ECDSA(hashes.SHA256(), deterministic_signing=True))
         return raw_signature(der)
 
     def sign_digest(self, digest: bytes) -> bytes:
-        """SIG(key, message) by its SHA-256, see :class:`PrivateKey`."""
+        """Return SIG(key, message) of the message's SHA-256, see :class:`PrivateKey`."""
         der = self._key.sign(digest, ec.ECDSA(utils.Prehashed(hashes.SHA256()), deterministic_signing=True))
         return raw_signature(der)
 
     def ecdh(self, peer: bytes) -> bytes:
-        """x-coordinate of the ECDH, see :class:`PrivateKey`."""
+        """Return the x-coordinate of the ECDH, see :class:`PrivateKey`."""
         return self._key.exchange(ec.ECDH(), public_key(peer))
 
     def __repr__(self) -> str:
@@ -147,7 +147,7 @@ def verify(point: bytes, message: bytes, signature: bytes) -> bool:
 
 
 def fingerprint(point: bytes) -> str:
-    """SHA-256(P(x)), 64 hex digits; people are shown the first 16."""
+    """Return SHA-256(P(x)), 64 hex digits; people see the first 16."""
     return hashlib.sha256(point).hexdigest()
 
 
@@ -160,13 +160,13 @@ def other_key(pinned: str, node: bytes) -> KeyMismatchError:
 
 
 def to_pem(point: bytes) -> str:
-    """SubjectPublicKeyInfo PEM of a point."""
+    """Return a point as SubjectPublicKeyInfo in PEM."""
     form = serialization.PublicFormat.SubjectPublicKeyInfo
     return public_key(point).public_bytes(serialization.Encoding.PEM, form).decode()
 
 
 def from_pem(text: bytes) -> bytes:
-    """Point (65 octets) of a P-256 public key in PEM; raises BadDataError, by name for private and foreign keys."""
+    """Return the point (65 octets) of a P-256 public key in PEM; raises BadDataError, which names private keys."""
     if b"PRIVATE KEY" in text:
         raise BadDataError("This file holds a private key where a public one belongs.")
     try:

@@ -43,5 +43,5 @@ class Repetition:
         self._at = now
 
     def forget(self) -> None:
-        """Loss of the field or link, bus-off or restart."""
+        """Forget the stored reply, after loss of the field or link, bus-off or restart."""
         self._request, self._reply = None, b""

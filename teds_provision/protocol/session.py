@@ -30,7 +30,7 @@ OneTime = Callable[[], PrivateKey]
 
 
 def pad(octets: bytes) -> bytes:
-    """PKCS #7 padding to 16 octets (RFC 5652 section 6.3)."""
+    """Return the octets with PKCS #7 padding to 16 octets (RFC 5652 section 6.3)."""
     count = BLOCK_OCTETS - len(octets) % BLOCK_OCTETS
     return octets + bytes([count]) * count
 
@@ -63,7 +63,7 @@ class SessionKeys:
 
     @classmethod
     def derive(cls, key: bytes, uuid: bytes, shared: bytes, station: bytes, node: bytes) -> SessionKeys:
-        """HKDF-SHA-256(Z, salt = K, info = "TEDS1 session" ‖ 00 ‖ UUID ‖ Es ‖ En, 96 octets); ``shared`` is Z."""
+        """Derive HKDF-SHA-256(Z, salt K, info "TEDS1 session" ‖ 00 ‖ UUID ‖ Es ‖ En, 96 octets); ``shared`` is Z."""
         okm = hkdf.HKDF(hashes.SHA256(), 96, key, b"TEDS1 session\0" + uuid + station + node).derive(shared)
         tag = hmac.digest(okm[32:64], b"node open" + key_id(key) + station + node, "sha256")
         return cls(okm[:16], okm[16:32], okm[64:], tag[:TAG_OCTETS])

@@ -76,7 +76,7 @@ def key_id(key: bytes) -> bytes:
 def transcript(
     request: bytes, nonce: bytes, epoch: int, one_time: bytes, uuid: bytes, node: bytes, teds: bytes
 ) -> bytes:
-    """T: SHA-256 over the label, the request payload, nonceN, epoch, En, UUID, P(node) and the hash of the TEDS.
+    """Return T: SHA-256 over label, request payload, nonceN, epoch, En, UUID, P(node) and the hash of the TEDS.
 
     ``one_time`` is En, 65 octets; ``teds`` the node's Security TEDS as it is when Request is run, Length to Checksum.
     """
@@ -232,7 +232,7 @@ class NodeAgreement:
 
 
 def good_point(point: bytes, own: bytes) -> bool:
-    """Strict decoding of a point: on the curve, not infinity, not one's own."""
+    """Return True if a point decodes strictly: on the curve, not infinity, not one's own."""
     return point != own and is_point(point)
 
 

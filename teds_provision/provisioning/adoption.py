@@ -101,7 +101,7 @@ def read_factory_datasheet(station: Station, image: Image, *, name: str | None =
 
 
 def _wrong_with(sheet: Sheet, blocks: Mapping[BlockId, bytes]) -> tuple[list[str], list[str]]:
-    """Errors and warnings of a datasheet that can be signed: of its TEDS, its channels, its calibrations."""
+    """Return errors and warnings of a datasheet that can be signed: of its TEDS, channels and calibrations."""
     errors = [f"{name_of(finding.access_code)}: {finding.message}" for finding in sheet.errors]
     warnings = [
         f"{name_of(finding.access_code)}: {finding.message}"
@@ -156,7 +156,7 @@ def _refused(uuid: str, why: str) -> BadDataError:
 
 
 def _strange_texts(block: BlockId, octets: bytes) -> Iterator[str]:
-    """Why a name or text is none that people, topics and terminals may be shown."""
+    """Yield why a name or text must not be shown to people, topics and terminals."""
     decoded = decode(octets)
     where = f"{decoded.name} of channel {block[0]}" if block[0] else decoded.name
     for field in _leaves(decoded.fields):

@@ -197,7 +197,7 @@ class BatchRun:
     # -- many ------------------------------------------------------------------------------------------------------
 
     def __len__(self) -> int:
-        """How many boards the sheet has, or the job; 0 without one."""
+        """Return the number of boards of the sheet or of the job, 0 without either."""
         if self.progress is not None:
             return len(self.progress.rows)
         return self.line.total if self.line is not None else 0
@@ -331,7 +331,7 @@ class BatchRun:
             port.close()
 
     def _on_the_bus(self, port: Port) -> tuple[list[Contact], list[Contact]]:
-        """All that answer, and those of them that are meant."""
+        """Return the nodes that answer, and those of them that are to be provisioned."""
         if not port.capabilities.many:
             raise UsageError(
                 "--all needs a bus: a reader sees one node at a time.",
@@ -460,7 +460,7 @@ class BatchRun:
     # -- both ------------------------------------------------------------------------------------------------------
 
     def _lacks_calibration(self, uuid: bytes, image: Image) -> PolicyError | None:
-        """Why this board is not finished although its datasheet is authentic: its type requires a calibration."""
+        """Return an error if the datasheet is authentic but the board's type requires a calibration, else None."""
         record = self._station.nodes.get(uuid)
         profile = self.prepared.profile
         if profile is None and record is not None and record.profile:

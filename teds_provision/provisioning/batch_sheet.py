@@ -114,7 +114,7 @@ class BatchTotals:
 
 
 def worse(one: TedsProvisionError | None, other: TedsProvisionError | None) -> TedsProvisionError | None:
-    """Whichever a person should hear of first: not authentic, then refused, then the rest."""
+    """Return the error that a person should see first: not authentic, then refused, then the rest."""
     if one is None or other is None:
         return one or other
     return max(one, other, key=_weight)
@@ -215,7 +215,7 @@ def read_sheet(station: Station, path: Path, order: BuildOrder) -> BatchSheet:
 
 
 def _numbers(numbers: Sequence[int]) -> str:
-    """``2, 9, 16``; of many the first few, and how many more."""
+    """Return ``2, 9, 16``; of many numbers the first few, and how many more."""
     more = f" and {len(numbers) - _SHOWN} more" if len(numbers) > _SHOWN else ""
     return f"{', '.join(map(str, numbers[:_SHOWN]))}{more}"
 
@@ -592,7 +592,7 @@ class Progress:
 
 
 def mean_steps(all_steps: list[dict[str, float]]) -> dict[str, float]:
-    """Mean seconds of each step."""
+    """Return the mean seconds of each step."""
     names = list(dict.fromkeys(name for steps in all_steps for name in steps))
     return {name: round(sum(steps.get(name, 0.0) for steps in all_steps) / len(all_steps), 4) for name in names}
 

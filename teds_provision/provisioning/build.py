@@ -640,7 +640,7 @@ def _composed(
     named: bool,
     resume: bool = True,
 ) -> Proposal:
-    """Everything by profile; ``resume``: with the calibration of a run that never came to write."""
+    """Compose all TEDS by profile; ``resume``: with the calibration of a run that stopped before the write."""
     uuid, has = present.image.uuid, present.image
     pending = pending_image(station, uuid, has) if resume else None
     source = station.datasheets.draft(uuid) if pending is not None else station.nodes.get(uuid)

@@ -75,7 +75,7 @@ def merged(warnings: Sequence[str]) -> tuple[str, ...]:
 
 
 def _of_channel(text: str) -> tuple[str, int | None, str]:
-    """``Channel 3 (force): x`` → ("Channel", 3, ": x"); the name of the channel counts for nothing."""
+    """Split ``Channel 3 (force): x`` into ("Channel", 3, ": x"); the name of the channel does not matter."""
     head, _, rest = text.partition(" ")
     digits = len(rest) - len(rest.lstrip("0123456789"))
     if head.lower() != "channel" or not digits:

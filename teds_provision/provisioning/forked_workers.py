@@ -96,7 +96,7 @@ def _fork_workers(forked: list[_Worker], count: int, work: Callable[[range], obj
 
 
 def _serve(line: socket.socket, of_the_parent: Sequence[socket.socket], work: Callable[[range], object]) -> NoReturn:
-    """In the forked process: work on range after range until the parent closes the line."""
+    """Work on range after range in the forked process, until the parent closes the socket."""
     try:
         for end in of_the_parent:  # held open here, it would keep its worker waiting after the parent's death
             end.close()

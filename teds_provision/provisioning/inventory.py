@@ -136,7 +136,7 @@ class NodeFit:
     fit: Fit
 
     def to_json(self) -> dict[str, object]:
-        """One entry of ``fits``."""
+        """Return one entry of ``fits``."""
         return {
             "uuid": self.uuid.hex(),
             "channel": self.fit.channel,

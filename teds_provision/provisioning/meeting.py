@@ -326,7 +326,7 @@ class IdleStop(threading.Event):
         self._asked = True
 
     def renew(self) -> None:
-        """Something happened: wait the whole time again."""
+        """Wait the whole time again: something happened."""
         self._until = None if self._seconds is None else time.monotonic() + self._seconds
 
     @contextmanager

@@ -44,10 +44,10 @@ class Reporter(Protocol):
         """Report a step that ended well."""
 
     def notice(self, notice: Notice) -> None:
-        """Something is waited for, or came by."""
+        """Report that the run waits for something, or that something arrived."""
 
     def written(self, octets: int, total: int) -> None:
-        """So many octets of the datasheet are staged."""
+        """Report how many octets of the datasheet are staged."""
 
 
 class SilentReporter:
@@ -81,11 +81,11 @@ class NodeReporter:
         self._inner.finished(replace(step, of=self._label))
 
     def notice(self, notice: Notice) -> None:
-        """Something of this node is waited for, or came by."""
+        """Report that this node's run waits for something, or that something arrived."""
         self._inner.notice(replace(notice, text=f"{self._label}: {notice.text}"))
 
     def written(self, octets: int, total: int) -> None:
-        """So many octets of its datasheet are staged."""
+        """Report how many octets of its datasheet are staged."""
         self._inner.written(octets, total)
 
 

@@ -266,7 +266,7 @@ class _Run:
         return done
 
     def keyed(self) -> IdentifiedNode:
-        """Only identify, whitelist and agree."""
+        """Run only identify, whitelist and agree, and return the node."""
         who = self._identify()
         self._agree(who, self._whitelist(who))
         return who
@@ -344,7 +344,7 @@ class _Run:
         return named_for(self.station, who.uuid, prepared, keep=True)
 
     def _whitelist(self, who: IdentifiedNode) -> WhitelistEntry | None:
-        """None for a node that is whitelisted; else its entry, which the key agreement makes durable with the key.
+        """Return the node's whitelist entry to be made durable with the key, None if it is whitelisted.
 
         Until then the step is open: it is reported as done by :meth:`_agree`, once the entry is kept.
         """

@@ -64,7 +64,7 @@ def keep_read(
     more: Sequence[Check] = (),
     profile: str | None = None,
 ) -> NodeVerdict:
-    """As :func:`keep`, of what was read in the session of this ``c``, None for what was read in none."""
+    """Keep as :func:`keep` does; ``c`` is the counter of the session in which it was read, None for none."""
     row, judged = judge_reading(station, image, c, by=by, known=known, more=more)
     keep_judged(station, row, judged, image, profile)
     return judged
@@ -148,7 +148,7 @@ def is_keyed(station: Station, uuid: bytes) -> bool:
 
 
 def verdicts_of(station: Station, uuids: Sequence[bytes], keyed: Iterable[bytes]) -> dict[bytes, NodeVerdict]:
-    """As :func:`verdict_of`, of a page of nodes; ``keyed`` are those of which a key is held."""
+    """Return the verdicts of a chunk of nodes as :func:`verdict_of` does; ``keyed`` are those whose key is held."""
     rows = [row for row in station.datasheets.readings_of(uuids).values() if row.is_datasheet]
     if not rows:
         return {}

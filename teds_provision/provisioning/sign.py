@@ -368,7 +368,7 @@ def _keep(station: Station, order: SignOrder, signed: SignResult, draft: Draft |
 
 
 def _sequence_of(has: Image | None) -> int:
-    """Sequence of the datasheet that the node was last read to have."""
+    """Return the sequence of the datasheet that the node was last read to have."""
     octets = has.blocks.get(SECURITY) if has is not None else None
     return security.decode(octets).sequence if octets is not None else 0
 

@@ -42,13 +42,13 @@ class TrustLookup(Protocol):
     """Whose signatures count, and who is denied."""
 
     def revocation(self, uuid: bytes) -> RevocationRecord | None:
-        """Why a node is denied, None if it is not."""
+        """Return why a node is denied, None if it is not."""
 
     def trusted_cas(self, uuid: bytes | None = None) -> list[bytes]:
-        """CA keys that count for a node."""
+        """Return the CA keys that count for a node."""
 
     def trusted_stations(self) -> list[bytes]:
-        """Station keys that count."""
+        """Return the station keys that count."""
 
     def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> SignerVerdict | None:
         """Return the plant's verdict on the signer of this digest; None if it does not apply."""
@@ -131,7 +131,7 @@ def snapshot_trust(station: Station) -> StationSnapshot:
 
 
 def snapshot_trust_of(station: Station, uuids: Sequence[bytes]) -> StationSnapshot:
-    """As :func:`snapshot_trust`, of what is asked for a page of nodes alone: a list of 100,000 is never held whole."""
+    """Return :func:`snapshot_trust` restricted to a chunk of nodes, to limit memory."""
     entries = station.pins.get_many(uuids)
     return StationSnapshot(
         station.point,
@@ -147,7 +147,7 @@ def snapshot_trust_of(station: Station, uuids: Sequence[bytes]) -> StationSnapsh
 
 
 def _counting(station: Station, cas: Mapping[bytes, bytes]) -> dict[bytes, bytes]:
-    """Those of the CAs that nodes keep in which trust was not ended; a CA is asked about once."""
+    """Return those of the nodes' CAs in which trust has not ended; each CA is looked up once."""
     counts = {ca: station.policy.counts(ca) for ca in set(cas.values())}
     return {uuid: ca for uuid, ca in cas.items() if counts[ca]}
 
@@ -261,7 +261,7 @@ class Signers(NamedTuple):
 
     @classmethod
     def from_security_teds(cls, shown: SecurityTeds | NotCanonicalError | None) -> Signers:
-        """Those of a Security TEDS that was read; none of one that is absent or not of this profile."""
+        """Return the signers of a Security TEDS; none if it is absent or not of this profile."""
         if not isinstance(shown, SecurityTeds):
             return cls()
         signed = (shown.station_key, shown.station_key_signature) if shown.signed else (None, None)
@@ -289,7 +289,7 @@ _CHECKED: Final[deque[tuple[Image, tuple[_Shown, tuple[Check, ...]]]]] = deque(m
 def judge(
     station: TrustSource, uuid: bytes, octets: Iterable[Check], signers: Signers, security_teds: bytes | None
 ) -> list[Check]:
-    """All checks of a datasheet: those of its ``octets``, and those of today's pins, bans and trust.
+    """Return all checks of a datasheet: those of its ``octets``, and those of today's pins, bans and trust.
 
     ``security_teds``: the TEDS itself or its SHA-256, by which the plant's stations name what they signed.
     """

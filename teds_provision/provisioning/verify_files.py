@@ -45,7 +45,7 @@ class FileVerdict:
         return self.verified.verdict if self.verified is not None else "unreadable"
 
     def to_json(self) -> dict[str, object]:
-        """One line of the result."""
+        """Return one object of the result."""
         judged = _UNREADABLE if self.verified is None else self.verified.to_json()
         out = {"file": str(self.path), **judged, "warnings": list(self.warnings)}
         if self.error is not None:

@@ -296,7 +296,7 @@ def _is_entry_text(element: _Element, text: str, root: bool) -> bool:
 
 
 def _parts(text: str) -> list[str]:
-    """Several whole UUIDs in one text, or the one text as it is."""
+    """Split a text of several whole UUIDs; any other text is returned whole."""
     words = re.split(r"[\s,;]+", text.strip())
     whole = all(len(uuid_of_eui64(word).lower().removeprefix("0x")) == _UUID_DIGITS for word in words)
     return words if whole else [text]
@@ -492,7 +492,7 @@ def is_pinned(station: Station, uuid: bytes) -> bool:
 
 
 def as_dict(entry: WhitelistEntry) -> dict[str, Any]:
-    """One entry as the command-line contract shows it."""
+    """Return one entry as the command-line contract shows it."""
     return {
         "uuid": entry.uuid.hex(),
         "fingerprint": entry.fingerprint,

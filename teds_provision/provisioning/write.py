@@ -187,7 +187,7 @@ def _conclude(
 
 
 def _again(station: Station, uuid: bytes) -> str:
-    """How this station gets the image signed against the node as it is now."""
+    """Return how this station gets the image signed for the node as it is now."""
     roster = station.plant.roster
     if roster is not None and not roster.has(station.fingerprint, "sign"):
         return f"Have it signed again: teds-provision sign {uuid.hex()} --by OFFICE --job ID"
@@ -246,7 +246,7 @@ def _stage_and_commit(
 
 
 def _blocks_there(station: Station, image: Image, has: Image | None) -> set[BlockId]:
-    """Blocks that need not be sent; the Security TEDS is always sent, for it is what is committed."""
+    """Return the blocks that need not be sent; the Security TEDS is always sent, as it is what is committed."""
     has = has or station.datasheets.datasheet(image.uuid)
     if has is None:
         return set()
@@ -254,7 +254,7 @@ def _blocks_there(station: Station, image: Image, has: Image | None) -> set[Bloc
 
 
 def _is_there(node: Conversation, image: Image) -> bool:
-    """In a new session: whether the commit happened, and only its reply was lost."""
+    """Return True, in a new session, if the commit happened and only its reply was lost."""
     node.reopen()
     return read_block(node, SECURITY) == image.security
 

@@ -39,7 +39,7 @@ class Check(NamedTuple):  # a tuple: thirteen of them for each of ten thousand f
     kept: bool = False
 
     def to_json(self) -> CheckMembers:
-        """As `verify --json` and the API have it; a kept one has ``from: kept`` besides."""
+        """Return the check as `verify --json` and the API have it; a stored one has also ``from: kept``."""
         found = CheckMembers(name=self.name, result=self.result, why=self.why)
         return found | {"from": "kept"} if self.kept else found  # type: ignore[return-value]
 
@@ -89,7 +89,7 @@ class NodeVerdict:
     by: str
 
     def to_json(self) -> VerdictMembers:
-        """api.md, ``verdict``."""
+        """Return the object of api.md, ``verdict``."""
         checks = [check.to_json() for check in self.verified.checks]
         return {"verdict": self.verified.verdict, "checks": checks, "from": self.origin, "at": self.at, "by": self.by}
 

@@ -138,7 +138,7 @@ class KnownFirmware:
     changed: bool = False
 
     def to_json(self) -> dict[str, Any]:
-        """``firmware`` as commands print it."""
+        """Return ``firmware`` as commands print it."""
         report = self.reading.report
         return {
             "text": None if report is None else report.text,

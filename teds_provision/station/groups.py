@@ -59,7 +59,7 @@ class Groups:
         return [Group(name, tuple(uuids), created) for (name, created), uuids in found.items()]
 
     def get(self, name: str) -> Group:
-        """One group; raises NotFoundError."""
+        """Return one group; raises NotFoundError."""
         found = self.find(name)
         if found is None:
             known = [group.name for group in self.all()]

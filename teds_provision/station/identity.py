@@ -204,7 +204,7 @@ class StationIdentity:
         return ca.sign(keys.station_key_message(point))
 
     def certificate(self, ca: bytes, point: bytes) -> bytes | None:
-        """SIG104 of ``ca`` over a station's key as far as it is known here."""
+        """Return SIG104 of ``ca`` over a station's key if it is known here, else None."""
         return self._certificate(self._facts, ca, point)
 
     def _certificate(self, facts: StationRecord, ca: bytes, point: bytes) -> bytes | None:

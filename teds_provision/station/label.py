@@ -77,7 +77,7 @@ def label_of(station: Station, uuid: bytes) -> Label:
 
 
 def read_label(text: str) -> tuple[bytes, str] | None:
-    """UUID and fingerprint of what a scanner typed, whatever became of the separators; None for anything else."""
+    """Parse a scanned label into UUID and fingerprint, whatever became of the separators; None for other text."""
     text = text.strip()
     if len(text) != _LENGTH:
         return None
@@ -92,7 +92,7 @@ def read_label(text: str) -> tuple[bytes, str] | None:
 
 
 def _table(layout: str, letters: str) -> dict[int, str]:
-    """From what a layout types back to the keys of a US keyboard, with and without Shift."""
+    """Return the table from what a layout types to the keys of a US keyboard, with and without Shift."""
     table = dict(zip(letters, _KEYS, strict=True))
     small = [letter.translate(_LOWER).lower() for letter in letters]  # one by one: the last sigma of a word is another
     table |= dict(zip(small, _KEYS, strict=True))

@@ -79,7 +79,7 @@ class Measurements:
         return not measurement.lasting and not OwnerLock(self._home, measurement.id).is_taken
 
     def get(self, measurement_id: str) -> KeptMeasurement:
-        """One of them; raises NotFoundError."""
+        """Return one measurement; raises NotFoundError."""
         statement = f"SELECT {_COLUMNS} FROM measurements WHERE id = ?"
         found = self._store.read_one(_measurement, statement, (measurement_id,))
         if found is None:

@@ -111,7 +111,7 @@ class NodeKeys:
         return bool(self.keys_of(uuid))
 
     def unwrapped(self, uuid: bytes) -> Iterator[NodeKey]:
-        """Every key held for a node, in the order of trying: newest pending first, the active one last.
+        """Yield every key held for a node in the order of trying: newest pending first, the active one last.
 
         One that cannot be unwrapped does not hide the others; VaultError comes after the last.
         """
@@ -129,7 +129,7 @@ class NodeKeys:
             raise damaged
 
     def active_epoch(self, uuid: bytes) -> int:
-        """Epoch of the current (active) key of a node, 0 for none."""
+        """Return the epoch of the active key of a node, 0 for none."""
         return next((record.epoch for record in self.keys_of(uuid) if record.state == "active"), 0)
 
     def get_many(self, uuids: Sequence[bytes]) -> list[KeyRecord]:
@@ -322,7 +322,7 @@ class NodeKeys:
     # -- the CA that a node keeps ----------------------------------------------------------------------------------
 
     def ca_of(self, uuid: bytes) -> bytes:
-        """P(CA) that a node keeps: the owner's, or that of the bundle in which the node's key came."""
+        """Return P(CA) that a node keeps: the owner's, or that of the bundle that brought its key."""
         flags = self._flags(uuid)
         if flags.ca is None:
             return self._identity.ca
@@ -330,11 +330,11 @@ class NodeKeys:
         return flags.ca
 
     def cas_of_nodes(self) -> dict[bytes, bytes]:
-        """P(CA) of every node that keeps another CA than the owner's."""
+        """Return P(CA) of every node that keeps another CA than the owner's."""
         return self._checked_cas(self.all_flags())
 
     def cas_among(self, uuids: Sequence[bytes]) -> dict[bytes, bytes]:
-        """P(CA) of those of a chunk of nodes that keep another CA than the owner's."""
+        """Return P(CA) of those of a chunk of nodes that keep another CA than the owner's."""
         return self._checked_cas(self._flags_of(uuids))
 
     def _checked_cas(self, flagged: Mapping[bytes, KeyFlags]) -> dict[bytes, bytes]:
@@ -431,12 +431,12 @@ class NodeKeys:
         return why is not None and (begins is None or utc_now() >= begins)
 
     def rotations_due(self) -> dict[bytes, str]:
-        """Why a rotation is due, for every node that has one."""
+        """Return why a rotation is due, for every node that has one."""
         flags = self.all_flags()
         return {uuid: kept.rotation for uuid, kept in flags.items() if kept.rotation is not None}
 
     def due_among(self, uuids: Sequence[bytes]) -> set[bytes]:
-        """Those of a chunk of nodes whose key must be rotated."""
+        """Return those of a chunk of nodes whose key must be rotated."""
         flags = self._flags_of(uuids)
         return {uuid for uuid, kept in flags.items() if kept.rotation is not None}
 
@@ -445,7 +445,7 @@ class NodeKeys:
         return (self.rotation_due(uuid) or "").startswith(RESTORED)
 
     def stolen(self, uuid: bytes) -> str | None:
-        """Why the key of a node must not even end the session that it is in: a station that was stolen has had it."""
+        """Return why a key must not even end its present session: a stolen station has had it. None if it may."""
         why = self.rotation_due(uuid) or ""
         return why if why.startswith(STOLEN) else None
 
@@ -479,7 +479,7 @@ class NodeKeys:
             self._set_flags(record.uuid, rotation=None)
 
     def former(self, uuid: bytes) -> str | None:
-        """Fingerprint of the board that the link keys were agreed with, once its pin was let go."""
+        """Return the fingerprint of the board that the link keys were agreed with, if it was unpinned since."""
         return self._flags(uuid).former
 
     def set_former(self, uuid: bytes, fingerprint: str | None) -> None:

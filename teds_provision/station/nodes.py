@@ -88,7 +88,7 @@ class Nodes:
             self._replace(replace(record, point_mac=self._mac_of(record.uuid, record.point, present)), present)
 
     def restore(self, record: NodeRecord) -> None:
-        """As :meth:`put`, with the MAC that the record has: it comes from a backup."""
+        """Put a row as :meth:`put` does, with the MAC that it has: it comes from a backup."""
         with self._store.together():
             self._replace(record, self.get(record.uuid))
 

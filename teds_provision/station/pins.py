@@ -72,7 +72,7 @@ class Pins:
     def pinned_among(
         self, nodes: Iterable[NodeRecord | ExportEligibility], entries: Iterable[WhitelistEntry]
     ) -> dict[bytes, str]:
-        """Fingerprint of each of these nodes and entries that is pinned, by UUID."""
+        """Return the pinned fingerprint of each of these nodes and entries, by UUID."""
         pins: dict[bytes, str] = {}
         for node in nodes:
             if node.point is not None:
@@ -91,7 +91,7 @@ class Pins:
             raise keys.other_key(pinned, point)
 
     def _record(self, uuid: bytes, shown: str, pinned: str) -> None:
-        """One entry of the audit log in :data:`RECORD_AGAIN`; ``unrecorded``: how often it happened since the last."""
+        """Record one audit entry per :data:`RECORD_AGAIN`; ``unrecorded`` counts what happened since the last."""
         now = time.monotonic()
         at, passed_over = self._recorded.get(uuid, (-RECORD_AGAIN, 0))
         if now - at < RECORD_AGAIN:
@@ -133,7 +133,7 @@ class Pins:
         return None if entry is None else self._checked(entry)
 
     def row(self, uuid: bytes) -> WhitelistEntry | None:
-        """As :meth:`entry`, whatever its MAC: for what replaces or removes it."""
+        """Return the row as :meth:`entry` does, whatever its MAC, for a caller that replaces or removes it."""
         return self._store.read_one(WhitelistEntry, "SELECT * FROM whitelist WHERE uuid = ?", (uuid,))
 
     def get_many(self, uuids: Sequence[bytes]) -> dict[bytes, WhitelistEntry]:
@@ -199,7 +199,7 @@ class Pins:
             self._datasheets.forget_reading(uuid)  # of the board that it was
 
     def epoch_to_exceed(self, uuid: bytes, pinned: str | None) -> int:
-        """Epoch that an agreement must exceed: the active key's, but 0 for a board that it was not agreed with."""
+        """Return the epoch that an agreement must exceed: the active key's, 0 for a board that never agreed it."""
         former = self._keys.former(uuid)
         return 0 if former and pinned and not same_key(former, pinned) else self._keys.active_epoch(uuid)
 

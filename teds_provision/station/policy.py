@@ -70,11 +70,11 @@ class Policy:
     # -- trust -----------------------------------------------------------------------------------------------------
 
     def trusted(self, role: TrustRole | None = None) -> list[TrustRecord]:
-        """Every station and CA whose key counts here, or those of one role, by name."""
+        """Return every station and CA whose key counts here, or those of one role, by name."""
         return [record for record in self.listed() if role in (None, record.role) and self._trust_holds(record)]
 
     def listed(self) -> list[TrustRecord]:
-        """Every station and CA that is listed as trusted, by name; also one that another program put there.
+        """Return every station and CA listed as trusted, by name; also one that another program added.
 
         For a key that the plant's roster names the roster alone decides: members are listed, whom it removed is not.
         """
@@ -163,7 +163,7 @@ class Policy:
             return bool(found) and self._store.change("DELETE FROM trust WHERE fingerprint = ?", found[0]) > 0
 
     def trusted_cas(self, uuid: bytes | None = None) -> list[bytes]:
-        """CA keys that count here: the owner's, those added, and for one node that of the bundle it came in.
+        """Return the CA keys that count here: the owner's, those added, and for one node that of its bundle.
 
         The last one counts no more once trust in those who brought it has ended (:meth:`end_ca`).
         """
@@ -183,11 +183,11 @@ class Policy:
         self.restore_ended_ca(name, self._row_macs.note("ended ca", name))
 
     def restore_ended_ca(self, ca: str, mac: bytes | None) -> None:
-        """As :meth:`end_ca`, by fingerprint and with the MAC that the row has."""
+        """End trust as :meth:`end_ca` does, by fingerprint and with the MAC of the row."""
         self._store.execute("INSERT OR REPLACE INTO ended_cas VALUES(?, ?, ?)", (ca, utc_now(), mac))
 
     def ended_cas(self) -> dict[str, bytes | None]:
-        """CAs (fingerprints) that came in bundles and count no more, and the MAC of each."""
+        """Return the CAs (fingerprints) that came in bundles and no longer count, with the MAC of each."""
         return dict(self._store.execute("SELECT ca, mac FROM ended_cas"))
 
     def renew_ca(self, ca: bytes) -> None:
@@ -198,12 +198,12 @@ class Policy:
         self._store.execute("DELETE FROM ended_cas WHERE ca = ?", (ca,))
 
     def trusted_stations(self) -> list[bytes]:
-        """Station keys whose datasheets count without a CA: its own, and those added that no roster decides about."""
+        """Return the station keys that count without a CA: its own, and those added about which no roster decides."""
         others = (trusted.point for trusted in self.trusted("station") if not self.in_roster(trusted.fingerprint))
         return [self._identity.point, *others]
 
     def station_points(self) -> dict[str, bytes]:
-        """Keys of the other stations that count here, by fingerprint."""
+        """Return the keys of the other stations that count here, by fingerprint."""
         return {record.fingerprint: record.point for record in self.trusted("station")}
 
     # -- nodes that are refused ------------------------------------------------------------------------------------
@@ -246,7 +246,7 @@ class Policy:
         return self._store.change("DELETE FROM revocations WHERE uuid = ?", (uuid,)) > 0
 
     def lifted(self) -> dict[str, bytes | None]:
-        """Bans that a person lifted, as the SHA-256 of their signed text, and the MAC of each."""
+        """Return the bans that a person lifted, as SHA-256 of their signed text, with the MAC of each."""
         return dict(self._store.execute("SELECT statement, mac FROM lifted"))
 
     def restore_lifted(self, statement: str, mac: bytes | None) -> None:
@@ -260,7 +260,7 @@ class Policy:
         return any(name in lifted and self._row_macs.noted("lifted", name, lifted[name]) for name in names)
 
     def denied(self, uuid: bytes, key: str | None) -> RevocationRecord | None:
-        """Why a node with this key (fingerprint, None: not known) is denied; a ban of another key is none."""
+        """Return why a node with this key (fingerprint, None: unknown) is denied; other keys' bans do not count."""
         entry = self.revocation(uuid)
         return None if entry is None or (key and entry.fingerprint and not same_key(entry.fingerprint, key)) else entry
 

@@ -97,7 +97,7 @@ class RowMacs:
 
 
 def _keyed(key: bytes) -> hmac.HMAC:
-    """HMAC that has taken its key in: half of what a short one costs, and a handover makes two for each node."""
+    """Return an HMAC that has absorbed its key: half the cost of a short one; a handover makes two per node."""
     return hmac.new(key, digestmod="sha256")
 
 

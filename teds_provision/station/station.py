@@ -368,7 +368,7 @@ class Station:
 
     @contextmanager
     def run(self) -> Iterator[None]:
-        """Several steps by one thread, of which the last is durable: so are all of them when the block has ended."""
+        """Run several steps of one thread; all are durable when the block has ended."""
         self._runs.now = run = _DurableRun(BackgroundWriter(self._store.background))
         try:
             try:

@@ -226,7 +226,7 @@ class Channel:
         return self.units.interpretation == RATIO and model in (DataModel.FRACTION, DataModel.LONG_FRACTION)
 
     def show(self, value: float, *, difference: bool = False, digits: int = 6) -> str:
-        """Value in SI units as people see it: ``360 °``, ``0.35 N``; a difference leaves the unit's offset out."""
+        """Return an SI value as people see it: ``360 °``, ``0.35 N``; a difference ignores the unit's offset."""
         return format_value(value, self.shown, difference=difference, digits=digits)
 
     def show_reading(self, value: float, *, digits: int = 6) -> str:
@@ -238,7 +238,7 @@ class Channel:
 
 
 def described(number: int, blocks: Mapping[BlockId, bytes]) -> Channel:
-    """One channel as its TransducerChannel TEDS alone describes it, without name and calibration."""
+    """Return one channel as its TransducerChannel TEDS describes it, without name and calibration."""
     octets = blocks.get((number, AccessCode.CHANNEL))
     return read_channel(number, "", decode(octets) if octets is not None else None)
 
@@ -249,7 +249,7 @@ def channel_from(decoded: DecodedTeds) -> Channel:
 
 
 def read_channel(number: int, name: str, teds: DecodedTeds | None) -> Channel:
-    """Channel of that number and name as its decoded TransducerChannel TEDS describes it, None for none."""
+    """Return the channel of that number and name as its decoded TransducerChannel TEDS describes it."""
     if teds is None:
         return Channel(number, name)
     units, kind = teds.get("PhyUnits"), integer_of(teds, "ChanType")

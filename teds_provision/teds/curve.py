@@ -52,7 +52,7 @@ class CurveChannel:
         return self.uncertainty if self.uncertainty > 0 else 0.0
 
     def show(self, value: float, *, difference: bool = False, like: WrittenUnit | None = None) -> str:
-        """Value in SI units in the unit that people use for this channel."""
+        """Return a value in SI units in the unit that people use for this channel."""
         preferred = like if like is not None and self.display is None and like.text[:1] != "(" else None
         unit = preferred or display_unit(self.units, self.display)
         return format_value(value, unit, difference=difference, digits=5)
@@ -99,7 +99,7 @@ class Curve:
         return values * self.calibration.unit.scale + self.calibration.unit.offset
 
     def difference(self, other: Curve) -> NDArray[np.float64]:
-        """Results of this curve less those of another one over the same axes; of angles that wrap the shorter way."""
+        """Return this curve's results less those of another one over the same axes; wrapping angles the shorter way."""
         less = self.result - other.result
         return less - TURN * np.round(less / TURN) if self.channel.full_turn else less
 
@@ -205,7 +205,7 @@ def _axis(
 def _ends(
     boundaries: tuple[float, ...], source: CurveChannel | None, actuator: bool, unit: WrittenUnit
 ) -> tuple[float, float, bool]:
-    """Lowest and highest input, and whether it takes whole numbers alone."""
+    """Return lowest and highest input, and whether it has only whole numbers."""
     ends = source.raw if source else None
     whole = source is not None and source.integer
     if actuator and source is not None:

@@ -133,7 +133,7 @@ def _differing(
 
 
 def _flat(decoded: DecodedTeds) -> dict[_Path, Field]:
-    """Leaves by path of (name, number among fields of that name)."""
+    """Return the leaves by path of (name, number among fields of that name)."""
     out: dict[_Path, Field] = {}
 
     def walk(fields: tuple[Field, ...], above: _Path) -> None:

@@ -184,7 +184,7 @@ def _fit_of(requirement: Requirement, channel: Channel, now: datetime | None) ->
 
 
 def _sentence(parts: Iterable[str]) -> str:
-    """Half sentences, and whole ones, as one."""
+    """Join half sentences and whole ones into one."""
     return f"{'; '.join(part.removesuffix('.') for part in parts)}."
 
 

@@ -35,7 +35,7 @@ LARGE_CHANGE: Final = 0.1
 
 
 def check(curve: Curve, before: Curve | None, given: Calibration | None) -> Iterator[Raised]:
-    """All findings of one channel; ``before`` is what the node has now, ``given`` the calibration with its points."""
+    """Yield all findings of one channel; ``before`` is what the node has, ``given`` the calibration with its points."""
     if not np.isfinite(curve.result).all():
         at = int(np.argmin(np.isfinite(curve.result)))
         yield "overflow", "error", f"{_at(curve, curve.inputs_at(at))} gives no finite value."
@@ -65,7 +65,7 @@ def _show(curve: Curve, value: float, *, difference: bool = False) -> str:
 
 
 def _at(curve: Curve, inputs: tuple[float, ...]) -> str:
-    """``raw 512``, or for several inputs ``raw 512 with channel 2 at raw 100``."""
+    """Return ``raw 512``, or for several inputs ``raw 512 with channel 2 at raw 100``."""
     own = inputs[curve.main]
     text = f"{own:.6g} {curve.calibration.unit.text}" if curve.channel.actuator else f"raw {own:.8g}"
     others = [
@@ -172,7 +172,7 @@ def _beyond(curve: Curve, at: int, value: float, worst: float, limit: float, whe
 
 
 def _jumps(curve: Curve) -> Iterator[Raised]:
-    """Jumps between the segments of a table, which by its nature has none."""
+    """Find jumps between the segments of a table, which has none by its nature."""
     calibration = curve.calibration
     if calibration.method != "table" or len(calibration.inputs) != 1 or calibration.inputs[0].segments < 2:
         return
@@ -322,7 +322,7 @@ def misfit(calibration: Calibration, had: Channel, now: Channel, of: ChannelProf
 
 
 def _beyond_raw_range(calibration: Calibration, had: Channel, now: Channel, raw: Range | None) -> str:
-    """Another converter: it gives raw values that were never calibrated, or not those that were."""
+    """Return why not, if another converter gives raw values that were never calibrated, or other ones than before."""
     before = calibration.raw_range or (had.sample.raw_range if had.sample is not None else None)
     if raw is None or before is None:
         return "" if raw == before else "it was made for another range of raw values"
@@ -339,7 +339,7 @@ def _beyond_raw_range(calibration: Calibration, had: Channel, now: Channel, raw:
 
 
 def _points_beyond(calibration: Calibration, had: Channel, now: Channel) -> str:
-    """Points of it that new limits leave out; the old limits are the guard's matter."""
+    """Return which points new limits exclude, as text; the guard checks the old limits."""
     same = [bound for bound in ("low", "high") if getattr(had, bound) == getattr(now, bound)]
     part = calibration.inputs[0]
     if len(same) == 2 or now.full_turn or len(calibration.inputs) > 1 or not now.has_range:
@@ -407,7 +407,7 @@ class _Judge:
         return channel_of(number, blocks, self.profile)
 
     def _damage(self, calibration: Calibration) -> Iterator[GuardFinding]:
-        """Words that were erased, or boundaries without which nothing can be computed."""
+        """Find erased words, or boundaries without which nothing can be computed."""
         for name, values, per_cell in _words(calibration):
             bad = next(
                 (n for n, value in enumerate(values) if not math.isfinite(value) or 0 < abs(value) < _SMALLEST_NORMAL),
@@ -434,7 +434,7 @@ class _Judge:
             yield GuardFinding(self.number, code, message, severity)
 
     def _demanded(self, channel: CurveChannel, calibration: Calibration) -> CurveChannel:
-        """Without a profile, what the Calibration TEDS itself carries of its type's demands counts."""
+        """Return the channel with the demands that the Calibration TEDS itself carries, used without a profile."""
         if self.profile is not None and self.profile.channel(self.number) is not None:
             return channel
         raw = calibration.raw_range or channel.raw
@@ -458,7 +458,7 @@ class _Judge:
 
 
 def _words(calibration: Calibration) -> Iterator[tuple[str, tuple[float, ...], int]]:
-    """Every Float32 of a calibration: what it is, the words, how many belong to one segment."""
+    """Yield every Float32 of a calibration: its name, the words, how many belong to one segment."""
     yield "coefficient", calibration.coefficients, math.prod(part.degree + 1 for part in calibration.inputs)
     for part in calibration.inputs:
         yield "boundary", part.boundaries, 1

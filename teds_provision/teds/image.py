@@ -37,7 +37,7 @@ class Image:
         return self.blocks.get(SECURITY)
 
     def unsigned_blocks(self) -> dict[BlockId, bytes]:
-        """Every block but the Security TEDS, ascending."""
+        """Return every block except the Security TEDS, ascending."""
         return {key: self.blocks[key] for key in self if key != SECURITY}
 
     def with_block(self, key: BlockId, teds: bytes) -> Image:
@@ -45,7 +45,7 @@ class Image:
         return Image(self.uuid, {**self.blocks, key: teds})
 
     def digest(self) -> str:
-        """SHA-256 over all blocks with their ids and lengths, 64 hex digits."""
+        """Return the SHA-256 over all blocks with their ids and lengths, 64 hex digits."""
         whole = hashlib.sha256(self.uuid)
         for channel, access_code in self:
             teds = self.blocks[channel, access_code]
@@ -136,7 +136,7 @@ def split_run(octets: bytes) -> list[bytes]:
 
 
 def with_class(octets: bytes) -> TedsBlock:
-    """Block whose access code is the class that its TEDSID names."""
+    """Return a block whose access code is the class that its TEDSID names."""
     return TedsBlock(None, class_of(octets), octets)
 
 

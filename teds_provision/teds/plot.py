@@ -171,7 +171,7 @@ class _View:
         return np.unique(np.append(places[::step], places[-1:]))
 
     def _wrapped(self, values: Any) -> Any:
-        """Angles over a full turn as they are measured: within it."""
+        """Return angles over a full turn wrapped into it, as they are measured."""
         if not self.channel.full_turn:
             return values
         ends = sorted(self.unit.from_si(end) for end in (self.channel.low, self.channel.high))
@@ -233,7 +233,7 @@ class _View:
         axes.set_ylabel("point - curve")
 
     def straightness(self, axes: Any) -> None:
-        """Without points: draw how far the curve departs from the straight line through it."""
+        """Draw, without points, how far the curve departs from the straight line through it."""
         line = self.lines[len(self.lines) // 2]
         places = self._thinned(self.inside)
         x, y = self.axis[places], line[places]

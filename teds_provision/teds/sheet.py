@@ -100,7 +100,7 @@ class Sheet:
 
     @classmethod
     def from_image(cls, image: Image) -> Sheet:
-        """Datasheet of an image; never raises."""
+        """Return the datasheet of an image; never raises."""
         return _Reader(image.uuid, image.blocks).sheet()
 
     @classmethod
@@ -148,7 +148,7 @@ class Sheet:
 
 
 def channel_of(number: int, blocks: Mapping[BlockId, bytes]) -> Channel:
-    """One channel among framed TEDS by (channel, access code); one without a description states nothing."""
+    """Return one channel among framed TEDS by (channel, access code); without a description its facts are empty."""
     return _Reader(b"", blocks).channel(number)
 
 
@@ -246,7 +246,7 @@ class _Reader:
 
 
 def _vectors(meta: DecodedTeds) -> Iterator[tuple[int, ...]]:
-    """Members of every VGroup that can be read."""
+    """Yield the members of every VGroup that can be read."""
     for group in meta.fields:
         for part in group.children if group.name == "VGroup" else ():
             if part.name == "MemList" and isinstance(part.value, tuple | list):

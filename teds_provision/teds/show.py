@@ -108,7 +108,7 @@ def _number(field: Field, value: float, context: Context, spec: FieldSpec | None
 
 
 def seconds(value: float) -> str:
-    """Seconds in the unit that suits: ``100 µs``, ``500 ms``, ``365 days``."""
+    """Return seconds in the unit that suits: ``100 µs``, ``500 ms``, ``365 days``."""
     if value != value:  # noqa: PLR0124 - NaN
         return "not available"
     if abs(value) >= 2 * _DAY:
@@ -140,7 +140,7 @@ def span(value: TimeInstance) -> str:
 
 
 def hexadecimal(octets: bytes) -> str:
-    """Hex digits, the beginning alone of many."""
+    """Return hex digits; of many octets only the beginning."""
     if len(octets) <= SHOWN_OCTETS:
         return octets.hex() or "(empty)"
     return f"{octets[:SHOWN_OCTETS].hex()}… ({len(octets)} octets)"
@@ -156,7 +156,7 @@ def key(field: Field) -> str:
 
 
 def fingerprint(point: bytes) -> str:
-    """SHA-256 of an uncompressed point, 64 hex digits."""
+    """Return the SHA-256 of an uncompressed point, 64 hex digits."""
     return hashlib.sha256(point).hexdigest()
 
 
@@ -176,7 +176,7 @@ Line = tuple[str, str]
 
 
 def summary_of(decoded: DecodedTeds, context: Context, now: datetime) -> tuple[Line, ...]:
-    """Lines of (label, text) for people."""
+    """Return lines of (label, text) for people."""
     match decoded.access_code:
         case AccessCode.META:
             return tuple(_uuid(decoded, context))
@@ -357,7 +357,7 @@ def _unit(block: TedsBlock, decoded: DecodedTeds, beside: Mapping[tuple[int, int
 
 
 def finding_to_json(finding: Finding) -> dict[str, Any]:
-    """One finding as a JSON object."""
+    """Return one finding as a JSON object."""
     out: dict[str, Any] = {"severity": finding.severity, "offset": finding.offset, "code": finding.code}
     out["message"] = finding.message
     extra = {"field": finding.field, "asked": finding.asked, "found": finding.found}
@@ -365,7 +365,7 @@ def finding_to_json(finding: Finding) -> dict[str, Any]:
 
 
 def shown_to_json(shown: ShownTeds) -> dict[str, Any]:
-    """One TEDS as a JSON object: the field tree of format ``teds/1``, and edition, verdict, findings, meaning."""
+    """Return one TEDS as JSON: the field tree of format ``teds/1`` with edition, verdict, findings and meaning."""
     decoded = shown.decoded
     out = {"edition": decoded.edition, **teds_to_json(shown.block)}
     out["edition"], out["verdict"] = decoded.edition, str(decoded.verdict)

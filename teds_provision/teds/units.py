@@ -31,13 +31,13 @@ PRODUCT, RATIO, LOG_PRODUCT, LOG_RATIO, DIGITAL, ARBITRARY = range(6)
 
 
 def from_exponents(interpretation: int, exponents: Mapping[str, Fraction]) -> Units:
-    """Units of exponents by base name; a base that is left out is absent."""
+    """Return the units of exponents by base name; a base that is left out is absent."""
     rad, sr, m, kg, s, a, k, mol, cd = (exponents.get(base, Fraction(0)) for base in UNIT_PARTS)
     return Units(interpretation, rad, sr, m, kg, s, a, k, mol, cd)
 
 
 def units_of(interpretation: int = PRODUCT, **exponents: float) -> Units:
-    """Units of exponents given by keyword."""
+    """Return the units of exponents given by keyword."""
     return from_exponents(interpretation, {name: Fraction(value) for name, value in exponents.items()})
 
 
@@ -216,11 +216,11 @@ class WrittenUnit:
     offset: float = 0.0
 
     def to_si(self, value: float) -> float:
-        """Value in SI units of a value in this unit."""
+        """Return the SI value of a value in this unit."""
         return value * self.scale + self.offset
 
     def from_si(self, value: float) -> float:
-        """Value in this unit of a value in SI units."""
+        """Return the value in this unit of an SI value."""
         return (value - self.offset) / self.scale
 
     def difference_to_si(self, value: float) -> float:
@@ -256,12 +256,12 @@ def parse_unit(text: str) -> WrittenUnit:
 
 
 def parse_units(text: str) -> Units:
-    """Exponents alone of a unit as people write it; raises BadDataError."""
+    """Return only the exponents of a unit as people write it; raises BadDataError."""
     return parse_unit(text).units
 
 
 def _ratio(text: str) -> WrittenUnit | None:
-    """``mm/m``, ``mV/V``: both sides of the same kind, which ``pint`` would cancel to nothing."""
+    """Parse ``mm/m`` or ``mV/V``: both sides of one kind, which ``pint`` would cancel to nothing. None for others."""
     if text.count("/") != 1:
         return None
     upper, lower = (part.strip() for part in text.split("/"))
@@ -505,7 +505,7 @@ def display_unit(units: Units, preferred: str | None = None) -> WrittenUnit:
 
 
 def in_display_units(value: float, units: Units, preferred: str | None = None) -> tuple[float, str]:
-    """``(value, unit)`` for people, of a value in SI units."""
+    """Return ``(value, unit)`` for people, of a value in SI units."""
     unit = display_unit(units, preferred)
     return unit.from_si(value), unit.text
 
@@ -552,7 +552,7 @@ def _quantity(value: object) -> tuple[float, str]:
 
 
 def parse_seconds(value: object) -> float:
-    """Seconds of ``"100 us"``, ``"1 year"`` (365.2425 days), ``"10 kHz"`` (its period) or a bare number of seconds.
+    """Return the seconds of ``"100 us"``, ``"1 year"`` (365.2425 days), ``"10 kHz"`` (its period) or a bare number.
 
     Raises BadDataError.
     """

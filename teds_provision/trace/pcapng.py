@@ -44,7 +44,7 @@ def head() -> bytes:
 
 
 def block(record: Record) -> bytes:
-    """One record as an Enhanced Packet Block, its time in µs."""
+    """Return one record as an Enhanced Packet Block, its time in µs."""
     number, data = _framed(record)
     moment = round(record.time * 1e6)
     comments = [record.command] if number == 2 else []
@@ -63,7 +63,7 @@ def is_pcapng(octets: bytes) -> bool:
 
 
 def read_pcapng(octets: bytes) -> Iterator[Record]:
-    """Every packet of a link type that is known here; a last block that was cut short is left out.
+    """Yield every packet of a known link type; a last block that was cut off is left out.
 
     Raises BadDataError.
     """

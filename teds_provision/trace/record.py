@@ -68,7 +68,7 @@ def head() -> bytes:
 
 
 def line(record: Record) -> bytes:
-    """One record."""
+    """Return the line of one record."""
     return json.dumps(record.as_json()).encode() + b"\n"
 
 
@@ -78,7 +78,7 @@ def is_lines(octets: bytes) -> bool:
 
 
 def read_lines(octets: bytes) -> Iterator[Record]:
-    """Every record; a last line that was cut short is left out. Raises BadDataError with the line's number."""
+    """Yield every record; a last line that was cut off is left out. Raises BadDataError with the line's number."""
     for number, row in enumerate(io.BytesIO(octets), 1):
         if number == 1 or not row.strip():
             continue

@@ -85,7 +85,7 @@ class KeyringVault(SoftwareVault):
         )
 
     def opener(self) -> bytes:
-        """Nothing that could be held beside what is asked for."""
+        """Return nothing: this vault has no secret besides the one that is asked for."""
         return b""
 
     def new_passphrase(self, ask: Ask) -> Callable[[], None]:

@@ -134,7 +134,7 @@ class Pkcs11Vault:
         return tuple(sorted(self._content.masters.keys))
 
     def opener(self) -> bytes:
-        """Nothing that could be held beside what is asked for."""
+        """Return nothing: this vault has no secret besides the one that is asked for."""
         return b""
 
     def new_passphrase(self, ask: Ask) -> Callable[[], None]:
@@ -312,7 +312,7 @@ def _unsealed(station: TokenKey, members: dict[str, Any]) -> MasterKeys:
 
 
 def _sealing_key(shared: bytes, members: dict[str, Any]) -> bytes:
-    """HKDF-SHA-256 over x of the ECDH; bound to everything in the clear but the signature."""
+    """Derive the key by HKDF-SHA-256 over x of the ECDH; it is bound to all clear members except the signature."""
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 

@@ -38,7 +38,7 @@ class TokenKey:
         self.identifier = identifier
 
     def sign(self, message: bytes) -> bytes:
-        """SIG(key, message): CKM_ECDSA over the SHA-256 made here, s brought into the lower half."""
+        """Return SIG(key, message): CKM_ECDSA over the SHA-256 made here, s in the lower half."""
         return self.sign_digest(hashlib.sha256(message).digest())
 
     def sign_digest(self, digest: bytes) -> bytes:
@@ -48,7 +48,7 @@ class TokenKey:
         return normalise_signature(guarded(lambda: bytes(self._key.sign(digest, mechanism=Mechanism.ECDSA))))
 
     def ecdh(self, peer: bytes) -> bytes:
-        """x-coordinate of the ECDH: CKM_ECDH1_DERIVE with CKD_NULL into a secret of all 32 octets, read and destroyed.
+        """Return the x-coordinate of the ECDH: CKM_ECDH1_DERIVE with CKD_NULL into a 32-octet secret, then destroyed.
 
         A shorter secret would be the *last* octets of x on some modules and the first on others; key derivation is
         ours, outside, because tokens lack HKDF. Raises BadDataError for a bad point, VaultError.

@@ -32,7 +32,7 @@ ROWS = 40
 
 @contextmanager
 def watcher_for(app: App, station: Station, sinks: Sequence[Sink], stop: threading.Event) -> Iterator[Watcher]:
-    """Who watches: lines of JSON, a table, or lines on stderr."""
+    """Yield the watcher of a measurement: JSON lines, a table, or lines on stderr."""
     if app.json:
         lines = StdoutEvents(stop)
         lines.open((), measure_room.blocks.StationFacts(station.name))

@@ -144,7 +144,7 @@ def _change(app: App, station: Station, uuid: bytes, channel: int, name: str | N
 
 
 def _channels(station: Station) -> list[tuple[bytes, int, ChannelFacts]]:
-    """Every channel of a datasheet that is kept here, with what makes its name."""
+    """Return every channel of a stored datasheet, with the facts that make its name."""
     found = []
     for record in station.nodes.all():
         image = station.datasheets.datasheet(record.uuid)

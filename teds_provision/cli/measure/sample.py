@@ -166,7 +166,7 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
 
 
 def words(state: int) -> list[str]:
-    """State bits of a channel as words."""
+    """Return the state bits of a channel as words."""
     return bit_words(ChannelState, state)
 
 

@@ -87,7 +87,7 @@ class PressLines:
         self._app.emit(line, f"{notice.uuid.hex()}  says it was pressed")
 
     def written(self, octets: int, total: int) -> None:
-        """So many octets of a datasheet are staged."""
+        """Report how many octets of a datasheet are staged."""
         self._inner.written(octets, total)
 
 

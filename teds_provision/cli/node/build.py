@@ -167,7 +167,7 @@ def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, ye
 
 
 def calibration_json(certificate: CertificateReference | None) -> dict[str, Any]:
-    """Member ``calibration`` of a command that calibrated by a certificate, nothing for any other."""
+    """Return the member ``calibration`` if a certificate was used for the calibration, else nothing."""
     return {} if certificate is None else {"calibration": certificate.to_json()}
 
 

@@ -168,7 +168,7 @@ def _table(described: Iterator[dict[str, Any]]) -> None:
 
 
 def _fitting(widths: list[int]) -> list[int]:
-    """Numbers of the columns that fit side by side; those that are missed least go first, a UUID never."""
+    """Return the numbers of the columns that fit side by side; the least important are left out first, a UUID never."""
     kept = list(range(len(widths)))
     if not sys.stdout.isatty():
         return kept

@@ -197,7 +197,7 @@ def _one(app: App, boards: BatchRun, operator: Operator) -> None:
 
 
 def _of_line(boards: BatchRun, uuid: bytes) -> dict[str, Any]:
-    """Job, unit, attempt and evidence of a board, nothing outside a line."""
+    """Return job, unit, attempt and evidence of a board, nothing outside a line."""
     return boards.line.unit_to_json(uuid) if boards.line is not None else {}
 
 
@@ -294,7 +294,7 @@ def _print_result(
 
 
 def _print_board(app: App, board: BoardResult, *, warn: bool = True, **line: Any) -> None:
-    """One line of JSON, or what a person reads: UUID, time and row of the sheet on each; ``line``: its unit."""
+    """Print a board's result as a JSON line, or for people: UUID, time and row of the sheet; ``line`` has its unit."""
     if board.done is not None:
         failure = board.failure
         if failure is not None:  # an authentic board can fail: its type requires a calibration, a channel read nothing
@@ -439,7 +439,7 @@ _WORDS: Final = {"passed": ("PASS", "black on green"), "failed": ("FAIL", "white
 
 
 def big(text: str) -> list[str]:
-    """Five lines of letters that are read from afar; characters without a shape are left out."""
+    """Return five rows of letters that can be read from afar; characters without a shape are left out."""
     shapes = [_GLYPHS[character].split("|") for character in text.upper() if character in _GLYPHS]
     lines = ["  ".join(shape[row] for shape in shapes) for row in range(_ROWS)]
     return [line.replace("#", "██").replace(" ", "  ") for line in lines]
@@ -449,7 +449,7 @@ class BatchState(Protocol):
     """What the screen needs to know of the batch: :class:`BatchRun` is one."""
 
     def __len__(self) -> int:
-        """How many boards the sheet has."""
+        """Return the number of boards on the sheet."""
 
     @property
     def passed(self) -> int:
@@ -467,7 +467,7 @@ class BatchState(Protocol):
         """Return the row of the sheet with this number, counted from 1."""
 
     def board_of(self, row: SheetRow) -> str | None:
-        """UUID of the board that had a row before."""
+        """Return the UUID of the board that had a row before, None for none."""
 
 
 class Screen(Protocol):
@@ -488,10 +488,10 @@ class _NoScreen:
     tells = False
 
     def ended(self, board: BoardResult) -> None:
-        """No-op: already printed."""
+        """Do nothing: the line is printed already."""
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Do nothing: there is nothing to close."""
 
 
 class BoardReporter:
@@ -512,11 +512,11 @@ class BoardReporter:
         self._inner.finished(step)
 
     def notice(self, notice: Notice) -> None:
-        """Something is waited for, or came by."""
+        """Show that the run waits for something, or that something arrived."""
         self._inner.notice(notice)
 
     def written(self, octets: int, total: int) -> None:
-        """So many octets of the datasheet are staged."""
+        """Show how many octets of the datasheet are staged."""
         self._inner.written(octets, total)
 
 
@@ -567,7 +567,7 @@ class OperatorScreen:
             self._line(f"{line}  {self._name(end)}", style=style)
 
     def _print_end(self, board: BoardResult) -> None:
-        """Seconds and which board; of one that failed why, and what to do, in a few lines."""
+        """Print seconds and board; for one that failed also why, and what to do, in a few lines."""
         from rich.text import Text
 
         row = f"  row {board.row}" if board.row is not None else ""

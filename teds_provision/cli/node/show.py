@@ -208,7 +208,7 @@ _GOOD = {Conformity.CLEAN, Conformity.BLOCK_CLEAN, Conformity.MESSAGE}
 
 
 def escape(text: str) -> str:
-    """Text of a file that is to reach the terminal as text: no markup, no control or direction characters."""
+    """Return text of a file as text for the terminal: no markup, no control or direction characters."""
     return markup.escape(_UNSAFE.sub(lambda found: f"\\x{ord(found.group()):02x}", text))
 
 
@@ -381,7 +381,7 @@ class ShownFile:
 
 
 def read_file(name: str) -> bytes:
-    """Octets of a file or, for ``-``, of standard input.
+    """Return the octets of a file or, for ``-``, of standard input.
 
     Raises NotFoundError and, for more than 32 MiB, BadDataError.
     """
@@ -488,7 +488,7 @@ def is_message(octets: bytes) -> bool:
 
 
 def placed(blocks: Sequence[TedsBlock]) -> dict[tuple[int, int], bytes]:
-    """TEDS by (channel, access code); lone channel TEDS and calibrations without a channel count as channel 1."""
+    """Return TEDS by (channel, access code); a lone channel TEDS and a calibration without channel are channel 1."""
     out: dict[tuple[int, int], bytes] = {}
     for channel, code, octets in blocks:
         if code is not None:
@@ -521,7 +521,7 @@ def _converted(blocks: Sequence[TedsBlock], edition: Edition) -> tuple[list[Teds
 
 
 def guard_to_json(finding: GuardFinding) -> dict[str, Any]:
-    """One finding of the guard as a JSON object."""
+    """Return one finding of the guard as a JSON object."""
     return {
         "severity": finding.severity,
         "channel": finding.channel,

@@ -194,7 +194,7 @@ class DaemonLog:
         self._thread.start()
 
     def write_event(self, event: dict[str, Any]) -> None:
-        """One line, from whichever thread; returns at once."""
+        """Queue one event for writing, from any thread; returns at once."""
         with self._news:
             if len(self._waiting) >= MOST:
                 self._waiting.popleft()

@@ -310,14 +310,14 @@ def _toml(value: Any) -> str:
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Names with dashes alone, so that both spellings are one setting."""
+    """Return the settings with dashes in all names, so that both spellings are one setting."""
     return {
         name.replace("_", "-"): _plain(value) if isinstance(value, dict) else value for name, value in values.items()
     }
 
 
 def _pruned(values: dict[str, Any]) -> dict[str, Any]:
-    """Without empty tables: they set nothing."""
+    """Return the settings without empty tables: they set nothing."""
     inner = {name: _pruned(value) if isinstance(value, dict) else value for name, value in values.items()}
     return {name: value for name, value in inner.items() if value != {}}
 

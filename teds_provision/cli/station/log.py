@@ -170,7 +170,7 @@ def _as_dict(entry: AuditEntry) -> dict[str, Any]:
 
 
 def _line(entry: AuditEntry) -> str:
-    """One line; on a terminal as many as its width asks for, when and what before who and details."""
+    """Return the line of an entry; on a terminal it is wrapped, with time and act before node and details."""
     node = entry.uuid.hex() if entry.uuid else "-"
     detail = ", ".join(f"{key} {_short(value)}" for key, value in entry.detail.items() if value is not None)
     if sys.stdout.isatty():

@@ -125,7 +125,7 @@ def _channels(channels: list[dict[str, Any]]) -> Table:
 
 
 def _alike(channels: list[dict[str, Any]]) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """First and last of each run of channels that differ in number and name only."""
+    """Yield the first and last of each run of channels that differ in number and name only."""
 
     def same(channel: dict[str, Any]) -> str:
         return str({key: value for key, value in channel.items() if key not in ("number", "name")})
@@ -291,5 +291,5 @@ profile.add_command(new)
 
 
 def _plain(text: str) -> Callable[[Console], None]:
-    """Text as it is: brackets are no markup, lines stay whole."""
+    """Return a function that prints text as it is: brackets are no markup, lines stay whole."""
     return lambda _console: click.echo(text)

@@ -41,11 +41,11 @@ class Adapter:
         self._seen: dict[str, tuple[BLEDevice, float]] = {}
 
     def seen(self) -> dict[str, float]:
-        """Every node that advertised, and when (monotonic seconds)."""
+        """Return every node that advertised, and when (monotonic seconds)."""
         return {address: at for address, (_, at) in self._seen.items()}
 
     def forget(self, address: str) -> None:
-        """BlueZ has forgotten this device."""
+        """Drop a device that BlueZ has forgotten."""
         self._seen.pop(address, None)
 
     async def scan(self, seconds: float, enough: Callable[[dict[str, float]], bool]) -> dict[str, float]:

@@ -29,6 +29,6 @@ class BleAirtime:
         return 1e9 / (n * period) / AIR_MESSAGES
 
     def frames(self, length: int) -> int:
-        """One: a message is a notification."""
+        """Return 1: a message is one notification."""
         del length
         return 1

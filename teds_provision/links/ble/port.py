@@ -58,7 +58,7 @@ class RememberedNodes:
             self._known = {address: Identity.decode(bytes.fromhex(octets)) for address, octets in document.items()}
 
     def items(self) -> list[tuple[str, Identity]]:
-        """Every address and who was there, the newest first."""
+        """Return every address and the identity seen there, the newest first."""
         return list(reversed(self._known.items()))
 
     def remember_node(self, address: str, identity: Identity) -> None:
@@ -317,7 +317,7 @@ class BlePort(MeasuringLink):
         return address in self._loop.run(self._adapter.scan(_GUESS_SECONDS, lambda seen: address in seen))
 
     def _advertising(self, seconds: float, asked: dict[str, float]) -> list[str]:
-        """Who advertises and was not asked for a while, the first that comes."""
+        """Return addresses that advertise and were not asked lately, as soon as there is one."""
         now = time.monotonic()
 
         def fresh(seen: dict[str, float]) -> list[str]:

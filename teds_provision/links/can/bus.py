@@ -212,7 +212,7 @@ class Bus:
         return None if self._echoes and self._echoes.discard_echo(frame) else frame
 
     def _arrival(self, timestamp: float) -> float:
-        """Time of arrival on the monotonic clock: taken back by the age of a time stamp of this machine's clock."""
+        """Return the arrival on the monotonic clock, less the age of the time stamp if this machine's clock made it."""
         age = time.time() - timestamp if self._clock_is_ours else 0.0
         return time.monotonic() - (age if 0.0 < age < _LATEST_SECONDS else 0.0)
 

@@ -428,7 +428,7 @@ class PendingBroadcast:
     news: SimpleQueue[int] = field(default_factory=SimpleQueue)
 
     def next(self, seconds: float) -> int | None:
-        """Address of a node that has answered, or in conflict; None after ``seconds``."""
+        """Return the address of a node that has answered, or is in conflict; None after ``seconds``."""
         try:
             return self.news.get(timeout=max(0.0, seconds))
         except Empty:

@@ -153,7 +153,7 @@ def ask_one(ask: Callable[[bytes], bytes], *, questions: int = 2) -> Identity | 
 
 
 def conflict_text(node: int) -> str:
-    """One sentence that names the address."""
+    """Return one sentence that names the address."""
     return conflict(node).message
 
 
@@ -164,7 +164,7 @@ def twice_text(uuid: bytes, addresses: list[int]) -> str:
 
 
 def unfinished_text(nodes: set[int]) -> str:
-    """One sentence that names the addresses whose answers came in part."""
+    """Return one sentence that names the addresses whose answers came in part."""
     where = ", ".join(f"0x{node:02X}" for node in sorted(nodes))
     return f"The answer of {where} was incomplete; try again."
 
@@ -179,7 +179,7 @@ def _read(gathering: BroadcastReplies, node: int) -> Identity | None:
 
 
 def _identities(gathering: BroadcastReplies) -> dict[int, Identity]:
-    """Who answered in a way that can be read, addresses with two nodes left out."""
+    """Return the identities that could be read by address, without addresses that two nodes share."""
     read = {node: _read(gathering, node) for node in sorted(gathering.answers)}
     return {node: identity for node, identity in read.items() if identity is not None}
 

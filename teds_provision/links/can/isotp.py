@@ -74,7 +74,7 @@ def padded(data: bytes, *, fd: bool) -> bytes:
 
 
 def read_single(data: bytes) -> bytes | None:
-    """Content of a single frame (ISO 15765-2, SF_DL); None when it is none.
+    """Return the content of a single frame (ISO 15765-2, SF_DL), None for any other frame.
 
     The length is in the first octet of a frame of up to 8 octets, and behind an escape in a longer one.
     """
@@ -179,7 +179,7 @@ class Pair:
         return True
 
     def speak(self, *, fd: bool) -> None:
-        """From now on send in FD or classic."""
+        """Send in FD, or in classic frames, from now on."""
         params = self._logic.params
         if params.can_fd != fd and not self.sending:
             params.can_fd = params.bitrate_switch = fd
@@ -221,7 +221,7 @@ class Pair:
         return bool(self._logic.tx_state == self._wait_fc)
 
     def due_in(self, most: float) -> float:
-        """Seconds until :meth:`run` has something to do, at most ``most``."""
+        """Return the seconds until :meth:`run` has something to do, at most ``most``."""
         delay = self._logic.next_cf_delay()
         return most if delay is None else max(0.0, min(most, delay))
 
@@ -268,7 +268,7 @@ def _parameters(fd: bool) -> dict[str, Any]:
 
 
 def _not_waited_for(_seconds: float) -> None:
-    """Only the library's own thread waits; we have none."""
+    """Return at once: only the library's own thread waits, and there is none."""
 
 
 def _tolerable(data: bytes) -> bytes | None:
@@ -395,7 +395,7 @@ def consecutive_frames(rest: bytes, *, fd: bool) -> Iterator[bytes]:
 
 
 def gap_seconds(octet: int) -> float:
-    """STmin of a flow control in seconds; a reserved value counts as 127 ms (ISO 15765-2, table of STmin)."""
+    """Return STmin of a flow control in seconds; a reserved value counts as 127 ms (ISO 15765-2, table of STmin)."""
     if octet <= 0x7F:
         return octet / 1000
     if 0xF1 <= octet <= 0xF9:

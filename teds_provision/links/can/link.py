@@ -148,7 +148,7 @@ class CanLink:
         return self._bus().transfer_pace.wait()
 
     def close(self) -> None:
-        """Nothing to leave behind on CAN."""
+        """Do nothing: CAN has no connection to end."""
 
     # -- to try a node out, see links.ports.MultiStationLink
     # ------------------------------------------------------------------
@@ -169,7 +169,7 @@ class CanLink:
             return asked.replies.answers.get(self.address, b"")
 
     def there(self, address: int) -> Identity | None:
-        """Who answers Identify at this address."""
+        """Return the identity of the node that answers Identify at this address, None for none."""
         link = CanLink(self._bus, self._number, address, source=self._source)
         try:
             reply = decode_reply(link.exchange_limited(IDENTIFY.encode(), tries=1, seconds=_HELLO_SECONDS))
@@ -201,7 +201,7 @@ class CanLink:
             yield SingleFrames(bus, heard, self._source or bus.own)
 
     def exchange_limited(self, frame: bytes, *, tries: int, seconds: float) -> bytes:
-        """As ``exchange``, at most ``tries`` times, each with ``seconds`` of silence allowed."""
+        """Exchange as ``exchange`` does, at most ``tries`` times, each with ``seconds`` of silence allowed."""
         self._last = self._number()
         return self._ask(frame, self._last, tries=tries, seconds=seconds)
 

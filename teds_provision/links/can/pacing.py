@@ -41,7 +41,7 @@ _NO_BIT = 0  # before the first bit of a frame; else 1 + 4 · the last bit + (eq
 
 
 def classic_bits(identifier: int, data: bytes) -> int:
-    """Bits of a classic extended data frame from start of frame to the end of the intermission, stuffing included."""
+    """Return the bits of a classic extended data frame, from start of frame to intermission, with stuff bits."""
     length, stuffed, state, crc = _classic_head(identifier, len(data))
     for octet in data:
         more, state = _run(state, octet, 8)
@@ -55,7 +55,7 @@ def classic_bits(identifier: int, data: bytes) -> int:
 
 
 def fd_seconds(identifier: int, data: bytes, bitrate: int, data_bitrate: int) -> float:
-    """Seconds that an extended FD frame with bit rate switching takes; ``data`` is padded to a length FD knows."""
+    """Return the seconds of an extended FD frame with bit rate switching; ``data`` is padded to a length of FD."""
     length = next(size for size in FD_LENGTHS if size >= len(data))
     slow, stuffed, state = _fd_head(identifier)
     fast_stuffed, state = _run(state, FD_LENGTHS.index(length), 5)  # ESI (0) and the length's code
@@ -167,7 +167,7 @@ def sharp_timers() -> None:
 
 @lru_cache(1024)
 def _classic_head(identifier: int, octets: int) -> tuple[int, int, int, int]:
-    """Bits in front of the data, stuff bits among them, the run that they end with, and the CRC so far."""
+    """Return the bits before the data, their stuff bits, the run that they end with, and the CRC so far."""
     fields = [0, *_bits(identifier >> 18, 11), 1, 1, *_bits(identifier & 0x3FFFF, 18), 0, 0, 0, *_bits(octets, 4)]
     crc = 0
     for bit in fields:
@@ -177,7 +177,7 @@ def _classic_head(identifier: int, octets: int) -> tuple[int, int, int, int]:
 
 @lru_cache(1024)
 def _fd_head(identifier: int) -> tuple[int, int, int]:
-    """Bits at the nominal rate in front of the data's, stuff bits among them, and the run that they end with."""
+    """Return the bits at the nominal rate before the data, their stuff bits, and the run that they end with."""
     # start, base identifier, SRR, IDE, extension, RRS, FDF, reserved, BRS
     nominal = [0, *_bits(identifier >> 18, 11), 1, 1, *_bits(identifier & 0x3FFFF, 18), 0, 1, 0, 1]
     return len(nominal), *_runs(nominal)

@@ -71,7 +71,7 @@ def _number(fields: Fields, name: str) -> int | None:
 
 
 def capability(payload: bytes) -> Fields:
-    """``WLCCAP``: the node can be charged; times in ms."""
+    """Return the fields of ``WLCCAP``: the node can be charged; times in ms."""
     if len(payload) < 6:
         return {}
     version, flags, wait, read_wait, write_timeout, write_wait = payload[:6]
@@ -89,7 +89,7 @@ def capability(payload: bytes) -> Fields:
 
 
 def status(payload: bytes) -> Fields:
-    """``WLCSTAI``: how the node is; percent and °C, the rest without a public unit."""
+    """Return the fields of ``WLCSTAI``, the node's state: percent and °C, the rest without a public unit."""
     return dict(_status_fields(payload))
 
 
@@ -110,7 +110,7 @@ def _signed(octet: int) -> int:
 
 
 def control(payload: bytes) -> Fields:
-    """``WLCCTL``: whether the node wants power, and for how long (ms)."""
+    """Return the fields of ``WLCCTL``: whether the node wants power, and for how long (ms)."""
     if len(payload) < 6:
         return {}
     flags, request, step, percent, driver, last = payload[:6]

@@ -89,7 +89,7 @@ class Frontend(nfc.ContactlessFrontend):  # type: ignore[misc]
         return answer
 
     def _carried(self, send_data: bytes, timeout: float) -> Any:
-        """As nfcpy's exchange, which writes out each frame for its log."""
+        """Exchange as nfcpy does, which formats each frame for its log even if nothing is logged."""
         if not _logged():
             with self.lock:
                 if self.device is not None and isinstance(self.target, nfc.clf.RemoteTarget):

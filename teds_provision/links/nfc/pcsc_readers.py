@@ -44,7 +44,7 @@ def names_if_any() -> list[str]:
 
 
 def contactless(found: list[str]) -> list[str]:
-    """Without the slots for security modules that many readers have beside their antenna."""
+    """Return the readers without the slots for security modules that many have beside their antenna."""
     return [name for name in found if " SAM " not in f" {name} "]
 
 

@@ -96,7 +96,7 @@ def _open_usb(path: str, trace: Trace | None) -> Reader:
 
 
 def _usb_readers(path: str) -> list[tuple[int, int, int, int]]:
-    """Vendor, product, bus and device number of every reader on ``path`` that nfcpy has a driver for."""
+    """Return vendor, product, bus and device number of every reader on ``path`` that nfcpy has a driver for."""
     try:
         seen = nfc.clf.transport.USB.find(path) or []
     except FileNotFoundError as error:

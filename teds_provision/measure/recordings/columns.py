@@ -112,7 +112,7 @@ def raw_kind(form: str) -> RawKind:
 
 
 def integers(values: Sequence[int]) -> NDArray[Any]:
-    """Integers of any size, in the smallest type of 64 bits that holds them all."""
+    """Return integers of any size in the smallest array type that holds them all."""
     for kind in (np.int64, np.uint64):
         try:
             return np.array(values, dtype=kind)
@@ -143,7 +143,7 @@ class BlockJoiner:
         return self.rest() if self._rows >= ROWS else []
 
     def rest(self) -> list[Entry]:
-        """All that waits, and the end of a batch."""
+        """Return all entries that wait, and the end of a chunk."""
         runs = [run for all_of in self._waiting.values() for run in all_of]
         self._waiting, self._rows = {}, 0
         return [*(_joined(run) for run in runs), ()]

@@ -94,7 +94,7 @@ def convert(source: Path, target: Path, *, wide: bool = False, units: FileUnits 
 def _as_parquet(
     path: Path, entries: Iterator[Entry], recording: Recording, *, wide: bool, units: FileUnits
 ) -> list[Path]:
-    """One file for each set of facts: with another datasheet the next one begins, as with CSV."""
+    """Write one file for each set of facts: another datasheet begins a new file, as with CSV."""
     known = dict(recording.facts)
     if units == "shown":
         conversion = UnitConversion()

@@ -216,7 +216,7 @@ class McapRecording(Recording):
                 yield from joined.add_block(block)
 
     def _decoded(self, topic: _Topic, contents: list[bytes], length: int) -> Iterator[Block]:
-        """Blocks of messages of one length, so of one layout; a jump of the sample number begins another one."""
+        """Yield the blocks of messages of one length, so of one layout; a jump in sample numbers begins a new one."""
         size, columns = length + HEAD.size, len(topic.channels)
         integral = next((kind for kind in (True, False) if _SMALLEST[kind] + 16 * columns == size), None)
         if integral is None:
@@ -272,7 +272,7 @@ def _map(content: bytes, at: int) -> dict[str, str]:
 
 
 def _values(words: dict[str, str]) -> dict[str, Any]:
-    """Facts as they were before they became texts; those that are texts stay so."""
+    """Return facts as they were before they became texts; those that are texts stay so."""
     found: dict[str, Any] = {}
     for name, text in words.items():
         try:

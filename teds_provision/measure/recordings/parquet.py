@@ -292,7 +292,7 @@ def _floats(column: Any) -> NDArray[Any]:
 
 
 def _exact(column: Any) -> NDArray[Any]:
-    """Raw values: numbers as they are; of text long whole numbers, else octets of hex digits."""
+    """Return raw values: numbers unchanged; of text, whole numbers beyond 64 bits, else octets of hex digits."""
     kind = str(column.type)
     if kind in ("int64", "uint64"):
         filled: NDArray[Any] = column.fill_null(0).to_numpy(zero_copy_only=False)

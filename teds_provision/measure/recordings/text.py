@@ -52,7 +52,7 @@ class TextRecording(Recording):
         )
 
     def _lines(self) -> Iterator[str]:
-        """Whole lines, without their ends; what is no whole line at the end is torn."""
+        """Yield whole lines without their ends; a part of a line at the end of the file counts as torn."""
         self._line, rest = 0, b""
         with open_to_read(self.path) as file:
             while piece := file.read(_PIECE):

@@ -161,7 +161,7 @@ class Measurement:
             self.watcher.note(f"Waiting for {names} before the trigger, up to {TOGETHER:.0f} s.")
 
     def _until(self, now: float, duration: float | None) -> float:
-        """When ``duration`` seconds of data are over: they count from the first values."""
+        """Return the time at which ``duration`` seconds of data are over; they count from the first values."""
         left = self._common_start.seconds_left
         if duration is None or left is None or not any(supervisor.ever_ran for supervisor in self.supervisors):
             return math.inf
@@ -418,6 +418,6 @@ def _as_error(sink: Sink) -> TedsProvisionError | None:
 
 
 def _rank(error: TedsProvisionError) -> int:
-    """Not authentic before refused before the link before the rest."""
+    """Return the rank of an error: not authentic first, then refused, the link, all others."""
     order = (4, 6, 5)
     return order.index(error.exit_code) if error.exit_code in order else len(order)

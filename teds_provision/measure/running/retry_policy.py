@@ -30,7 +30,7 @@ class RetryPolicy:
         self._ends = timeout is not None
 
     def has_run(self) -> None:
-        """Its first value is there: from now on anyone could have sent a refusal, so it is tried again for ever."""
+        """Handle its first value: from now on anyone could have sent a refusal, so it is retried without end."""
         self._until = math.inf
 
     @property
@@ -39,7 +39,7 @@ class RetryPolicy:
         return max(0.0, self._until - time.monotonic())
 
     def again(self, pause: float) -> str:
-        """When it is tried again, and for how long that goes on."""
+        """Return when it is tried again, and for how long, as text."""
         left = self.seconds_left
         return f"{pause:.0f} s" if left == math.inf else f"{min(pause, left):.0f} s, giving up in {left:.0f} s"
 

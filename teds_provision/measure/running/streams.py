@@ -124,7 +124,10 @@ class NodeStreams:
                 self._held.append(block)
 
     def tell_time(self, trusted: VerifiedSession) -> ClockReply:
-        """One Clock: sends and waits without the map's lock, which the hearing thread needs."""
+        """Send one Clock and record the exchange.
+
+        It waits without the map's lock, which the receiver thread needs.
+        """
         reply, exchange = ask_clock(trusted.node)
         with self.mapping:
             self.clock.exchange(exchange)
@@ -200,7 +203,7 @@ class NodeStreams:
     # -- whether the node is still there -----------------------------------------------------------------------------
 
     def _steady(self) -> list[ReceivedStream]:
-        """Streams whose messages come all the time: events may be silent for ever, and so may what waits."""
+        """Return streams that have messages all the time: events, and streams waiting for a trigger, may be silent."""
         return [
             stream
             for stream in self.running.values()

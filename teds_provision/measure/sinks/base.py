@@ -75,7 +75,7 @@ class Sink(Protocol):
         """Begin; ``facts`` are those of the channels that are known by now."""
 
     def describe(self, facts: Sequence[ChannelFacts]) -> None:
-        """Facts of channels that came later, or changed since (a new datasheet)."""
+        """Learn the facts of channels that came later, or changed (a new datasheet)."""
 
     def write(self, block: Block) -> None:
         """Take samples of one stream."""
@@ -131,7 +131,7 @@ class ThreadedSink(ABC):
         self._thread.start()
 
     def describe(self, facts: Sequence[ChannelFacts]) -> None:
-        """Facts that came later; never dropped."""
+        """Queue facts that came later; they are never dropped."""
         self._put(tuple(facts), 0)
 
     def write(self, block: Block) -> None:
@@ -139,12 +139,12 @@ class ThreadedSink(ABC):
         self._put(block, int(block.value.size))
 
     def write_group(self, rows: GroupRows) -> None:
-        """Rows of the grid."""
+        """Queue rows of the grid."""
         if self.wants_rows:
             self._put(rows, int(rows.value.size))
 
     def report(self, report: NodeReport) -> None:
-        """State of a node."""
+        """Queue the state of a node."""
         self._put(report, 0)
 
     def clock_set(self, news: ClockSet) -> None:
@@ -164,14 +164,14 @@ class ThreadedSink(ABC):
 
     @abstractmethod
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
-        """On the caller's thread: check and open. Raises TedsProvisionError."""
+        """Check and open, on the caller's thread. Raises TedsProvisionError."""
 
     def _begin(self) -> None:  # noqa: B027  may be left out
-        """First step on the sink's own thread."""
+        """Run the first step on the sink's own thread."""
 
     @abstractmethod
     def _process_item(self, item: Item) -> None:
-        """One item."""
+        """Write one item."""
 
     def _first(self) -> None:
         """Call ``_begin``; a sink that can outlive its failure does so here, in ``_one`` and in ``_beat``."""
@@ -186,7 +186,7 @@ class ThreadedSink(ABC):
         self._idle(now)
 
     def _idle(self, now: float) -> None:  # noqa: B027  may be left out
-        """Something to do by the clock (time.monotonic); at least every TICK."""
+        """Do work that is due by the clock (time.monotonic); called at least every TICK."""
 
     @abstractmethod
     def _finish(self) -> None:
@@ -231,7 +231,7 @@ class ThreadedSink(ABC):
                 self._lock.notify_all()
 
     def _drop_oldest(self) -> None:
-        """Of what waits, the oldest samples go; facts and reports stay, they are few."""
+        """Drop the oldest waiting samples; facts and reports stay, they are few."""
         for place, (_, values, item) in enumerate(self._items):
             if isinstance(item, Block | GroupRows):
                 del self._items[place]

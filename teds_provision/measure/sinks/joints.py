@@ -86,7 +86,7 @@ def _of_node(uuid: str, channels: Sequence[ChannelFacts], topics: Topics) -> lis
 def state_of(
     joints: Sequence[Joint], newest: Mapping[tuple[str, int], float]
 ) -> tuple[list[str], list[float], list[float], list[float]]:
-    """Names, positions, velocities and efforts of a JointState.
+    """Return names, positions, velocities and efforts of a JointState.
 
     A joint without a position is left out: the hardware interface takes one for each name. Velocities and efforts are
     there for all joints or for none, as the message demands.

@@ -14,7 +14,7 @@ from teds_provision.teds.calibration.plain import calibration_as_json
 
 
 def iso(seconds: float) -> str:
-    """ISO 8601 in UTC, to the millisecond, of unix seconds."""
+    """Return unix seconds as ISO 8601 in UTC, to the millisecond."""
     try:
         return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
     except (OverflowError, OSError, ValueError):
@@ -34,7 +34,7 @@ _WITHIN = ("units", "siblings", "chosen")  # fields of facts that are of use in 
 
 
 def facts_as_json(facts: ChannelFacts) -> dict[str, Any]:
-    """Facts of a channel for a header or a metadata message: what is not known is left out."""
+    """Return the facts of a channel for a header or a metadata message, without those that are not known."""
     fields = {
         field.name: getattr(facts, field.name) for field in dataclasses.fields(facts) if field.name not in _WITHIN
     }
@@ -46,7 +46,7 @@ def facts_as_json(facts: ChannelFacts) -> dict[str, Any]:
 
 
 def data_lines(block: Block, facts: Mapping[tuple[str, int], ChannelFacts]) -> Iterator[dict[str, Any]]:
-    """One ``data`` event for each channel of a block (``measure --json``); an invalid value is null, never NaN."""
+    """Yield a ``data`` event for each channel of a block (``measure --json``); an invalid value is null, never NaN."""
     times = [round(instant, 6) for instant in block.time.tolist()]
     for column, number in enumerate(block.channels):
         known = facts.get((block.uuid, number)) or ChannelFacts(block.uuid, "", number, "")

@@ -126,7 +126,7 @@ class TopicSink(ThreadedSink):
 
     @abstractmethod
     def _fields(self, topic: str, kind: str, stamp: float, frame: str, fields: Mapping[str, FieldValue]) -> None:
-        """One message of type ``kind`` with a header, its fields by path (``magnetic_field.x``)."""
+        """Publish one message of type ``kind`` with a header, its fields by path (``magnetic_field.x``)."""
 
     @abstractmethod
     def _latched(self, topic: str, words: str) -> None:

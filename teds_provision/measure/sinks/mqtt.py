@@ -134,7 +134,7 @@ class MqttSink(ThreadedSink):
             raise BadDataError(f"The password file {self._files['password-file']} is not UTF-8 text.") from error
 
     def _tls(self) -> ssl.SSLContext:
-        """How the broker is checked, and what this client shows; raises NotFoundError, BadDataError."""
+        """Return how the broker is checked, and what this client presents; raises NotFoundError, BadDataError."""
         for named, path in self._files.items():
             _octets(named, path)  # the library reads by name and knows no limit
         try:
@@ -187,7 +187,7 @@ class MqttSink(ThreadedSink):
         self._client.loop_start()
 
     def _learn(self, facts: tuple[ChannelFacts, ...]) -> None:
-        """Facts that are new or have changed are announced, and those of a node whose topics have another name now."""
+        """Announce facts that are new or changed, and those of a node whose topics have been renamed."""
         changed = [channel_facts.key for channel_facts in facts if self._facts.get(channel_facts.key) != channel_facts]
         self._facts.update((channel_facts.key, channel_facts) for channel_facts in facts)
         self._topics.learn(facts)
@@ -221,7 +221,7 @@ class MqttSink(ThreadedSink):
         self._announce()
 
     def _greet(self) -> None:
-        """After each connection: who is here, and what there is."""
+        """Announce the station and its channels after each connection."""
         if self._anew.is_set() and self._client.publish(self._status, "online", qos=1, retain=True).rc != _FULL:
             self._anew.clear()
             self._why = ""
@@ -375,7 +375,7 @@ def _no_password() -> str:
 
 
 def _in_words(error: BaseException, host: str, port: int) -> str:
-    """Why no connection came about."""
+    """Return why no connection was made, as text."""
     if isinstance(error, ssl.SSLCertVerificationError):
         reason = error.verify_message or str(error)
         return f"the certificate of {host} does not verify: {reason} (ca=PATH names the CA)"

@@ -68,7 +68,7 @@ class Topics:
         self._name_nodes()
 
     def learn(self, facts: Iterable[ChannelFacts]) -> None:
-        """Facts of channels; a node that the station does not know gives way to those that it does."""
+        """Learn facts of channels; a node that the station does not know gives its name up to one that it does."""
         strangers = len(self._strangers)
         for channel_facts in facts:
             if channel_facts.unverified:
@@ -135,7 +135,7 @@ class Topics:
         return self._chosen.get((uuid, 0)) or self._nodes.get(uuid) or f"n{uuid[:8]}"
 
     def channel(self, uuid: str, number: int) -> str:
-        """Whole topic of a channel: ``/bench/arm/angle``."""
+        """Return the whole topic of a channel: ``/bench/arm/angle``."""
         if (uuid, number) in self._chosen and uuid not in self._unverified:
             return f"/{self._chosen[uuid, number]}"
         if uuid not in self._made:

@@ -196,7 +196,7 @@ def _raw_values(block: Block) -> list[list[Any]]:
 
 
 def names_of(known: Sequence[ChannelFacts]) -> list[str]:
-    """``NODE/CHANNEL`` of each channel; those of one name get their UUID and number behind it."""
+    """Return ``NODE/CHANNEL`` of each channel; equal names get their UUID and number appended."""
     names = [f"{facts.node or facts.uuid}/{facts.label}" for facts in known]
     count = Counter(names)
     return [

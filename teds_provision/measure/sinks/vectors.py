@@ -48,7 +48,7 @@ class Meaning:
     variance: bool = False  # whether the message has a field for it
 
     def field_value(self, value: float) -> float:
-        """Value of the message's field."""
+        """Return the value of the message's field."""
         return value + self.shift
 
 
@@ -131,7 +131,7 @@ def compounds_of(facts: Iterable[ChannelFacts]) -> list[Compound]:
 
 
 def _vectors(sensors: Mapping[int, ChannelFacts]) -> dict[object, list[list[ChannelFacts]]]:
-    """Axes of each whole vector whose axes are of one unit, by that unit."""
+    """Return the axes of each whole vector whose axes have one unit, by that unit."""
     groups = {
         facts.vector: [sensors[n] for n in facts.vector]
         for facts in sensors.values()
@@ -155,7 +155,7 @@ def _paths(field_name: str, axes: list[ChannelFacts]) -> tuple[tuple[str, int], 
 
 
 def _covariance(axes: list[ChannelFacts]) -> list[float]:
-    """Row by row; only the diagonal is known."""
+    """Return the covariance row by row; only the diagonal is known."""
     found = [0.0] * 9
     for k, facts in enumerate(axes):
         found[4 * k] = variance_of(facts)
@@ -192,7 +192,7 @@ def _range(facts: ChannelFacts) -> Compound:
 
 
 def _without_namesakes(found: list[Compound]) -> list[Compound]:
-    """Two of one kind get the number of their first channel behind the name."""
+    """Return the compounds; two of one name get the number of their first channel appended."""
     names = [compound.name for compound in found]
     return [
         compound

@@ -76,7 +76,7 @@ class _SharedSession:
 
     @contextmanager
     def session(self, _uuid: str) -> Iterator[VerifiedSession | None]:
-        """One exchange at a time."""
+        """Yield the session for one exchange at a time."""
         with self.turn:
             yield self.verified
 
@@ -235,7 +235,7 @@ class ActuatorLeases:
 
     @contextmanager
     def _session(self, uuid: str) -> Iterator[Measured]:
-        """How to get at the node's session, again and again: the measurement's, or one of our own."""
+        """Yield access to the node's session for repeated use: the measurement's, or one of our own."""
         if self._is_measured(uuid):
             yield self._measured
             return

@@ -200,7 +200,7 @@ class NodeDirectory:
         return news
 
     def strangers(self, place: str) -> int:
-        """How many nodes of a link are not looked at."""
+        """Return how many nodes of a link are ignored."""
         with self._lock:
             return len(self._strangers.get(place, ()))
 
@@ -213,14 +213,14 @@ class NodeDirectory:
             self.note(uuid, "left", present=False)
 
     def present(self, place: str) -> int:
-        """How many nodes are there."""
+        """Return how many nodes of a link are present."""
         with self._lock:
             return sum(seen.present and seen.place == place for seen in self._seen.values())
 
     # -- for the API -------------------------------------------------------------------------------------------------
 
     def uuids(self) -> list[str]:
-        """Every node of the store or on a link: those that are there first, each part by name."""
+        """Return every node of the store or on a link: those present first, each part by name."""
         with self._lock:
             known = set(self._rows) | {uuid for uuid, seen in self._seen.items() if seen.present or seen.looked}
             return sorted(known, key=lambda uuid: (not self.seen(uuid).present, _order(self.name(uuid), uuid)))
@@ -288,12 +288,12 @@ class NodeDirectory:
         return text
 
     def touch(self) -> None:
-        """Something that is shown of every node has changed (names of topics)."""
+        """Record that something shown of every node has changed (names of topics)."""
         with self._lock:
             self.changes += 1
 
     def node(self, uuid: str) -> dict[str, Any]:
-        """One node: api.md, `/nodes/UUID`."""
+        """Return one node: api.md, `/nodes/UUID`."""
         channels = self._sheet(uuid)
         with self._lock:
             seen = self._seen.get(uuid) or NodePresence()

@@ -332,7 +332,7 @@ class LinkWatch:
             self._directory.note(uuid, "left", present=False)
 
     def _publish_notice(self, notice: Notice) -> None:
-        """Something else that a person should know of, once."""
+        """Publish another notice that a person should know of, once."""
         if notice.text != self.state.notice_text:
             self.state.notice_text = notice.text
             self._live.event("link", place=self.place, state=notice.kind, text=notice.text)

@@ -75,7 +75,7 @@ class NodeLocks:
 
     @contextmanager
     def hold(self, uuid: str, what: str, *, wait: float = WAIT) -> Iterator[None]:
-        """Work on one node for the length of the block."""
+        """Hold one node for work for the length of the block."""
         self.acquire(uuid, what, wait=wait)
         try:
             yield

@@ -69,7 +69,7 @@ class ProvisioningRun:
     job: NodeJob[Any] | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """api.md, `/nodes/UUID/provision`."""
+        """Return the object of api.md, `/nodes/UUID/provision`."""
         names = ("uuid", "state", "waits_for", "until", "steps", "error", "verdict")
         return {name: getattr(self, name) for name in names}
 
@@ -284,11 +284,11 @@ class _RunReporter:
         self._step(step.name, step.result, step.detail)
 
     def notice(self, notice: Notice) -> None:
-        """Something is waited for, or came by."""
+        """Publish that the run waits for something, or that something arrived."""
         self._live.event("provision", uuid=self._run.uuid, state="running", text=notice.text)
 
     def written(self, octets: int, total: int) -> None:
-        """So many octets of the datasheet are staged."""
+        """Publish how many octets of the datasheet are staged."""
         self._live.event(
             "provision", uuid=self._run.uuid, state="running", step="write", result="running",
             detail=f"{octets} of {total} octets",

@@ -53,7 +53,7 @@ class Sheets:
         self._station, self._directory, self._node_jobs, self._measured = station, roster, desk, measured
 
     def read(self, uuid: str) -> DatasheetRead:
-        """From the node if it is on a bus, else as it was last read; raises NotFoundError, and what reading raises."""
+        """Read from the node if it is on a bus, else return the last reading; raises NotFoundError too."""
         held = self._measured(uuid)
         if held is None and self._node_jobs.on_a_bus(uuid):
             found = self._node_jobs.with_node(uuid, "its datasheet is read", self._read)

@@ -37,7 +37,7 @@ class Feed:
     skipped: int = 0
 
     def as_json(self) -> dict[str, Any]:
-        """api.md, `/virtual`."""
+        """Return the object of api.md, `/virtual`."""
         return {name: getattr(self, name) for name in ("by", "since", "lines", "skipped")}
 
 
@@ -106,14 +106,14 @@ class _NoClock:
         return 0.0
 
     def own_clock(self) -> None:
-        """Nothing to stop."""
+        """Do nothing: there is no clock to stop."""
 
     def advance(self, seconds: float, change: Callable[[], None]) -> None:
         """Take the new values."""
         change()
 
     def host_clock(self) -> None:
-        """Nothing to go on with."""
+        """Do nothing: there is no clock to go on with."""
 
 
 class Pace:

@@ -73,7 +73,7 @@ class Virtual:
     feed: Feed | None = field(default=None, repr=False)
 
     def as_json(self) -> dict[str, Any]:
-        """api.md, `/virtual`."""
+        """Return the object of api.md, `/virtual`."""
         facts = {name: getattr(self, name) for name in ("uuid", "name", "source", "state", "why", "channels")}
         return {**facts, "simulation": self.feed.as_json() if self.feed is not None else None}
 
@@ -105,7 +105,7 @@ class Virtuals:
         return with_source(f"can:{self.bus}", own_source(self._station.id))
 
     def all(self) -> list[dict[str, Any]]:
-        """Every one."""
+        """Return every virtual transducer as JSON."""
         with self._guard:
             return [virtual.as_json() for virtual in self._all.values()]
 

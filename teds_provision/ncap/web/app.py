@@ -99,7 +99,7 @@ class _Page(StaticFiles):
     """The files of the page; a browser asks whether they are still good."""
 
     async def get_response(self, path: str, scope: Scope) -> Response:
-        """One file."""
+        """Return one file, which the browser has to revalidate."""
         response = await super().get_response(path, scope)
         response.headers["cache-control"] = "no-cache"
         return response

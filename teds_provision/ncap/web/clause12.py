@@ -66,7 +66,7 @@ class Clause12:
     # -- the resources -----------------------------------------------------------------------------------------------
 
     def tims(self, _given: dict[str, str]) -> Fields:
-        """Every node that is there."""
+        """Return every node that is present."""
         present = [uuid for uuid in self._daemon.directory.uuids() if self._daemon.directory.seen(uuid).present]
         numbers = [self._number(uuid) for uuid in present]
         return {"timIds": ",".join(map(str, numbers)), "uuids": ",".join(present)}
@@ -93,7 +93,7 @@ class Clause12:
         return {**ids, "transducerData": last.value, "timestamp": last.time}
 
     def read_teds(self, given: dict[str, str]) -> Fields:
-        """One TEDS, its fields decoded."""
+        """Return one TEDS with its fields decoded."""
         uuid, channel, code = self._teds(given)
         found, _ = self._daemon.sheets.as_json(uuid)
         for block in found["teds"]:
@@ -104,7 +104,7 @@ class Clause12:
         raise NotFoundError(f"Node {uuid} has no TEDS {code} of channel {channel}.")
 
     def read_raw_teds(self, given: dict[str, str]) -> Fields:
-        """One TEDS, its octets in base64."""
+        """Return one TEDS as octets in base64."""
         uuid, channel, code = self._teds(given)
         octets = self._daemon.sheets.read(uuid).image.blocks.get((channel, code))
         if octets is None:

@@ -55,7 +55,7 @@ class Resources:
         self._daemon = daemon
 
     def routes(self) -> list[Route]:
-        """Paths below /api/v1."""
+        """Return the routes below /api/v1."""
         return [
             Route("/status", self.status),
             Route("/detection", self.detection, methods=["GET", "PUT"]),

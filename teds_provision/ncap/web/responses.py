@@ -78,7 +78,7 @@ def answer_refusal(_request: Request, refusal: Exception) -> Response:
 
 
 def answer_bug(_request: Request, error: Exception) -> Response:
-    """Whatever else escapes is a bug; the client learns only its type."""
+    """Return the answer to any other error, which is a bug; the client learns only its type."""
     message = f"Unexpected {type(error).__name__}."
     problem = Problem(code="bug", message=message, hint="See the daemon's log.")
     return JSONResponse(Error(error=problem), 500)

@@ -89,7 +89,7 @@ class HttpConnection(H11Protocol):
         self.transport.abort()
 
     def _await(self) -> None:
-        """Time runs from the beginning of a head, and of a body, to its end."""
+        """Start the time limit of a head, or of a body, when it begins."""
         state = self.conn.their_state
         if state is self._awaited:
             return

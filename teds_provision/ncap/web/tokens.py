@@ -44,7 +44,7 @@ class Token:
 
 
 def digest_of(token: str) -> str:
-    """SHA-256 of a token, hex."""
+    """Return the SHA-256 of a token, hex."""
     return hashlib.sha256(token.encode()).hexdigest()
 
 
@@ -83,7 +83,7 @@ class Tokens:
         return gone
 
     def all(self) -> list[Token]:
-        """Every token that is good now."""
+        """Return every token that is valid now."""
         now = time.time()
         return [token for token in self._read() if not token.until or token.until > now]
 

@@ -310,7 +310,7 @@ class CanServer:
             self._run_transfers(now)
 
     def _wait(self) -> float:
-        """Seconds until a consecutive frame, an answer to everyone or an Announce is due."""
+        """Return the seconds until a consecutive frame, an answer to a broadcast or an Announce is due."""
         with self._lock:
             wait = _IDLE
             for _, pair in self._pushing:
@@ -458,7 +458,7 @@ class CanServer:
         self._at_time(time.monotonic() + self._spread(), answer)
 
     def _spread(self) -> float:
-        """Seconds to wait before an answer to everyone."""
+        """Return the seconds to wait before an answer to a broadcast."""
         return random.uniform(0, _SPREAD_SECONDS)
 
     def _answer_everyone(self, endpoint: CanEndpoint, station: int, own: int, transaction: bytes, *, fd: bool) -> None:

@@ -164,7 +164,7 @@ class Board:
         return self.clock.tick() if self.sampling is None else self.sampling
 
     def keeps(self, period: int) -> bool:
-        """Any whole number of nanoseconds is kept on average."""
+        """Return True for any whole number of nanoseconds: it is kept on average."""
         return period > 0
 
     # -- sensors ---------------------------------------------------------------------------------------------------
@@ -186,7 +186,7 @@ class Board:
         return bool(self._seen)
 
     def events(self) -> Iterator[tuple[int, int, RawReading]]:
-        """Event sensors that show something else than at the last look: channel, tick, what they show."""
+        """Yield the event sensors that changed since the last look: channel, tick, reading."""
         tick = self.now()
         for channel, before in list(self._seen.items()):
             reading = self.read(channel, tick)
@@ -256,7 +256,7 @@ class Board:
         self._testing.update(dict.fromkeys(channels, end))
 
     def testing(self, channel: int) -> bool:
-        """True if its self-test runs."""
+        """Return True if the channel's self-test runs."""
         return self.now() < self._testing.get(channel, 0)
 
     def fault(self, channel: int) -> bool:
@@ -264,7 +264,7 @@ class Board:
         return channel in self.faults
 
     def power(self) -> PowerReply:
-        """Battery and charge; without a battery nothing is known."""
+        """Return battery and charge; nothing is known without a battery."""
         return self.battery.power() if self.battery is not None else PowerReply()
 
 

@@ -46,7 +46,7 @@ class NodeClock:
         return not self._own
 
     def now(self) -> float:
-        """Seconds since the start."""
+        """Return the seconds since the start."""
         return self.tick() / NANOSECONDS
 
     def own_clock(self) -> None:

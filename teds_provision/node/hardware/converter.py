@@ -85,7 +85,7 @@ class Converter:
         return self._to if value - self._to <= self._from + self._turn - value else self._from
 
     def write(self, raw: float) -> bytes:
-        """Octets of a raw number, rounded and kept within what a sample can hold."""
+        """Return the octets of a raw number, rounded and clipped to what a sample can hold."""
         if self._most is not None:
             return min(max(round(raw), 0), self._most).to_bytes(self._octets, "big")
         if self._packing is not None and abs(raw) < _MOST_FLOAT:

@@ -38,7 +38,7 @@ _BATTERY_LEVEL: Final = 0x01
 
 
 def charge_records(power: PowerReply) -> tuple[NdefRecord, ...]:
-    """``WLCCAP`` (I can be charged, or am full) and ``WLCSTAI`` (battery in per cent); none without a battery."""
+    """Return ``WLCCAP`` (can be charged, or is full) and ``WLCSTAI`` (battery in per cent), none without a battery."""
     if not power.flags & PowerFlag.BATTERY or power.level is None:
         return ()
     mode = _BATTERY_FULL if power.flags & PowerFlag.FULL else _STATIC
@@ -49,7 +49,7 @@ def charge_records(power: PowerReply) -> tuple[NdefRecord, ...]:
 
 
 def out_of_band_record(address: bytes, *, random: bool) -> NdefRecord:
-    """Bluetooth LE out-of-band record: ``address`` 6 octets as people write them; the role is peripheral only."""
+    """Return the Bluetooth LE out-of-band record; ``address`` has 6 octets as people write them; peripheral only."""
     structures = b"\x08\x1b" + address[::-1] + bytes((random,)) + b"\x02\x1c\x00"
     return NdefRecord(MIME, OUT_OF_BAND, structures)
 
@@ -156,7 +156,7 @@ class TnepTag:
             self._jobs.put(self._forget)
 
     def idle(self) -> None:
-        """Nothing happens on air: renew the initial message when Identify has changed meanwhile."""
+        """Renew the initial message if Identify has changed; called while nothing happens on air."""
         if self._jobs.empty():
             self._jobs.put(self._renew)
 

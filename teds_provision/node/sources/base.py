@@ -67,7 +67,7 @@ class SimulationClock(Protocol):
     """The node's clock in the hands of a simulation."""
 
     def now(self) -> float:
-        """Seconds since the node's start by its clock."""
+        """Return the seconds since the node's start by its clock."""
 
     def own_clock(self) -> None:
         """Stop the clock, except for :meth:`advance`, from now on."""
@@ -89,13 +89,13 @@ class GeneratedSource:
         self.places = {place.number: place for place in places}
 
     def start(self, drive: SimulationClock) -> None:
-        """Nothing to begin."""
+        """Do nothing: there is nothing to begin."""
 
     def acted(self, values: Mapping[str, float]) -> None:
         """Ignore the values of actuators."""
 
     def stop(self) -> None:
-        """Nothing to end."""
+        """Do nothing: there is nothing to end."""
 
 
 def seconds_of(text: str, word: str) -> float:

@@ -72,7 +72,7 @@ class CommandSource(LineSource):
 
 
 def make(argument: str, places: Sequence[SourceChannel], notify: Notify) -> CommandSource:
-    """``exec:./hand --rate 100``: words as a shell would part them."""
+    """Make the source of ``exec:./hand --rate 100``, split as a shell does."""
     try:
         words = shlex.split(argument)
     except ValueError as error:

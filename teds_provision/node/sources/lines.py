@@ -278,7 +278,7 @@ def _answers(path: Path) -> bool:
 
 
 def make_stream(argument: str, places: Sequence[SourceChannel], notify: Notify) -> StandardInput:
-    """``-`` reads standard input."""
+    """Make the source of ``-``, which reads standard input."""
     return StandardInput(places, notify, sys.stdin.buffer)
 
 
@@ -290,7 +290,7 @@ def make_socket(argument: str, places: Sequence[SourceChannel], notify: Notify) 
 
 
 def make_simulation(argument: str, places: Sequence[SourceChannel], notify: Notify) -> Simulation:
-    """``simulation:PATH``, as ``ncap`` uses it."""
+    """Make the source of ``simulation:PATH``, which ``ncap`` uses."""
     if not argument:
         raise UsageError("simulation: needs a path.", hint="Write --source simulation:/tmp/hand.sock.")
     return Simulation(places, notify, Path(argument))

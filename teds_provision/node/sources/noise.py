@@ -19,7 +19,7 @@ class Noise(GeneratedSource):
 
 
 def make(argument: str, places: Sequence[SourceChannel], notify: Notify) -> Noise:
-    """``noise`` takes no argument."""
+    """Make the source of ``noise``, which takes no argument."""
     if argument:
         raise UsageError(f"noise takes no argument, not {argument!r}.", hint="Write --source noise.")
     return Noise(places)

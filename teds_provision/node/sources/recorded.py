@@ -53,7 +53,7 @@ class RecordedSource(GeneratedSource):
 
 
 def make(argument: str, places: Sequence[SourceChannel], notify: Notify) -> RecordedSource:
-    """``file:run.csv``; raises NotFoundError, and BadDataError with the line that is wrong."""
+    """Make the source of ``file:run.csv``; raises NotFoundError, and BadDataError with the line that is wrong."""
     if not argument:
         raise UsageError("file: needs a file.", hint="Write --source file:run.csv.")
     return read(Path(argument), places, notify)
@@ -76,7 +76,7 @@ def read(path: Path, places: Sequence[SourceChannel], notify: Notify) -> Recorde
 
 
 def _rows(path: Path, lines: list[tuple[int, str]], fields: list[list[str]]) -> Iterator[tuple[int, list[str]]]:
-    """Each row with the number of its line; every one has as many fields as the first line names."""
+    """Yield each row with its line number; raises BadDataError unless it has as many fields as the first line."""
     for (line, _), row in zip(lines[1:], fields[1:], strict=True):
         if len(row) != len(fields[0]):
             raise BadDataError(f"{path}, line {line}: {len(row)} fields, the first line names {len(fields[0])}.")
@@ -84,7 +84,7 @@ def _rows(path: Path, lines: list[tuple[int, str]], fields: list[list[str]]) -> 
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    """Numbered lines without comments and empty ones: the first line and at least one row."""
+    """Return numbered lines without comments and empty ones: the first line and at least one row."""
     text = read_text(path, MOST_OCTETS, "file of values")
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
     if len(lines) < 2:
@@ -108,7 +108,7 @@ def _reading(number: float | None, *, raw: bool) -> Reading | None:
 
 
 def _columns(path: Path, header: list[str], places: Sequence[SourceChannel]) -> list[tuple[int, int, bool]]:
-    """(channel, column, raw) of each column that names a channel."""
+    """Return (channel, column, raw) of each column that names a channel."""
     numbers = {place.name: place.number for place in places if place.name}
     found: list[tuple[int, int, bool]] = []
     if not any(name.lower() in _TIME_NAMES for name in header):

@@ -41,7 +41,7 @@ class WrappedSource:
         self._since = time.monotonic() - drive.now()
 
     def acted(self, values: Mapping[str, float]) -> None:
-        """Nothing: a wrapped node has sensors only."""
+        """Do nothing: a wrapped node has sensors only."""
 
     def stop(self) -> None:
-        """Nothing to end: its reader serves other nodes as well."""
+        """Do nothing: its reader serves other nodes too."""

@@ -156,7 +156,7 @@ def payload_pieces(bundle: Bundle, nodes: Iterable[BundledNode], count: int) -> 
 
 
 def _node_to_json(node: BundledNode) -> str:
-    """Compact JSON of one node, put together by hand: an encoder takes three times as long, and there are thousands."""
+    """Return the compact JSON of one node, put together by hand: an encoder takes three times as long."""
     # x, y and K coded at once, each filled up with zeros to whole groups of three octets: zeros are its spare bits too
     coded = encode_base64url(node.node_key[1:33] + b"\0" + node.node_key[33:] + b"\0" + node.key + b"\0\0")
     x, y, key = coded[:43], coded[44:87], coded[88:110]
@@ -311,7 +311,7 @@ class BundleHeader:
 
 
 def seal_bundle(payload: Bundle, sender: PrivateKey, recipients: Sequence[bytes]) -> bytes:
-    """Like :func:`seal_pieces`, whole: the octets of the file."""
+    """Seal a bundle as :func:`seal_pieces` does, and return the octets of the whole file."""
     made = seal_pieces(payload, payload.nodes, len(payload.nodes), sender, recipients)
     return b"".join([*made.body(), made.end()])
 

@@ -143,7 +143,7 @@ def check_signature(
 
 
 def _es256_good(point: bytes, digest: bytes, signature: bytes) -> bool:
-    """RFC 7518 section 3.4: r ‖ s of 32 octets each; either s."""
+    """Verify ES256 (RFC 7518 section 3.4): r ‖ s of 32 octets each; either s is accepted."""
     if len(signature) != SIGNATURE_OCTETS:
         return False
     der = utils.encode_dss_signature(int.from_bytes(signature[:32], "big"), int.from_bytes(signature[32:], "big"))
@@ -202,7 +202,7 @@ def _recipient_entry(point: bytes, content_key: bytes) -> dict[str, object]:
 
 
 def _wrapping_key(shared: bytes, party_u: bytes, party_v: bytes) -> bytes:
-    """RFC 7518 section 4.6.2: Concat KDF over Z with AlgorithmID, PartyUInfo, PartyVInfo and SuppPubInfo."""
+    """Derive the wrapping key (RFC 7518 section 4.6.2): Concat KDF over Z, AlgorithmID, Party*Info and SuppPubInfo."""
     parts = [len(part).to_bytes(4, "big") + part for part in (KEY_ALGORITHM.encode(), party_u, party_v)]
     info = b"".join(parts) + (8 * _KEY_OCTETS).to_bytes(4, "big")
     return concatkdf.ConcatKDFHash(hashes.SHA256(), _KEY_OCTETS, info).derive(shared)
@@ -305,7 +305,7 @@ def _shared_header(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _entries(document: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """Recipient entries of the General form, or the one of the Flattened form (RFC 7516 section 7.2)."""
+    """Yield the recipient entries of the General form, or the one of the Flattened form (RFC 7516 section 7.2)."""
     if "recipients" not in document:
         return iter((document,))
     entries = document["recipients"]

@@ -140,7 +140,7 @@ def load_object(octets: bytes, what: str) -> dict[str, Any]:
 
 
 def load_exact(octets: bytes, what: str) -> dict[str, Any]:
-    """:func:`load_object` in which no number has a fraction or an exponent: readers round those differently."""
+    """Load as :func:`load_object` does, without fractions and exponents, which readers round differently."""
     with _failing_as(what):
         value = _EXACT.decode(_decoded(octets))
     if not isinstance(value, dict):
@@ -149,7 +149,7 @@ def load_exact(octets: bytes, what: str) -> dict[str, Any]:
 
 
 def load_long(octets: bytearray, what: str, name: str, make: Callable[[object], object]) -> dict[str, Any]:
-    """:func:`load_object` of an object whose member ``name`` is a long list: each element is passed through ``make``.
+    """Load an object whose member ``name`` is a long list; each element is passed through ``make``.
 
     So neither the text nor the elements are ever all there beside what is made of them. ``octets`` is emptied as it is
     read. Whatever ``make`` raises comes out as it is.

@@ -81,7 +81,7 @@ def read_plain(payload: bytes, layout: str, base: int) -> tuple[list[Argument], 
 
 
 def _extent(payload: bytes, at: int, kind: str, count: int) -> int:
-    """Octets that the next argument takes; for a cut one what it should take."""
+    """Return the octets that the next argument takes; for one that was cut off, those that it should take."""
     fixed = size_of(kind)
     if fixed is not None:
         return fixed

@@ -22,7 +22,7 @@ _ATT_OCTETS: Final = 3
 
 
 def piece_octets(mtu: int) -> int:
-    """Octets of a command or reply in one frame: min(MTU - 3, 512) - 6."""
+    """Return the octets of a command or reply in one frame: min(MTU - 3, 512) - 6."""
     return min(max(mtu, LEAST_MTU) - _ATT_OCTETS, MOST_VALUE) - _HEAD.size
 
 

@@ -65,7 +65,7 @@ class Message:
     teds: tuple[tuple[int, bytes], ...] = ()
 
     def get(self, name: str) -> MessageValue | Blocks | None:
-        """Value of the argument of that name, None when absent."""
+        """Return the value of the argument of that name, None if it is absent."""
         return next((argument.value for argument in self.arguments if argument.name == name), None)
 
 
@@ -122,7 +122,7 @@ def _u16(length: int, name: str) -> bytes:
 
 
 def _sniff(octets: bytes, *, lenient: bool = False) -> Kind:
-    """Kind by header; ``lenient`` takes unknown functions of the standard's classes for commands, too."""
+    """Return the kind by header; ``lenient`` counts unknown functions of the standard's classes as commands, too."""
     if _is_network(octets):
         return "network-service"
     if _is_command(octets, lenient=lenient):
@@ -249,7 +249,7 @@ def _reply_length(octets: bytes) -> list[Finding]:
 
 
 def _reply_layout(ok: bool, payload: bytes, request: Message | None) -> tuple[str, str, bool]:
-    """Layout, name, and whether they are guessed from the form."""
+    """Return layout and name, and whether they are guessed from the form."""
     if not ok and len(payload) == 1:
         return "reason:u8", "Refusal", request is None
     if request is not None and request.group is not None and request.function is not None:

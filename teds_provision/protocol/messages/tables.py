@@ -344,7 +344,7 @@ def describe_reply(reply: Reply) -> str:
 
 
 def describe_request(command: Command) -> str:
-    """As :func:`describe_command`, and which TEDS a command is about: "Read (1.2), 5 octets: TEDS 5 of channel 1 …"."""
+    """Describe a command like :func:`describe_command`, with TEDS: "Read (1.2), 5 octets: TEDS 5 of channel 1 …"."""
     text = describe_command(command)
     payload = command.payload
     if (

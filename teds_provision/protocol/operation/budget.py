@@ -16,12 +16,12 @@ _FULL_OCTETS: Final = 8
 
 
 def frames(length: int, *, link: str, fd: bool) -> int:
-    """Frames of a data message: of 8 octets, on FD of 64, on BLE one. ``link`` is ``can`` or ``ble``."""
+    """Return the frames of a data message: of 8 octets, on FD of 64, on BLE one. ``link`` is ``can`` or ``ble``."""
     return 1 if link == "ble" else frames_of(length, fd=fd)
 
 
 def share(count: int, gap: int, n: int, period: int) -> int:
-    """One stream's share of the node's budget in ppm: ⌈frames · g · 10^9 / (n · period)⌉ (g in µs, period in ns).
+    """Return a stream's share of the node's budget in ppm: ⌈frames · g · 10^9 / (n · period)⌉ (g in µs, period in ns).
 
     The node counts with g at least 1; the sum over its streams on one bus is at most 10^6.
     """
@@ -29,7 +29,7 @@ def share(count: int, gap: int, n: int, period: int) -> int:
 
 
 def classic_bits(octets: int, *, worst: bool = True) -> int:
-    """Bits of a classic frame with a 29-bit identifier and ``octets`` of data, interframe space included.
+    """Return the bits of a classic frame with a 29-bit identifier and ``octets`` of data, interframe space included.
 
     ISO 11898-1. ``worst``: with the most stuff bits that can be; else without any.
     """
@@ -38,7 +38,7 @@ def classic_bits(octets: int, *, worst: bool = True) -> int:
 
 
 def fd_seconds(octets: int, bitrate: int, data_bitrate: int, *, worst: bool = True) -> float:
-    """Seconds that a CAN FD frame with a 29-bit identifier takes, bit rate switched; ``octets`` a length of FD.
+    """Return the seconds of an FD frame, 29-bit identifier, bit rate switched; ``octets`` is a length of FD.
 
     ISO 11898-1:2015: CRC of 17 bits up to 16 octets, else of 21, with the stuff count and its fixed stuff bits.
     """

@@ -106,7 +106,7 @@ def cut(message: bytes, *, fd: bool, drive: bool = False) -> Iterator[Segment]:
 
 
 def frames_of(length: int, *, fd: bool, drive: bool = False) -> int:
-    """How many frames a message of ``length`` octets takes."""
+    """Return how many frames a message of ``length`` octets takes."""
     return -(-length // ((FD_OCTETS if fd else CLASSIC_OCTETS) - drive))
 
 

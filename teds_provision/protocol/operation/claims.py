@@ -43,7 +43,7 @@ class Claims:
     # -- questions -------------------------------------------------------------------------------------------------
 
     def channels_of(self, session: NodeSession) -> frozenset[int]:
-        """Channels that a session claims."""
+        """Return the channels that a session claims."""
         sensors = {channel for channel, sessions in self._sensors.items() if session in sessions}
         acting = {channel for channel, held in self.actuators.items() if held.session is session}
         return frozenset(sensors | acting)
@@ -54,12 +54,12 @@ class Claims:
         return (held is not None and held.session is session) or session in self._sensors.get(channel, ())
 
     def holders(self, channel: int) -> set[NodeSession]:
-        """Sessions that claim a channel."""
+        """Return the sessions that claim a channel."""
         held = self.actuators.get(channel)
         return set(self._sensors.get(channel, ())) | ({held.session} if held is not None else set())
 
     def sessions(self) -> set[NodeSession]:
-        """Sessions that claim something."""
+        """Return the sessions that claim something."""
         return {held.session for held in self.actuators.values()}.union(*self._sensors.values())
 
     # -- claiming and letting go -----------------------------------------------------------------------------------
@@ -78,7 +78,7 @@ class Claims:
         self._leases[session] = lease * SECOND
 
     def fed(self, channels: Iterable[int], now: int) -> None:
-        """Good values came for these actuators, and were applied."""
+        """Extend the dead-man of these actuators: good values arrived and were applied."""
         for channel in channels:
             held = self.actuators[channel]
             held.deadline = now + held.dead_man
@@ -140,5 +140,5 @@ class Claims:
 
 
 def _last_sign(session: NodeSession) -> int:
-    """When the last good Sealed frame of a session came, real ns."""
+    """Return when the last good Sealed frame of a session arrived, real ns."""
     return round(session.good_at * SECOND)

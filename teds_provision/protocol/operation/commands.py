@@ -77,7 +77,7 @@ class OperateCommand:
 
 
 def idle(channel: int = 0) -> Command:
-    """Idle (4.2): let go of one channel, 0 of all."""
+    """Return Idle (4.2), which releases one channel, or all for 0."""
     return Command(channel, EITHER, IDLE_FUNCTION)
 
 
@@ -216,7 +216,7 @@ class PowerReply:
     temperature: int | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """As the API and `mode --json` have it."""
+        """Return the object of the API and of `mode --json`."""
         return {
             "flags": bit_words(PowerFlag, self.flags),
             "level": self.level,

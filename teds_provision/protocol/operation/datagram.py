@@ -26,12 +26,12 @@ _NONCE_HEAD: Final = bytes(9)
 
 
 def stream_key(message_key: bytes, run: int) -> bytes:
-    """Key of a stream's run: HKDF-Expand-SHA-256(k_m, "TEDS1 stream" ‖ 00 ‖ run u16, 16 octets)."""
+    """Return the key of a stream's run: HKDF-Expand-SHA-256(k_m, "TEDS1 stream" ‖ 00 ‖ run u16, 16 octets)."""
     return HKDFExpand(hashes.SHA256(), 16, b"TEDS1 stream\0" + run.to_bytes(2, "big")).derive(message_key)
 
 
 def drive_key(message_key: bytes, run: int) -> bytes:
-    """Key of a Drive's run: the same with "TEDS1 drive"."""
+    """Return the key of a Drive's run, derived like that of a stream with "TEDS1 drive"."""
     return HKDFExpand(hashes.SHA256(), 16, b"TEDS1 drive\0" + run.to_bytes(2, "big")).derive(message_key)
 
 
@@ -43,7 +43,7 @@ class DatagramSealer:
         self._decrypt = self._cipher.decrypt
 
     def seal(self, counter: int, plain: bytes) -> bytes:
-        """One message; a counter is used once, which is the caller's to see to."""
+        """Seal one message. The caller has to use each counter once only."""
         head = counter.to_bytes(COUNTER_OCTETS, "big")
         return head + self._cipher.encrypt(_NONCE_HEAD + head, plain, None)
 
@@ -77,7 +77,7 @@ class DriveValues(NamedTuple):
 
 
 def drive_length(octets: int) -> int:
-    """Octets of a Drive message whose data sets have ``octets`` together."""
+    """Return the octets of a Drive message whose data sets have ``octets`` together."""
     return COUNTER_OCTETS + DRIVE_HEAD + octets + TAG_OCTETS
 
 
@@ -94,7 +94,7 @@ class Layout:
         return sum(self.widths)
 
     def cut(self, instant: bytes) -> tuple[bytes, ...]:
-        """One instant into data sets, in order."""
+        """Split one instant into data sets, in order."""
         parts, at = [], 0
         for width in self.widths:
             parts.append(instant[at : at + width])

@@ -88,13 +88,13 @@ class Hardware(Protocol):
         """Begin a self-test; it never moves an actuator."""
 
     def testing(self, channel: int) -> bool:
-        """True if its self-test runs."""
+        """Return True if the channel's self-test runs."""
 
     def fault(self, channel: int) -> bool:
         """Return True if its hardware has a fault, or its last self-test failed."""
 
     def power(self) -> PowerReply:
-        """Battery and charge."""
+        """Return battery and charge."""
 
 
 class SessionPort(NamedTuple):

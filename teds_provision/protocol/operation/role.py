@@ -259,7 +259,7 @@ class OperationRole:
         return b""
 
     def _pairs(self, payload: bytes) -> dict[int, bytes]:
-        """(channel, data set) … to its end; a channel that is not there has no width, so nothing after it is read."""
+        """Parse (channel, data set) … to the end; after an absent channel, which has no width, nothing is read."""
         demand_form(bool(payload))
         values: dict[int, bytes] = {}
         at = 0

@@ -74,7 +74,7 @@ class SubscribeCommand:
 
 
 def message_length(kind: StreamKind, n: int, octets: int) -> int:
-    """13 + n · Σ ModLenth, + 8 for kinds that carry their tick."""
+    """Return 13 + n · Σ ModLenth, + 8 for kinds that carry their tick."""
     return 13 + n * octets + (0 if kind == StreamKind.PERIODIC else 8)
 
 

@@ -183,7 +183,7 @@ class StreamRole:
         return DriveReply(own.run, length).encode()
 
     def clock(self, payload: bytes, session: NodeSession, received: int) -> bytes:
-        """Clock: ``received`` is the tick at which the last frame of the request came."""
+        """Reply to Clock; ``received`` is the tick at which the last frame of the request arrived."""
         demand_form(not payload)
         own, hardware = self._measuring_of(session), self._hardware
         last = NONE if own.drive is None or own.drive.last is None else own.drive.last
@@ -222,14 +222,14 @@ class StreamRole:
                     self._claims.release(session, acting, stopped=True)
 
     def drive_frame(self, session: NodeSession, data: bytes) -> None:
-        """One CAN frame of a Drive message."""
+        """Handle one CAN frame of a Drive message."""
         drive = self._measuring_of(session).drive
         message = drive.assembly.add_drive_segment(data) if drive is not None else None
         if message is not None:
             self.drive_message(session, message)
 
     def drive_message(self, session: NodeSession, message: bytes) -> None:
-        """One whole Drive message; whatever is wrong with it, it is dropped without a word."""
+        """Handle one whole Drive message; a bad one is dropped silently."""
         drive = self._measuring_of(session).drive
         if drive is None or len(message) != drive.assembly.length:
             return
@@ -248,7 +248,7 @@ class StreamRole:
             self._claims.fed(channels, self._real())
 
     def _in_time(self, until: int, channels: Sequence[int]) -> bool:
-        """Not past (which shows as far ahead, mod 2^32), nor further ahead than the shortest dead-man."""
+        """Return True if it is not past (far ahead, mod 2^32), nor further ahead than the shortest dead-man."""
         ahead = (until - self._hardware.now() // MICRO) % _WRAP
         return ahead <= min(self._claims.actuators[channel].dead_man for channel in channels) // MICRO
 
@@ -265,7 +265,7 @@ class StreamRole:
     # -- ends ------------------------------------------------------------------------------------------------------
 
     def claims_ended(self, session: NodeSession, channels: frozenset[int]) -> None:
-        """Claims of these channels ended: streams and Drive over any of them end, with the last one what is armed."""
+        """End streams and Drive over any of these channels, whose claims ended; with the last one what is armed."""
         for stream in [s for s in self._streams if s.session is session and channels.intersection(s.channels)]:
             self._end(stream)
         own = self._measuring_of(session)
@@ -308,7 +308,7 @@ class StreamRole:
         return self._sender(bus).frame(self._on(bus), self._real())
 
     def next_frame(self) -> int | None:
-        """When the next data frame of any bus may begin, real ns."""
+        """Return when the next data frame of any bus may begin, real ns, None for none."""
         due = [self._sender(bus).due(self._on(bus)) for bus in {stream.port.bus for stream in self._streams}]
         return min((at for at in due if at is not None), default=None)
 
@@ -329,7 +329,7 @@ class StreamRole:
         return next((s for s in self._streams if s.session is session and s.asked.stream == number), None)
 
     def _layout(self, channels: tuple[int, ...], session: NodeSession) -> Layout:
-        """Widths of channels that are there and claimed here (else 2)."""
+        """Return the widths of channels; refuses with 2 those that are absent or not claimed by this session."""
         demand(all(self._claims.holds(session, channel) for channel in channels), Reason.WRONG_STATE)
         return Layout(channels, tuple(self._hardware.channels[channel].octets for channel in channels))
 

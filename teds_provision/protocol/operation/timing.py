@@ -41,14 +41,14 @@ class ClockSample:
         return ((self.reply.received - self.asked) + (self.reply.sent - self.answered)) / 2
 
     def error(self, at: int, *, own_drift: float = 0.0) -> float:
-        """Bound of the offset's error in ns at station time ``at``; ``own_drift`` of the station's clock in ppm."""
+        """Return the bound of the offset's error, ns, at station time ``at``; ``own_drift``: the station's, in ppm."""
         reply = self.reply
         round_trip = (self.answered - self.asked) - (reply.sent - reply.received)
         age = max(0, at - self.answered)
         return round_trip / 2 + reply.step + (reply.drift + own_drift) * age / MILLION
 
     def tick(self, at: int, *, own_drift: float = 0.0) -> TickBounds:
-        """Bounds of the node's tick at station time ``at``."""
+        """Return the bounds of the node's tick at station time ``at``."""
         middle, error = at + self.offset, self.error(at, own_drift=own_drift)
         return TickBounds(int(middle - error), int(middle + error) + 1)
 
@@ -74,7 +74,7 @@ class TriggerToken(NamedTuple):
 
 
 def commitment(token: bytes) -> bytes:
-    """C of a token T."""
+    """Return C of a token T."""
     return hashlib.sha256(b"TEDS1 trigger\0" + token).digest()[:16]
 
 

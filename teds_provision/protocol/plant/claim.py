@@ -100,7 +100,7 @@ class Claim:
         return {gave for gave in self.gave if gave[0] not in self.undone}
 
     def to_json(self) -> str:
-        """As the store keeps it."""
+        """Return the JSON that the store keeps."""
         kept = {name: sorted(value) if isinstance(value, set) else value for name, value in asdict(self).items()}
         return json.dumps({name: value for name, value in kept.items() if value not in _NOTHING}, separators=(",", ":"))
 

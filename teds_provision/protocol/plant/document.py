@@ -78,7 +78,7 @@ def seal(members: Mapping[str, Any], key: PrivateKey, kind: DocumentKind) -> byt
 
 
 def hash_of(octets: bytes) -> str:
-    """H: SHA-256 of the signing input, 64 digits."""
+    """Return H: SHA-256 of the signing input, 64 digits."""
     return hashlib.sha256(octets.rpartition(b".")[0]).hexdigest()
 
 
@@ -109,7 +109,7 @@ def open_document(octets: bytes, find_key: Callable[[str], bytes | None], kind: 
 
 
 def split(octets: bytes) -> tuple[bytes, bytes, bytes]:
-    """Header (as it is), payload and signature of a document that was opened; :func:`join` gives the same octets."""
+    """Return header (unchanged), payload and signature of an opened document; :func:`join` gives the same octets."""
     header, text, signature = octets.split(b".")
     return header, decode_base64url(text, "The payload"), decode_base64url(signature, "The signature")
 
@@ -200,7 +200,7 @@ class Fields:
         return point
 
     def octets(self, name: str, count: int) -> bytes:
-        """So many octets in base64url."""
+        """Return a member of ``count`` octets in base64url; raises BadDataError."""
         value = self.members.get(name)
         octets = decode_base64url(value, f"{self._where}: {name}") if isinstance(value, str) else b""
         if len(octets) != count:
@@ -223,7 +223,7 @@ class Fields:
         return value
 
     def one_of(self, name: str, words: tuple[str, ...]) -> str:
-        """One of these words."""
+        """Return a member that is one of these words; raises BadDataError."""
         value = self.members.get(name)
         if value not in words or not isinstance(value, str):
             raise self.bad(name, f"is none of {', '.join(words)}")

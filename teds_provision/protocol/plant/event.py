@@ -161,5 +161,5 @@ def reset_proven(event: Event) -> str | None:
 
 
 def hash_of_statement(statement: str) -> str:
-    """H of a statement's signed text: one and the same statement, whichever s its signature has."""
+    """Return H of a statement's signed text: the same for either s of its signature."""
     return hash_of(statement.encode())

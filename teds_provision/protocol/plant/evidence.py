@@ -99,7 +99,7 @@ class BoardFacts:
     firmware: tuple[str, str, str, int] | tuple[()] | None = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Member ``facts`` of the predicate."""
+        """Return the member ``facts`` of the predicate."""
         found = self._all_json()
         if self.firmware == ():
             del found["firmware"]
@@ -138,7 +138,7 @@ class EvidenceClaim:
 
 
 def canonical(facts: Mapping[str, Any], subject: object) -> bytes:
-    """RFC 8785 form of ``{facts, subject}``, which hold texts, whole numbers, lists and null alone."""
+    """Return the RFC 8785 form of ``{facts, subject}``, which hold only texts, whole numbers, lists and null."""
     try:
         return _spelled({"facts": facts, "subject": subject}).encode()
     except UnicodeEncodeError as error:  # half a surrogate pair
@@ -394,7 +394,7 @@ def _wrong_signatures(evidence: Evidence, signatures: Signatures, ca: bytes) -> 
 
 
 def blocks_of(shown: SecurityTeds) -> tuple[tuple[int, int, str], ...]:
-    """Fields 108 as ``facts`` list them: channel, access code, SHA-256 as 64 hex digits."""
+    """Return fields 108 as ``facts`` list them: channel, access code, SHA-256 as 64 hex digits."""
     return tuple((channel, code, digest.hex()) for (channel, code), digest in shown.signed_blocks.items())
 
 
@@ -526,7 +526,7 @@ def _heads(heads: object) -> tuple[str, int]:
 
 
 def _sha256(members: Members, name: str) -> str:
-    """As ``Members.sha256``, and in lower case: another spelling is another text to the board's signature."""
+    """Return a digest as ``Members.sha256`` does, if in lower case: the board signed that spelling."""
     text = members.get(name)
     if isinstance(text, str) and _DIGEST.fullmatch(text):
         return text

@@ -43,7 +43,7 @@ class CalibrationRule:
     max_age_days: int | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Member ``calibration``."""
+        """Return the member ``calibration``."""
         if self.rule == "one":
             return {"rule": "one", "sha256": self.sha256}
         if self.rule == "list":

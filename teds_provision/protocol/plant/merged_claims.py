@@ -182,7 +182,7 @@ class _Holdings:
 
 
 def _holdings(roster: Roster, claims: Mapping[str, Claim], reset_to: int) -> _Holdings:
-    """Whose key still counts: not forgotten, not given away, newer than the newest reset."""
+    """Return the keys that still count: not forgotten, not given away, newer than the newest reset."""
     found = _Holdings()
     for station, claim in claims.items():
         key = claim.key()
@@ -267,7 +267,7 @@ def _who(roster: Roster, named: Mapping[str, str]) -> str:
 
 
 def _weight(roster: Roster, station: str, at: str) -> tuple[bool, str, str]:
-    """Between stations a keeper's word goes before others', then the greater time, then the higher fingerprint."""
+    """Return a statement's sort key: a keeper's before others', then the later time, then the higher fingerprint."""
     return "keeper" in roster.roles_of(station), at, station
 
 

@@ -302,7 +302,7 @@ def taking(new: Roster, own: Roster | None, registry: str) -> tuple[Taking, str]
 
 
 def best(rosters: Sequence[Roster], own: Roster | None, registry: str) -> list[tuple[Roster, Taking, str]]:
-    """Rosters in the order in which they are to be taken, each judged by those before it."""
+    """Return the rosters in the order in which they are applied, each judged by those before it."""
     judged = []
     for roster in sorted(rosters, key=lambda roster: (roster.version, roster.hash)):
         how, why = taking(roster, own, registry)

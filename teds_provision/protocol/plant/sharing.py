@@ -20,7 +20,7 @@ SILENT: Final = timedelta(days=7)
 
 
 def receivers(roster: Roster, sender: str, share: Share) -> tuple[str, ...]:
-    """Who gets copies by a share: its stations that are members with ``base``, but the sender."""
+    """Return who gets copies by a share: its stations that are members with ``base``, except the sender."""
     return tuple(
         receiver
         for receiver in share.to
@@ -47,7 +47,7 @@ def gave_away(view: MergedClaims, station: str) -> bool:
 
 
 def sharer(roster: Roster, view: MergedClaims, key: tuple[int, str], silent: AbstractSet[str]) -> str | None:
-    """Who has to share a key (epoch, key id): who made it, else the holder with the lowest fingerprint; None: unknown.
+    """Return who shares a key (epoch, key id): its maker, else the holder with the lowest fingerprint; None if unknown.
 
     ``silent`` are stations of which no page came for :data:`SILENT`. A removed one shares nothing.
     """
@@ -69,7 +69,7 @@ def rotator(view: MergedClaims, key: tuple[int, str], me: str) -> str:
 
 
 def silent(created: Mapping[str, datetime | None], now: datetime) -> set[str]:
-    """Stations whose newest page that counts was made more than :data:`SILENT` before now."""
+    """Return the stations whose newest counted page was made more than :data:`SILENT` before now."""
     return {station for station, at in created.items() if at is None or now - at > SILENT}
 
 

@@ -175,12 +175,12 @@ class Tim:
         return reply
 
     def link_lost(self, link: str) -> None:
-        """Loss of the field or link: its session, half-open Open and pending agreement go."""
+        """End session, half-open Open and pending agreement of a link whose field or connection is lost."""
         self._sessions.lose(link)
         self._agreeing.forget(link)
 
     def reset_by_hand(self) -> None:
-        """Button, pad or magnet held 5 s: the effect of Reset."""
+        """Reset by hand (button, pad or magnet held 5 s), to the same effect as Reset."""
         self._commit(in_factory_state(self._flash), safe=True)
         self._end_everything()
 

@@ -142,7 +142,7 @@ class Sessions:
             self._end(held)
 
     def lose(self, link: str) -> None:
-        """Loss of the field or link."""
+        """End the session of a link whose field or connection is lost."""
         held = self._links.pop(link, None)
         if held is not None:
             self._end(held)

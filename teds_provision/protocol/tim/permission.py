@@ -149,12 +149,12 @@ class Permission:
         self.role.demand_configuration(origin.session, writes_over_nfc=writes and origin.port.kind == "nfc")
 
     def _spare_actuators(self) -> None:
-        """No stranger's point arithmetic may hold up the values of a claimed actuator."""
+        """Refuse a stranger's point arithmetic with 17 if it could delay the values of a claimed actuator."""
         if self.role is not None and self.role.claims.actuators and not self.quick_points:
             raise CommandRefusedError(Reason.BUSY)
 
     def _hold_strangers_back(self) -> None:
-        """While a stream runs, plain Read and List beyond one a second get 17, together and over all links."""
+        """Refuse plain Read and List beyond one a second with 17 while a stream runs, all links together."""
         if self.role is None or not self.role.streams.running:
             return
         now = self.clock()

@@ -38,7 +38,7 @@ class BackgroundWriter:
         self._steps.put(lambda: context.run(step))
 
     def wait(self) -> None:
-        """Until the step that was put here last has been taken; raises what it raised."""
+        """Wait until the last queued step is done; raises its error."""
         if self._waiting.get(self._owner) is self:
             error = self._ended.get()
             del self._waiting[self._owner]

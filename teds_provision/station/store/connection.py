@@ -237,7 +237,7 @@ class Connection:
                 self._reader = None
 
     def transaction(self, *, later: bool = False) -> AbstractContextManager[None]:
-        """All or nothing: BEGIN IMMEDIATE, COMMIT, or ROLLBACK when anything is raised; inside another, a savepoint.
+        """Run the block as a transaction: BEGIN IMMEDIATE, COMMIT or, on an error, ROLLBACK; in another, a savepoint.
 
         It is on the disk when the block ends; ``later``: when a later one is, or after :meth:`flush`. A loss of power
         until then undoes it whole, and never without those that came after it.

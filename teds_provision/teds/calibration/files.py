@@ -122,7 +122,7 @@ def _data_lines(table: CsvTable, text: str, keys: Sequence[str]) -> list[tuple[i
 
 
 def _unnamed(table: CsvTable, number: int, cells: list[str]) -> _Columns:
-    """Two columns without a header: raw value and value."""
+    """Return the columns of a file without header: raw value and value."""
     if len(cells) != 2:
         raise BadDataError(
             f"{table.file}:{number}: {len(cells)} columns and no header.",
@@ -194,7 +194,7 @@ def _name_and_unit(cell: str) -> tuple[str, str | None]:
 
 
 def _pair_columns(table: CsvTable, number: int, names: list[str], channel: int | None) -> tuple[int, int]:
-    """Places of raw value and value: the raw one by its name, else the first."""
+    """Return the places of raw value and value: the raw one by its name, else the first."""
     rest = [at for at, name in enumerate(names) if at != channel and not name.startswith(REMARK)]
     if len(rest) != 2:
         raise BadDataError(
@@ -358,7 +358,7 @@ def _certified_channel(file: str, profile: Profile, number: int | None) -> Chann
 
 
 def read_calibrations(text: str, file: str, profile: Profile) -> dict[int, Calibration]:
-    """As :func:`load_calibrations`, from text.
+    """Read calibrations as :func:`load_calibrations` does, from text.
 
     The ending of the name ``file`` decides: .toml, .json, .xml for a certificate, else CSV.
     """

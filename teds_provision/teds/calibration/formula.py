@@ -51,7 +51,7 @@ class PreparedCurve:
         self._plain = len(self._table) == 1  # one cell: no search, no gathering
 
     def __call__(self, *inputs: Floats) -> Floats:
-        """Results for one array per input."""
+        """Return the results for one array per input."""
         with np.errstate(over="ignore", invalid="ignore"):
             if self._plain:
                 distances = [values - offsets[0] for values, offsets in zip(inputs, self._offsets, strict=True)]
@@ -121,7 +121,7 @@ class PreparedInverse:
         )
 
     def _lines(self) -> tuple[Floats, Floats, Floats, Floats, Floats] | None:
-        """Of a curve of straight lines: results at the inner nodes, and per segment start, slope, and its ends."""
+        """Return results at inner nodes and each segment's start, slope and ends; None unless all are straight."""
         part = self._curve.calibration.inputs[0]
         table = self._curve._table
         if part.segments != len(table) or not np.all(table[:, 1] * self._direction > 0):
@@ -144,7 +144,7 @@ class PreparedInverse:
         return self._bisect(results, others)
 
     def ends(self, shape: tuple[int, ...], others: Sequence[Floats] = ()) -> tuple[Floats, Floats]:
-        """Results at the low and at the high end, for as many values of the other inputs."""
+        """Return the results at the low and at the high end, for as many values of the other inputs."""
         return self._at(np.full(shape, self._low), others), self._at(np.full(shape, self._high), others)
 
     def _bisect(self, results: Floats, others: Sequence[Floats]) -> Floats:
@@ -220,12 +220,12 @@ class Residuals:
 
 
 def oriented(points: Points, *, actuator: bool) -> list[tuple[float, float]]:
-    """Points as (input, output): (raw, value) for sensors, (value, raw) for actuators."""
+    """Return points as (input, output): (raw, value) for sensors, (value, raw) for actuators."""
     return [(value, raw) for raw, value in points] if actuator else list(points)
 
 
 def residuals(calibration: Calibration) -> Residuals | None:
-    """Residuals of a calibration's own points, by the curve as written (Float32), the zero offset left out.
+    """Return the residuals of a calibration's own points by the curve as written (Float32), without the zero offset.
 
     None without points.
     """
@@ -352,7 +352,7 @@ def _require_room(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]
 
 
 def _thinned(pairs: list[tuple[float, float]], tolerance: float) -> list[tuple[float, float]]:
-    """Nodes of a polygon that stays within ``tolerance`` of every point (Douglas-Peucker, measured upright)."""
+    """Return nodes of a polygon that stays within ``tolerance`` of every point (Douglas-Peucker, vertical distance)."""
     if tolerance <= 0 or len(pairs) < 3:
         return pairs
     x, y = _columns(pairs)
@@ -378,7 +378,7 @@ def _columns(pairs: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def kind_of(calibration: Calibration) -> str:
-    """``linear``, ``polynomial of degree 3``, ``table of 64 segments``."""
+    """Return ``linear``, ``polynomial of degree 3`` or ``table of 64 segments``."""
     segments = math.prod(part.segments for part in calibration.inputs)
     if calibration.method in ("table", "steps"):
         return f"{calibration.method} of {segments} segment{'s' if segments > 1 else ''}"
@@ -420,7 +420,7 @@ def describe_calibration(calibration: Calibration, now: datetime | None = None) 
 
 
 def sentence(calibration: Calibration) -> str:
-    """One line for people: ``channel 1: polynomial of degree 3, 20 points, largest residual 0.1 N at raw 300, …``."""
+    """Return text for people: ``channel 1: polynomial of degree 3, 20 points, largest residual 0.1 N at raw 300``."""
     unit = "raw" if calibration.actuator else calibration.unit.text
     text = f"channel {calibration.channel}: {kind_of(calibration)}"
     left = residuals(calibration)

@@ -87,7 +87,7 @@ class ChannelInterpreter:
         return tuple(number for number in dict.fromkeys(self.inputs) if number != self.channel.number)
 
     def decode(self, octets: Octets, others: Mapping[int, Octets] | None = None) -> Values:
-        """Values of a block of samples; ``others`` holds the octets of as many samples of each further input."""
+        """Return the values of a block of samples; ``others`` has octets of as many samples of each further input."""
         raw = self.reader.raw(octets)
         rows = {number: self._readers[number].raw(more) for number, more in (others or {}).items()}
         return self.values(raw, rows)
@@ -114,7 +114,7 @@ class ChannelInterpreter:
     def why_invalid(
         self, raw: NDArray[np.generic], others: Mapping[int, NDArray[np.generic]] | None = None
     ) -> dict[str, int]:
-        """Why raw values give none that is valid, as half a sentence each, and how many; nothing of valid ones."""
+        """Return why raw values are invalid, as half sentences with counts; nothing for valid ones."""
         if self.problem:
             return {self.problem.removesuffix("."): len(raw)}
         shown, possible, extrapolated = self._computed(raw, others or {})
@@ -139,7 +139,7 @@ class ChannelInterpreter:
     def _computed(
         self, raw: NDArray[np.generic], others: Mapping[int, NDArray[np.generic]]
     ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-        """Values before the limits are looked at; which raw values can be; which lie beyond the calibrated range."""
+        """Return values before limits are applied, which raw values are possible, and which are extrapolated."""
         numbers, valid = self.reader.numbers(raw)
         if self.problem or (self.channel.actuator and self._curve is not None and self._way_back is None):
             nothing = np.full(len(raw), math.nan)
@@ -293,7 +293,7 @@ class ChannelInterpreter:
         return (scale, offset) == (self.unit.scale, self.unit.offset)
 
     def _shown(self, values: Floats) -> Floats:
-        """Values of the curve (or, without one, in SI units) in :attr:`unit`."""
+        """Convert values of the curve (without one: SI values) to :attr:`unit`."""
         if self._same:
             return values
         own = self.channel.calibration
@@ -301,7 +301,7 @@ class ChannelInterpreter:
         return (si - self.unit.offset) / self.unit.scale
 
     def _stated(self, values: Floats) -> Floats:
-        """Values in :attr:`unit` in the unit of the curve (or, without one, in SI units)."""
+        """Convert values in :attr:`unit` to the unit of the curve (without one: SI)."""
         if self._same:
             return values
         si = values * self.unit.scale + self.unit.offset

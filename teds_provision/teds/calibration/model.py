@@ -161,7 +161,7 @@ class Calibration:
         return out
 
     def fields(self, edition: Edition = 2007) -> list[tuple[str, object]]:
-        """Fields of the Calibration TEDS (access code 5) by name, ready to be composed."""
+        """Return the fields of the Calibration TEDS (access code 5) by name, for the composer."""
         out: list[tuple[str, object]] = []
         if self.date is not None:
             out.append(("LstCalDt", instant(self.date)))
@@ -283,7 +283,7 @@ def _number(decoded: DecodedTeds, name: str) -> float | None:
 
 
 def calibrated_unit(decoded: DecodedTeds, units: Units) -> WrittenUnit:
-    """Calibrated unit of a decoded Calibration TEDS: exponents of the channel, SIConvrt as the way into SI."""
+    """Return the calibrated unit of a decoded Calibration TEDS: exponents of the channel, SIConvrt as the way to SI."""
     convert = next((field for field in decoded.fields if field.name == "SIConvrt"), None)
     if convert is None:
         return recognize(units, 1.0, 0.0)

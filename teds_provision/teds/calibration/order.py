@@ -30,7 +30,7 @@ class CalibrationOrder:
     values: dict[str, tuple[object, int]] = field(default_factory=dict)
 
     def wrong(self, key: str, message: str) -> BadDataError:
-        """Error at a key."""
+        """Return the error at a key, with file and line."""
         line = self.values[key][1] if key in self.values else self.line
         return BadDataError(f"{self.file}:{line}: {key}: {message}" if key else f"{self.file}:{line}: {message}")
 

@@ -16,7 +16,7 @@ MOST_NUMBERS: Final = 100_000
 
 
 def calibration_as_json(calibration: Calibration) -> dict[str, Any]:
-    """Plain data from which :func:`calibration_from_json` makes the same curve.
+    """Return plain data from which :func:`calibration_from_json` makes the same curve.
 
     ``si`` are slope and intercept from ``unit`` into SI. The formula is that of :mod:`model`; an input has a boundary
     more than segments, and an offset for each.

@@ -58,7 +58,7 @@ def with_point(text: str, file: str, point: Point, *, node: str, unit: WrittenUn
 
 
 def node_of(text: str) -> str:
-    """UUID of the node that the points are of, 20 hex digits; "" if the file names none."""
+    """Return the UUID of the node that the points belong to, 20 hex digits; "" if the file names none."""
     owner = _NODE.search(text)
     return owner[1] if owner is not None else ""
 

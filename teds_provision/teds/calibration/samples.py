@@ -163,7 +163,7 @@ class SampleReader:
         return _as_integers(rows) if self._long else _words(rows)
 
     def numbers(self, raw: NDArray[np.generic]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Raw values as Float64, and which of them their data model and SigBits can give.
+        """Return raw values as Float64, and which of them their data model and SigBits can have.
 
         Of integers above 2^53 the nearest Float64 is taken; one that no Float64 can hold is infinite, and not possible.
         """
@@ -177,7 +177,7 @@ class SampleReader:
         return values, possible
 
     def write(self, numbers: NDArray[np.float64]) -> bytes:
-        """Octets of raw numbers, rounded to the nearest that the form can hold and kept within what it can give.
+        """Return octets of raw numbers, rounded to the nearest that the form can hold, and clipped to its range.
 
         Raises BadDataError for a number that is not finite, and for bit sequences and times, which are not quantities.
         """
@@ -214,19 +214,19 @@ class SampleReader:
 
 
 def big_endian(rows: NDArray[np.uint8]) -> NDArray[Any]:
-    """Octets of the last axis (at most 8) as integers of 64 bits, high octet first."""
+    """Return the octets of the last axis (at most 8) as integers of 64 bits, high octet first."""
     padded = np.zeros((*rows.shape[:-1], WORD), dtype=np.uint8)
     padded[..., WORD - rows.shape[-1] :] = rows
     return padded.view(">u8")[..., 0]
 
 
 def _words(rows: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """Up to 8 octets a row, as integers."""
+    """Return rows of up to 8 octets as integers."""
     return big_endian(rows).astype(np.uint64)
 
 
 def _as_integers(rows: NDArray[np.uint8]) -> NDArray[np.object_]:
-    """Any number of octets a row, as Python integers."""
+    """Return rows of any number of octets as Python integers."""
     out = np.empty(len(rows), dtype=object)
     out[:] = [int.from_bytes(row.tobytes(), "big") for row in rows]
     return out

@@ -141,14 +141,14 @@ class ManyChannels:
         return cls(channels, usable) if all(map(_can_stand_beside, channels)) else None
 
     def raw(self, octets: bytes) -> NDArray[Any]:
-        """Raw values (int64, of 8 octets uint64), instants × channels, of instants one after another in a message."""
+        """Return raw values (int64; of 8 octets uint64), instants × channels, of a message's consecutive instants."""
         if self._form is not None:
             return np.frombuffer(octets, self._form).astype(self._native).reshape(-1, len(self._columns))
         rows = np.frombuffer(octets, dtype=np.uint8).reshape(-1, len(self._columns), self._width)
         return big_endian(rows).astype(self._native)
 
     def values(self, raw: NDArray[Any]) -> tuple[Floats, NDArray[np.bool_]]:
-        """Values in SI units, and which are valid."""
+        """Return values in SI units, and which are valid."""
         if self._known is not None:
             value: Floats = self._known.take(raw if self._places is None else raw + self._places)
             return value, value == value  # noqa: PLR0124  NaN alone is not itself
@@ -172,7 +172,7 @@ class ManyChannels:
         return total
 
     def _segments(self, numbers: Floats) -> Floats:
-        """Of each number's segment: its offset, then its coefficients, (degree + 2) × instants × channels."""
+        """Return offset and coefficients of each number's segment, (degree + 2) × instants × channels."""
         if self._inner.shape[1] == 1:
             return np.where(numbers >= self._inner[:, 0], self._highest, self._lowest)
         segment = (numbers[:, :, None] >= self._inner).sum(axis=2)
@@ -180,7 +180,7 @@ class ManyChannels:
         return found
 
     def _valued(self, numbers: Floats, total: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Curved values converted to the channels' units, judged by their limits, and in SI units."""
+        """Convert curve values to the channels' units, check them against their limits, and return them in SI units."""
         if self._converts:
             converted = (total * self._own_scale + self._own_offset - self._offset) / self._scale
             total = np.where(self._same, total, converted)

@@ -79,7 +79,7 @@ class Composer:
         return head + self.tuples(content, self.table.by_name)
 
     def tedsid(self, given: object) -> bytes:
-        """TEDSID tuple; its own length has one octet whatever the width."""
+        """Return the TEDSID tuple; its own length has one octet whatever the width."""
         family, version = self.table.family, _VERSION[self.edition]
         if isinstance(given, Mapping):
             family, version = _octet(given, "family", family), _octet(given, "version", version)
@@ -92,7 +92,7 @@ class Composer:
         return raw_tuple(TEDSID, value)
 
     def tuples(self, pairs: list[tuple[str, object]], known: Mapping[str, FieldSpec]) -> bytes:
-        """Tuples in ascending order; repeated types keep the order given."""
+        """Return the tuples in ascending order; repeated types keep the given order."""
         done: list[tuple[int, bytes]] = []
         seen: set[int] = set()
         for name, value in _spread(pairs, known):
@@ -105,7 +105,7 @@ class Composer:
         return b"".join(self.tuple(number, octets) for number, octets in done)
 
     def one(self, name: str, value: object, known: Mapping[str, FieldSpec]) -> tuple[int, bytes, bool]:
-        """Type, value octets and whether the type may repeat."""
+        """Return type, value octets and whether the type may repeat."""
         spec = known.get(name)
         if spec is not None:
             return spec.type, self.value(spec, value), spec.repeats
@@ -122,7 +122,7 @@ class Composer:
         return int(name), bytes(value), True
 
     def value(self, spec: FieldSpec, value: object) -> bytes:
-        """Value octets of one field, tuples inside included."""
+        """Return the value octets of one field, with the tuples inside it."""
         if spec.kind == "units":
             units = values.as_units(spec, value)
             packed = values.pack_units(spec, units)
@@ -132,7 +132,7 @@ class Composer:
         return values.write(spec, value, self.edition)
 
     def nested_units(self, spec: FieldSpec, packed: bytes) -> bytes:
-        """Spelling A: tuples, zero exponents and a missing extension left out."""
+        """Return spelling A: tuples without zero exponents and without a missing extension."""
         parts = [self.tuple(50, packed[:1])]
         parts += [self.tuple(50 + n, packed[n : n + 1]) for n in range(1, 10) if packed[n] != 128]
         if packed[10]:
@@ -140,7 +140,7 @@ class Composer:
         return b"".join(parts)
 
     def tuple(self, number: int, octets: bytes) -> bytes:
-        """One tuple in this width."""
+        """Return one tuple in this width."""
         if len(octets) >= 1 << 8 * self.width:
             raise LengthOverflowError(f"Field {number} of {self.table.name} has {len(octets)} octets and")
         return raw_tuple(number, octets, width=self.width)
@@ -167,7 +167,7 @@ def _octet(given: Mapping[str, object], key: str, default: int) -> int:
 
 
 def encode(decoded: DecodedTeds) -> bytes:
-    """Octets that a TEDS was decoded from, exactly: unknown fields and classes, damage and all."""
+    """Return exactly the octets that a TEDS was decoded from, with unknown fields, classes and damage."""
     return decoded.octets
 
 

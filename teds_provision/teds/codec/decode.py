@@ -150,7 +150,7 @@ class Head:
             self.find("note", "version", f"The TEDSID names version {what}.", at + size, "TEDSID", usual, what)
 
     def search_tedsid(self, start: int, end: int) -> int | None:
-        """Offset of the first tuple of type 3 with 4 or 5 octets, tuples having one length octet."""
+        """Return the offset of the first tuple of type 3 with 4 or 5 octets (lengths of one octet), None for none."""
         octets, at = self.octets, start
         while at + 1 < end:
             if octets[at] == TEDSID and octets[at + 1] in (4, 5):
@@ -304,7 +304,7 @@ class _Walk(Head):
         return Field(kind, spec.name, self.value(spec, raw, body), raw, at)
 
     def value(self, spec: FieldSpec, raw: bytes, body: int) -> Value:
-        """Value of a leaf whose length needs looking at."""
+        """Return the value of a leaf whose length has to be checked."""
         size, kind = len(raw), spec.kind
         if kind == "uuid":
             wanted = 16 if self.edition == 2024 else 10
@@ -368,7 +368,7 @@ class _Walk(Head):
             )
 
     def units(self, spec: FieldSpec, raw: bytes, at: int, body: int) -> Field:
-        """Physical units in any of three spellings."""
+        """Return physical units in any of three spellings."""
         if is_packed_units(raw):
             return Field(spec.type, spec.name, units_of(raw), raw, at)
         packed = bytearray([0, *[128] * 9, 0])

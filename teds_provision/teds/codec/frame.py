@@ -31,7 +31,7 @@ class RawTuple(NamedTuple):
 
 
 def checksum(octets: bytes) -> int:
-    """0xFFFF minus the sum of all octets modulo 65536 (Length included, checksum excluded)."""
+    """Return 0xFFFF minus the sum of all octets modulo 65536 (Length included, checksum excluded)."""
     # The lower half of Adler-32 is 1 plus the sum, modulo 65521, which 256 octets never reach: far quicker than sum().
     if len(octets) <= _SUMMED:
         return 0x10000 - (adler32(octets) & 0xFFFF)

@@ -60,7 +60,7 @@ def _base64(text: bytes) -> bytes | None:
 
 
 def _is_der(octets: bytes) -> bool:
-    """One SEQUENCE whose length is exactly that of the rest."""
+    """Return True for one SEQUENCE whose length is exactly that of the rest."""
     if len(octets) < 2 or octets[0] != 0x30:
         return False
     if octets[1] < 0x80:

@@ -78,7 +78,7 @@ class Conformity(StrEnum):
 
     @classmethod
     def from_findings(cls, framed: bool, findings: Iterable[Finding]) -> Conformity:
-        """Verdict from the errors found; warnings and notes do not count."""
+        """Return the conformity by the errors found; warnings and notes do not count."""
         frame = content = False
         for finding in findings:
             if finding.severity != "error":
@@ -188,12 +188,12 @@ class DecodedTeds:
     text: tuple[bytes, ...] = ()
 
     def get(self, name: str) -> Value:
-        """Value of the first field of that name at any depth, None when absent."""
+        """Return the value of the first field of that name at any depth, None if absent."""
         found = self.field(name)
         return None if found is None else found.value
 
     def field(self, name: str) -> Field | None:
-        """First field of that name, depth first."""
+        """Return the first field of that name, depth first."""
         pending = list(self.fields)
         while pending:
             first = pending.pop(0)

@@ -164,7 +164,7 @@ def _sample_form(field: Field, find: Find) -> None:
 
 
 def _sampling(field: Field, find: Find) -> None:
-    """SDefault is one bit of the mask in some sources, the number 1 to 5 of a mode in others: either will do."""
+    """Accept SDefault as one bit of the mask, as some sources have it, or as the number 1 to 5 of a mode."""
     parts = {child.type: child.value for child in field.children}
     modes, default = parts.get(_SAMPLING_MODES), parts.get(_DEFAULT_MODE)
     if not isinstance(modes, int) or not isinstance(default, int) or 1 <= default <= 5:

@@ -129,7 +129,7 @@ def require_our_wire(image: Image) -> Image:
 
 
 def ca_hint(name: str, ca_fingerprint: str) -> str:
-    """Field 5: ``name:`` and the first 16 hex digits; the name is cut to 47 octets at a character's border."""
+    """Return field 5: ``name:`` and the first 16 hex digits; the name is cut to 47 octets at a character."""
     cut = name.encode()[:CA_NAME_OCTETS].decode(errors="ignore")
     return f"{cut}:{ca_fingerprint[:16]}"
 
@@ -157,7 +157,7 @@ def decode_block(block: bytes) -> SecurityTeds:
 
 
 def decode_with_tbs(uuid: bytes, teds: bytes) -> tuple[SecurityTeds, bytes]:
-    """:func:`decode` and :func:`tbs` in one walk, for who judges many that are each seen once."""
+    """Decode and compute :func:`tbs` in one pass, for callers that check many TEDS once each."""
     block = unframe(teds)
     places = _places(block)
     return _read(block, places), _without_signature(uuid, block, places)

@@ -44,7 +44,7 @@ class UuidParts:
 
     @classmethod
     def at(cls, latitude: float, longitude: float, *, manufacturer: int, year: int, seconds: float) -> UuidParts:
-        """Parts of a 2007 UUID: degrees (north and east positive) and seconds since the start of the year."""
+        """Return the parts of a 2007 UUID: degrees (north and east positive), seconds since the start of the year."""
         return cls(
             2007,
             latitude >= 0,

@@ -28,12 +28,12 @@ NO_EXTENSION: Final = (0x00, 0x80)
 
 
 def read_int(raw: bytes) -> Value:
-    """Unsigned integer of any number of octets."""
+    """Return an unsigned integer of any number of octets."""
     return int.from_bytes(raw, "big")
 
 
 def read_f32(raw: bytes) -> Value:
-    """Float32, None when there are not four octets."""
+    """Return a Float32."""
     value: float = _F32.unpack(raw)[0]
     return value
 
@@ -73,7 +73,7 @@ def read_octets(raw: bytes) -> Value:
 
 
 def read_instant(raw: bytes) -> Value:
-    """TimeInstance or TimeDuration: 8 octets (U32 s, sign and 31-bit ns) or 10 (48-bit s, U32 ns)."""
+    """Return a TimeInstance or TimeDuration: 8 octets (U32 s, sign and 31-bit ns) or 10 (48-bit s, U32 ns)."""
     if len(raw) == 8:
         word = int.from_bytes(raw[4:], "big")
         return TimeInstance(int.from_bytes(raw[:4], "big"), word & 0x7FFFFFFF, bool(word >> 31))
@@ -101,7 +101,7 @@ READERS: Final[Mapping[str, Callable[[bytes], Value]]] = {
 
 @lru_cache(maxsize=1024)
 def units_of(packed: bytes) -> Units:
-    """Units from the packed spelling: interpretation, nine exponents, and the extension octet if there is an 11th."""
+    """Return units from the packed spelling: interpretation, nine exponents, an extension octet if there is an 11th."""
     rad, sr, m, kg, s, a, k, mol, cd = (Fraction(octet - 128, 2) for octet in packed[1:10])
     extension = packed[10] if len(packed) > 10 and packed[10] not in NO_EXTENSION else 0
     return Units(packed[0], rad, sr, m, kg, s, a, k, mol, cd, extension)
@@ -126,7 +126,7 @@ def _refuse(name: str, why: str) -> BadDataError:
 
 
 def write_int(spec: FieldSpec, value: object, octets: int) -> bytes:
-    """Unsigned integer; a string is looked up among the names of the field's enumeration."""
+    """Return the octets of an unsigned integer; a text is looked up in the field's enumeration."""
     if isinstance(value, str):
         wanted = value.casefold()
         for number, name in spec.enumeration.items():
@@ -143,7 +143,7 @@ def write_int(spec: FieldSpec, value: object, octets: int) -> bytes:
 
 
 def write_f32(spec: FieldSpec, value: object) -> bytes:
-    """Float32; NaN and None become the NaN that means "not available"."""
+    """Return the octets of a Float32; NaN and None become the NaN that means "not available"."""
     if value is None:
         return NOT_AVAILABLE
     if isinstance(value, bool) or not isinstance(value, Real):
@@ -156,7 +156,7 @@ def write_f32(spec: FieldSpec, value: object) -> bytes:
 
 
 def write_array(spec: FieldSpec, value: object) -> bytes:
-    """Array of UInt16 or Float32; anything with an order and a length will do (list, tuple, numpy array)."""
+    """Return the octets of an array of UInt16 or Float32, given as list, tuple or numpy array."""
     plain: object = value.tolist() if hasattr(value, "tolist") else value
     if not isinstance(plain, Sequence) or isinstance(plain, str | bytes):
         raise _refuse(spec.name, f"is a list of numbers, not {shown(value)}")
@@ -169,21 +169,21 @@ def write_array(spec: FieldSpec, value: object) -> bytes:
 
 
 def write_text(spec: FieldSpec, value: object) -> bytes:
-    """UTF-8 text, or octets as they are."""
+    """Return text as UTF-8, or octets unchanged."""
     if isinstance(value, str):
         return value.encode()
     return write_octets(spec, value)
 
 
 def write_octets(spec: FieldSpec, value: object) -> bytes:
-    """Octets as they are."""
+    """Return octets unchanged."""
     if not isinstance(value, bytes | bytearray | memoryview):
         raise _refuse(spec.name, f"is octets, not {shown(value)}")
     return bytes(value)
 
 
 def write_instant(spec: FieldSpec, value: object, edition: Edition) -> bytes:
-    """TimeInstance (2007: 8 octets, 2024: 10) or TimeDuration (8); a plain number counts as seconds."""
+    """Return a TimeInstance (2007: 8 octets, 2024: 10) or TimeDuration (8); a plain number counts as seconds."""
     if isinstance(value, Real):
         value = _split_seconds(spec, value)
     if not isinstance(value, TimeInstance):
@@ -210,7 +210,7 @@ def _split_seconds(spec: FieldSpec, value: Real) -> TimeInstance:
 
 
 def write_uuid(spec: FieldSpec, value: object, edition: Edition) -> bytes:
-    """UUID: octets or hex digits, 10 in the 2007 form, 16 in the 2024 form."""
+    """Return a UUID from octets or hex digits: 10 octets in the 2007 form, 16 in the 2024 form."""
     if isinstance(value, str):
         try:
             value = bytes.fromhex(value)
@@ -224,7 +224,7 @@ def write_uuid(spec: FieldSpec, value: object, edition: Edition) -> bytes:
 
 
 def as_units(spec: FieldSpec, value: object) -> Units:
-    """Units from Units, from a mapping of its attributes, or from the packed octets."""
+    """Return Units from Units, from a mapping of its attributes, or from the packed octets."""
     if isinstance(value, Units):
         return value
     if isinstance(value, Mapping):
@@ -244,7 +244,7 @@ def as_units(spec: FieldSpec, value: object) -> Units:
 
 
 def pack_units(spec: FieldSpec, units: Units) -> bytes:
-    """Packed spelling B: interpretation, nine exponents (2 x + 128), extension; 11 octets."""
+    """Return the packed spelling B: interpretation, nine exponents (2 x + 128), extension; 11 octets."""
     octets = [units.interpretation]
     for part in UNIT_PARTS:
         doubled = getattr(units, part) * 2 + 128
@@ -265,7 +265,7 @@ def write_fixed(spec: FieldSpec, value: object) -> bytes:
 
 
 def write(spec: FieldSpec, value: object, edition: Edition) -> bytes:
-    """Value octets of one field that holds no tuples; raises BadDataError naming the field."""
+    """Return the value octets of one field that holds no tuples; raises BadDataError naming the field."""
     kind = spec.kind
     if kind in _INTEGERS:
         return write_int(spec, value, _INTEGERS[kind])
@@ -349,7 +349,7 @@ def _text(value: object) -> tuple[str, bytes, int]:
 
 
 def split_text(fields: list[Field], area: bytes, at: int, find: Callable[..., None]) -> tuple[bytes, ...]:
-    """Texts behind the directory, without their checksums; deviations go to ``find``."""
+    """Split off the texts after the directory, without their checksums; deviations go to ``find``."""
     # octets of each text, as the directory counts them
     entries = (child for field in fields if field.name == "DirBlock" for child in field.children)
     known = [child.value for child in entries if child.type == 22 and isinstance(child.value, int)]

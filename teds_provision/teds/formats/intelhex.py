@@ -126,7 +126,7 @@ def stretches(text: str) -> list[tuple[int, bytes]]:
 
 
 def _place(base: int, address: int, data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Addresses wrap at 64 KiB within a record."""
+    """Yield data with its addresses, which wrap at 64 KiB within a record."""
     here = 0x10000 - address
     yield base + address, data[:here]
     if data[here:]:

@@ -50,7 +50,7 @@ def read_json(text: str | bytes) -> list[TedsBlock]:
 
 
 def teds_to_json(block: TedsBlock) -> dict[str, Any]:
-    """One TEDS as a JSON object."""
+    """Return one TEDS as a JSON object."""
     tree = to_tree(block)
     head = {name: getattr(tree, name) for name in _HEAD}
     out: dict[str, Any] = {**head, "edition": tree.edition, "framed": tree.framed, "name": tree.name}
@@ -61,7 +61,7 @@ def teds_to_json(block: TedsBlock) -> dict[str, Any]:
 
 
 def entry_to_json(entry: TreeEntry) -> dict[str, Any]:
-    """One field as a JSON object: type, name, kind, and value or fields."""
+    """Return one field as a JSON object: type, name, kind, and value or fields."""
     out: dict[str, Any] = {} if entry.type is None else {"type": entry.type}
     out |= {"name": entry.name, "kind": entry.kind}
     if entry.kind == "fields":
@@ -70,7 +70,7 @@ def entry_to_json(entry: TreeEntry) -> dict[str, Any]:
 
 
 def value_to_json(value: object) -> Any:
-    """JSON of a field's value: octets as hex digits, numbers that JSON has no word for as NaN, INF, -INF in quotes."""
+    """Return a field's value for JSON: octets as hex digits, non-finite numbers as the texts NaN, INF, -INF."""
     if isinstance(value, float):
         if math.isfinite(value):
             return value

@@ -45,7 +45,7 @@ Placed = dict[tuple[int, int], bytes]
 
 
 def read_profile(text: str, path: Path | None = None) -> list[TedsBlock]:
-    """TEDS that a profile gives for a node with UUID 0.
+    """Return the TEDS that a profile gives for a node with UUID 0.
 
     Raises BadDataError and NotFoundError as the profile loader does.
     """
@@ -53,13 +53,13 @@ def read_profile(text: str, path: Path | None = None) -> list[TedsBlock]:
 
 
 def profile_blocks(profile: Profile) -> list[TedsBlock]:
-    """TEDS of a loaded profile, the UUID all zeros."""
+    """Return the TEDS of a loaded profile, the UUID all zeros."""
     blocks = profile.build(NO_UUID).blocks
     return [TedsBlock(channel, code, octets) for (channel, code), octets in blocks.items()]
 
 
 def write_profile(blocks: Sequence[TedsBlock]) -> tuple[str, tuple[str, ...]]:
-    """Text of a profile, and what it cannot hold, one sentence each."""
+    """Return the text of a profile, and a sentence about each thing that it cannot hold."""
     placed, lost = _place(blocks)
     decoded = {key: decode(octets) for key, octets in placed.items()}
     body = "\n".join(_lines(decoded)) + "\n"

@@ -115,7 +115,7 @@ def _entries(decoded: DecodedTeds) -> Iterator[TreeEntry]:
 
 
 def _texts(decoded: DecodedTeds) -> Iterator[TreeEntry]:
-    """One entry per language; the directory follows from them."""
+    """Yield one entry per language; the directory follows from them."""
     languages = [field for field in decoded.fields if field.name == "DirBlock"]
     for number, text in enumerate(decoded.text):
         parts = languages[number].children if number < len(languages) else ()
@@ -190,14 +190,14 @@ def _pair(entry: TreeEntry, access_code: int, depth: int) -> tuple[str, object]:
 
 
 def units_to_parts(units: Units) -> dict[str, str]:
-    """Interpretation, exponents other than 0 and the extension, as texts ("1", "-2", "1/2")."""
+    """Return interpretation, exponents other than 0 and the extension, as texts ("1", "-2", "1/2")."""
     parts = {"interpretation": str(units.interpretation)}
     parts |= {name: str(getattr(units, name)) for name in UNIT_PARTS if getattr(units, name)}
     return parts | ({"extension": str(units.extension)} if units.extension else {})
 
 
 def _short(value: object) -> str:
-    """Text of an exponent; without powers of ten, which could ask for a number of any size."""
+    """Return the text of an exponent; raises ValueError for powers of ten, whose number could have any size."""
     text = str(value)
     if len(text) > _EXPONENT_CHARACTERS or "e" in text.lower():
         raise ValueError(text[:_EXPONENT_CHARACTERS])
@@ -205,7 +205,7 @@ def _short(value: object) -> str:
 
 
 def units_from_parts(parts: Mapping[str, object]) -> Units:
-    """Units from those parts, texts or numbers; raises BadDataError."""
+    """Return units from those parts, texts or numbers; raises BadDataError."""
     unknown = set(parts) - {"interpretation", "extension", *UNIT_PARTS}
     if unknown:
         raise BadDataError(f"Units have no part {min(unknown)!r}.")

@@ -53,7 +53,7 @@ def channels_of(top: Section, abstract: bool) -> tuple[ChannelProfile, ...]:
 
 
 def _selections(section: Section) -> dict[int, TomlTable]:
-    """Tables by channel number: ``all`` first, then the selections ``1-12`` from the widest to the narrowest."""
+    """Return tables by channel number: ``all`` first, then the selections ``1-12`` from the widest to the narrowest."""
     everywhere: TomlTable | None = None
     selections: list[tuple[range, TomlTable]] = []
     for key, entry in section.table.entries.items():

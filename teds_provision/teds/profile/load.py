@@ -48,7 +48,7 @@ class ListedProfile:
 
 @cache
 def shipped_profiles() -> Path:
-    """Folder of the profiles that come with the tool: inside the installed package, or of the checkout."""
+    """Return the folder of the shipped profiles: inside the installed package, or in the checkout."""
     package = Path(__file__).resolve().parents[2]
     installed = package / "shipped_profiles"
     return installed if installed.is_dir() else package.parent / "profiles"
@@ -102,7 +102,7 @@ def is_profile_name(text: str) -> bool:
 
 
 def passed_over(name: str, folders: Sequence[Path]) -> tuple[str, ...]:
-    """Sentences about files of that name which were not taken, because a folder before theirs has one."""
+    """Return sentences about files of that name that were not used, because an earlier folder has one."""
     if not is_profile_name(name):
         return ()
     found = [folder / f"{name}.toml" for folder in folders if (folder / f"{name}.toml").is_file()]
@@ -125,7 +125,7 @@ def check(
 
 
 def find_profile(name_or_path: str | Path, folders: Sequence[Path] | None = None) -> Path:
-    """File of a profile; raises NotFoundError."""
+    """Return the file of a profile; raises NotFoundError."""
     text = str(name_or_path)
     path = Path(text)
     if isinstance(name_or_path, Path) or path.suffix == ".toml" or path.parent != Path():
@@ -165,7 +165,7 @@ def _files(folders: Sequence[Path]) -> Iterator[Path]:
 
 
 def list_profiles(folders: Sequence[Path] | None = None) -> list[ListedProfile]:
-    """Every profile of the folders by name; one that hides another of the same name comes alone."""
+    """Return every profile of the folders by name; one that hides another of the same name is listed alone."""
     found: dict[str, ListedProfile] = {}
     places = default_folders() if folders is None else folders
     for path in _files(places):
@@ -180,7 +180,7 @@ def list_profiles(folders: Sequence[Path] | None = None) -> list[ListedProfile]:
 
 
 def _merged(path: Path, folders: Sequence[Path], chain: tuple[Path, ...]) -> tuple[TomlTable, tuple[str, ...]]:
-    """Table of a profile's file laid over those it extends, and their names from this one up."""
+    """Return the table of a profile's file merged over those that it extends, and their names from this one up."""
     return _laid_over(parse(read_text(path), str(path)), path, folders, (*chain, path.resolve()))
 
 
@@ -246,7 +246,7 @@ _TYPES: Final = {code: name for name, code in CHANNEL_TYPES.items()}
 
 
 def describe(profile: Profile) -> dict[str, Any]:
-    """Plain data of a profile; limits and uncertainty in the channel's own unit, times in seconds."""
+    """Return plain data of a profile; limits and uncertainty in the channel's own unit, times in seconds."""
     return {
         **summary(profile),
         "description": profile.description,
@@ -281,7 +281,7 @@ def listed(entry: ListedProfile) -> dict[str, Any]:
 
 
 def describe_channel(channel: ChannelProfile) -> dict[str, Any]:
-    """Plain data of one channel."""
+    """Return plain data of one channel."""
     unit, demand = channel.unit, channel.calibration
     period = channel.fields.get("SPeriod")
     return {

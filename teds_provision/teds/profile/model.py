@@ -160,7 +160,7 @@ class Profile:
         edition: Edition = 2007,
         now: datetime | None = None,
     ) -> BuiltDatasheet:
-        """TEDS of this type for one node: Meta, TransducerChannel, names, calibrations (by channel), PHY and texts.
+        """Build a node's TEDS of this type: Meta, TransducerChannel, names, calibrations (by channel), PHY, texts.
 
         ``uuid`` has 10 octets (16 in the 2024 form; 10 are put at the end of 16 there, with a warning). Raises
         BadDataError for an abstract profile, a UUID of another length, or a calibration that does not belong to a

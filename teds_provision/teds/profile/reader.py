@@ -103,7 +103,7 @@ def _parts(keys: str) -> KeyPath:
 
 
 def key_lines(text: str) -> dict[KeyPath, int]:
-    """Line of each table header and each key of a TOML text (keys inside inline tables: the line of the table)."""
+    """Return the line of each table header and key of a TOML text (keys of an inline table: the table's line)."""
     scan, table, closing = _Scan(), (), None
     base: KeyPath = table
     for number, line in enumerate(text.splitlines(), 1):
@@ -159,12 +159,12 @@ def parse(text: str, file: str) -> TomlTable:
 
 
 def read_text(path: Path) -> str:
-    """Text of a small UTF-8 file; raises NotFoundError, BadDataError or StoreError naming it."""
+    """Read a small UTF-8 file; raises NotFoundError, BadDataError or StoreError naming it."""
     return files.read_text(path, LIMITS.text_file, "profile or calibration", failure=StoreError)
 
 
 def walk(table: TomlTable) -> Iterator[tuple[str, PlacedValue]]:
-    """Every value of a table with its dotted path."""
+    """Yield every value of a table with its dotted path."""
     for key, entry in table.entries.items():
         path = f"{table.path}.{key}" if table.path else key
         if isinstance(entry, TomlTable):
@@ -245,7 +245,7 @@ class Section:
         self._known: set[str] = set()
 
     def path(self, key: str) -> str:
-        """Dotted path of a key."""
+        """Return the dotted path of a key."""
         return f"{self.table.path}.{key}" if self.table.path else key
 
     def where(self, key: str) -> SourcePlace:
@@ -271,7 +271,7 @@ class Section:
         return None if entry is None else entry.value
 
     def text(self, key: str, default: str = "") -> str:
-        """Text of a key."""
+        """Return the text of a key."""
         value = self.item(key)
         if value is None:
             return default
@@ -291,7 +291,7 @@ class Section:
         return tuple(value)
 
     def flag(self, key: str, default: bool = False) -> bool:
-        """Truth value of a key."""
+        """Return the truth value of a key."""
         value = self.item(key)
         if value is None:
             return default
@@ -338,7 +338,7 @@ class Section:
         return None
 
     def pairs(self, keys: Iterable[Key]) -> tuple[tuple[str, object], ...]:
-        """Field name and value of every key that is there."""
+        """Return field name and value of every key that is present."""
         values = [(key.field, self.read(key)) for key in keys]
         return tuple((name, value) for name, value in values if value is not None)
 

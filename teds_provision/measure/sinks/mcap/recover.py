@@ -311,7 +311,7 @@ class _Scan:
         return after
 
     def _close_chunk(self, *, torn: bool = False) -> None:
-        """No message index of the last chunk follows any more; of a torn file's last chunk some may be missing."""
+        """Close the last chunk: no message index follows; of a torn file's last chunk some may be missing."""
         chunk = self.chunk
         if chunk is None or chunk.found is None:
             return

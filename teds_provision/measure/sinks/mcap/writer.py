@@ -56,7 +56,7 @@ class McapSummary:
         self.counts[channel] = self.counts.get(channel, 0) + messages
 
     def tail(self, start: int) -> bytes:
-        """DataEnd, summary, footer and magic for a file whose data section ends at octet ``start``."""
+        """Return DataEnd, summary, footer and magic for a file whose data section ends at octet ``start``."""
         data_end = record(DATA_END, struct.pack("<I", 0))
         start += len(data_end)
         counts = b"".join(struct.pack("<HQ", key, value) for key, value in sorted(self.counts.items()))
@@ -137,7 +137,7 @@ class McapWriter:
         return number
 
     def metadata(self, name: str, pairs: Mapping[str, str]) -> None:
-        """Words about the recording; closes the chunk first."""
+        """Write texts about the recording; closes the chunk first."""
         self.close_chunk()
         octets = record(METADATA, text(name) + _map(pairs))
         index = struct.pack("<QQ", self._offset, len(octets)) + text(name)
@@ -145,7 +145,7 @@ class McapWriter:
         self._put(octets)
 
     def add_messages(self, channel: int, records: bytes, times: list[int]) -> None:
-        """Message records of equal length of one channel, with their log times in ns."""
+        """Add message records of equal length of one channel, with their log times in ns."""
         if not times:
             return
         step = len(records) // len(times)

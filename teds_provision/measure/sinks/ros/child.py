@@ -42,7 +42,7 @@ def imports(python: str, packages: str, environment: dict[str, str]) -> bool:
 
 
 def environment(*, sourced: bool) -> dict[str, str]:
-    """Our environment without the paths of our own Python; those of a ROS that the user sourced stay."""
+    """Return the environment without the paths of our own Python; those of a ROS that the user sourced stay."""
     kept = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONHOME")}
     if sourced and "PYTHONPATH" in os.environ:
         kept["PYTHONPATH"] = os.environ["PYTHONPATH"]
@@ -177,7 +177,7 @@ class ChildSink(TopicSink):
         self._pause = min(2 * self._pause, BACK_OFF[1])
 
     def _send(self, **words: object) -> None:
-        """One line to the child; a child that takes nothing for STUCK seconds is given up."""
+        """Send one line to the child; a child that accepts nothing for STUCK seconds is given up."""
         child = self._child
         if child is None or child.stdin is None:
             return

@@ -22,7 +22,7 @@ INTERFACES = ("position", "velocity", "effort")  # of sensor_msgs/JointState
 
 
 def say(**words: object) -> None:
-    """One line to the parent."""
+    """Send one line to the parent."""
     with _OUT:
         sys.stdout.write(json.dumps(words) + "\n")
         sys.stdout.flush()
@@ -94,14 +94,14 @@ class Bridge:
         return answer
 
     def type_of(self, name: str) -> Any:
-        """Message class of ``package/Type``."""
+        """Return the message class of ``package/Type``."""
         if name not in self.types:
             package, _, kind = name.partition("/")
             self.types[name] = getattr(importlib.import_module(package + ".msg"), kind)
         return self.types[name]
 
     def qos(self, *, latched: bool, reading: bool = False) -> Any:
-        """Metadata for late comers; the rest reliable with a short history. Set points: best effort hears both."""
+        """Return the QoS: latched for metadata, else reliable with a short history; set points: best effort."""
         from rclpy import qos
 
         return qos.QoSProfile(
@@ -144,7 +144,7 @@ class Bridge:
         publisher.publish(message)
 
     def value(self, line: dict[str, Any]) -> None:
-        """One value of a channel."""
+        """Publish one value of a channel."""
         publisher, message = self.message(line)
         setattr(message, line["field"], float(line["v"]))
         if hasattr(message, "variance"):
@@ -183,7 +183,7 @@ class Bridge:
         publisher.publish(message)
 
     def param(self, line: dict[str, Any]) -> None:
-        """Facts of a channel: parameters ``station.node.channel.fact`` of this node, by its parameter services."""
+        """Set the facts of a channel as parameters ``station.node.channel.fact`` of this node."""
         from rclpy.parameter import Parameter
 
         descriptor = importlib.import_module("rcl_interfaces.msg").ParameterDescriptor(dynamic_typing=True)
@@ -224,7 +224,7 @@ class Bridge:
 
 
 def main() -> None:
-    """Be a node, carry lines."""
+    """Run the ROS node: publish the lines of the parent."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 

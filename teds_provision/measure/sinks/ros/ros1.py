@@ -34,7 +34,7 @@ class Ros1Sink(ChildSink):
             )
 
     def _environment(self) -> dict[str, str]:
-        """Without the virtual environment's paths; a ROS that the user sourced keeps its own."""
+        """Return the environment without the virtual environment's paths; a ROS that the user sourced keeps its own."""
         kept = child.environment(sourced="/opt/ros/" in os.environ.get("PYTHONPATH", ""))
         if self._master:
             kept["ROS_MASTER_URI"] = self._master

@@ -35,7 +35,7 @@ INTERFACES = ("position", "velocity", "effort")  # of sensor_msgs/JointState
 
 
 def say(**words: object) -> None:
-    """One line to the parent."""
+    """Send one line to the parent."""
     with _OUT:
         sys.stdout.write(json.dumps(words) + "\n")
         sys.stdout.flush()
@@ -89,7 +89,7 @@ class Outlet:
         self._waiting: list[Any] | None = [] if expected else None
 
     def publish(self, message: Any) -> None:
-        """Now, or after those that wait."""
+        """Publish now, or after the messages that wait."""
         if self._waiting is None:
             self.publisher.publish(message)
             return
@@ -127,7 +127,7 @@ class Bridge:
         self._subscribed: tuple[float, dict[str, int]] = (0.0, {})
 
     def subscribers(self, topic: str) -> int:
-        """How many nodes subscribe it, as the master knows it; some of them may be dead."""
+        """Return how many nodes subscribe to a topic, as the master knows it; some of them may be dead."""
         if time.monotonic() > self._subscribed[0] + KNOWN:
             found = {}
             with suppress(Exception):  # whatever a socket, or the master itself, throws at an XML-RPC client
@@ -143,14 +143,14 @@ class Bridge:
                 time.sleep(PAUSE)
 
     def type_of(self, name: str) -> Any:
-        """Message class of ``package/Type``."""
+        """Return the message class of ``package/Type``."""
         if name not in self.types:
             package, _, kind = name.partition("/")
             self.types[name] = getattr(importlib.import_module(package + ".msg"), kind)
         return self.types[name]
 
     def stamp(self, seconds: float) -> Any:
-        """Unix seconds as ROS takes them."""
+        """Return unix seconds as a ROS time."""
         return self.rospy.Time.from_sec(seconds)
 
     def topic(self, line: dict[str, Any]) -> None:
@@ -178,7 +178,7 @@ class Bridge:
         publisher.publish(message)
 
     def value(self, line: dict[str, Any]) -> None:
-        """One value of a channel."""
+        """Publish one value of a channel."""
         publisher = self.publishers[line["id"]]
         message = publisher.kind()
         setattr(message, line["field"], line["v"])

@@ -210,7 +210,7 @@ class Ros2Sink(TopicSink):
             self._unshown = True
 
     def _parameter(self, name: str, value: object) -> None:
-        """ROS 2 has no parameter server; the latched metadata holds the same facts."""
+        """Do nothing: ROS 2 has no parameter server; the latched metadata holds the same facts."""
 
     def _listen(self, topic: str, uuid: str, channel: int) -> None:
         self._read(topic, "std_msgs/Float64", uuid, channel)
