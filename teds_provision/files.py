@@ -1,4 +1,4 @@
-"""Files written whole or not at all, and read with a limit: the one way for every room.
+"""Files written atomically, and read with a limit: the one way for every room.
 
 A new file begins under a temporary name in the same folder (``.NAME.<16 hex digits>.teds-part``), made with ``O_EXCL``,
 so a planted link is never written through. It gets its name only when its octets are on the disk; the folder is brought

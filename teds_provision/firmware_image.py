@@ -111,7 +111,7 @@ def public_pem(key: KeyClass) -> bytes:
 
 
 def read_firmware_image(octets: bytes, key: KeyClass | None = None) -> FirmwareImage:
-    """Return what an image file says, once its header, TLVs and digest are good, and with a key its signature.
+    """Return the facts of an image file once its header, TLVs and digest are good, and with a key its signature.
 
     Raises BadDataError, NotAuthenticError.
     """

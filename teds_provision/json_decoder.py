@@ -1,4 +1,4 @@
-"""JSON that is read one way or not at all (RFC 8259): the decoder under every reader of what a stranger wrote.
+"""JSON with one meaning or refused (RFC 8259): the decoder under every reader of untrusted documents.
 
 Python's own takes the last of two members of one name, and NaN, which is no JSON. Readers that differ about either see
 two documents in one text, so a check in front could pass another one than is used. The readers above differ in size,

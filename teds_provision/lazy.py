@@ -1,6 +1,6 @@
 """Modules that are loaded at their first use, if a command that people wait for would get slower otherwise.
 
-:func:`late` stands for a heavy library, or for one module of ours, until something of it is asked for. :func:`lazy`
+:func:`late` replaces a heavy library, or one module of ours, until something of it is used. :func:`lazy`
 gives the modules of a room (PEP 562): its ``__init__`` names them for type checkers and loads them late for all else::
 
     if TYPE_CHECKING:

@@ -42,7 +42,7 @@ class CommandRow(NamedTuple):
 
 
 class OptionalRoom(NamedTuple):
-    """What a room adds; every place is ``"module:attribute"`` below its folder."""
+    """Additions of a room; every place is ``"module:attribute"`` below its folder."""
 
     sections: Mapping[str, Mapping[str, CommandRow]] = _NOTHING
     """Sections of ``--help``, after those of the core, and before the last one."""

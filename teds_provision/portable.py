@@ -1,4 +1,4 @@
-"""What Linux has and other systems may lack: flags of open(), owners by number, locks of whole files.
+"""Features of Linux that other systems may lack: flags of open(), owners by number, locks of whole files.
 
 The commands that work on files alone also run without it (docs/compatibility.md). The rule for locks: without flock,
 what only tidies up is skipped, and what must not happen twice at once is refused, except for the store: there SQLite's

@@ -1,4 +1,4 @@
-"""The shapes of the API, each once: what a request may say, what an answer holds, which operations there are.
+"""The shapes of the API, each once: members of requests and answers, and the operations.
 
 ==============  ========================================================================
 module          what it holds

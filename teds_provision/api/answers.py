@@ -125,7 +125,7 @@ class Wrapped(TypedDict):
 
 
 class Firmware(_FirmwareOrigin):
-    """What a node reports of its firmware, and whether its type accepts it. A report proves no image."""
+    """Firmware as a node reports it, and whether its type accepts it. A report proves no image."""
 
     text: Annotated[str, Meta(description="board and application")] | None
     version: Annotated[str, Meta(description="null: it does not report its firmware")] | None
@@ -275,7 +275,7 @@ class Budget(TypedDict):
 
 
 class VaultStatus(TypedDict):
-    """Whether this service can use the station's keys; if not, why, and the command that helps."""
+    """Access of this service to the station's keys; if it has none, why, and the command that helps."""
 
     state: Literal["open", "locked"]
     problem: Problem | None
@@ -400,7 +400,7 @@ class Provisioning(TypedDict):
 
 
 class UpdateImage(TypedDict):
-    """The firmware image of an update, as its file says."""
+    """The firmware image of an update, by its file."""
 
     version: str
     digest: Annotated[str, Meta(description="MCUboot's, which boards report; not that of the file")]
@@ -604,7 +604,7 @@ class PlantNodes(TypedDict):
 
 
 class Job(TypedDict):
-    """What a keeper permits a line to build; ``units`` and ``passed`` are those of this station."""
+    """A job: boards that a keeper permits a line to build; ``units`` and ``passed`` are those of this station."""
 
     id: str
     title: str

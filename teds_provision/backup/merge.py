@@ -1,4 +1,4 @@
-"""What a backup restores in an existing store, and what stays although the backup differs."""
+"""Restore a backup into an existing store: what is restored, and what stays although the backup differs."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class Merge:
     def _groups(self) -> None:
         """Merge the measurement groups: add those that are missing here, replace members by those of a newer copy.
 
-        What an older copy has and this store lacks was deleted since.
+        Rows of an older copy that this store lacks were deleted since.
         """
         present = {group.name: set(group.uuids) for group in self.live.groups.all()}
         for group in self.copy.groups.all():
@@ -173,7 +173,7 @@ class Merge:
     def _decisions(self) -> None:
         """Merge the CAs whose trust a person ended, and the bans that a person lifted.
 
-        What an older copy has and this store lacks may have been taken back since.
+        Rows of an older copy that this store lacks may have been taken back since.
         """
         ended, lifted = self.live.policy.ended_cas(), self.live.policy.lifted()
         for ca, mac in self.copy.policy.ended_cas().items():
@@ -201,7 +201,7 @@ class Merge:
     def _marks(self) -> None:
         """Merge key flags (the CA that a node keeps, a due rotation) of a newer copy, or with a key missing here.
 
-        What an older copy has and this store lacks may have been settled since.
+        Rows of an older copy that this store lacks may have been settled since.
         """
         present = self.live.keys.all_flags()
         wanted = {

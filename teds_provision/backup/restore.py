@@ -35,7 +35,7 @@ from teds_provision.vault.selection import asked_first, create_vault, open_vault
 
 @dataclass(frozen=True)
 class RestoreResult:
-    """What was done (or would be): ``rebuilt``, ``merged`` or ``nothing``; how many rows came back, and what stayed.
+    """Result of a restore, or of its plan: ``rebuilt``, ``merged`` or ``nothing``; rows restored, and rows kept.
 
     ``rotations_due`` counts the nodes whose key must be rotated by tap, or by an operator's confirmation, before
     anything else.

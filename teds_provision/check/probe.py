@@ -376,7 +376,7 @@ class Probe:
         return inner
 
     def _slip_of_sealed(self, session: StationSession) -> Slip | None:
-        """Return the slip that explains how the node opens Sealed frames; each is tried under counters of its own."""
+        """Return the slip that explains how the node opens Sealed frames; each is tried under other counters."""
 
         def takes(payload: bytes) -> bool:
             return self.plain(security_command(Function.SEALED, payload)).ok

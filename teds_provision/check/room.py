@@ -1,4 +1,4 @@
-"""What the check of a board's firmware adds to the program."""
+"""The additions of ``node check`` to the program."""
 
 from __future__ import annotations
 

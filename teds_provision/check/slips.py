@@ -1,6 +1,6 @@
 """Common slips of firmware authors, tried in turn to find the one that explains what a node sent.
 
-``node check`` knows the secrets of its own test agreements and sessions. If a tag or a signature is wrong, it computes
+``node check`` knows the secrets of its test agreements and sessions. If a tag or a signature is wrong, it computes
 it as a node with a known slip does, and names the slip that gives the same octets. A tag has 16 octets: none fits by
 chance. Up to two slips at once are found in the key agreement and in Open.
 """

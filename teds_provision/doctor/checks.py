@@ -36,7 +36,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class System:
-    """What to check: the station's home, the root of the file system, the environment, and the requested links."""
+    """The system to check: the station's home, the root of the file system, environment, and requested links."""
 
     home: Path
     nfc: str | None = None

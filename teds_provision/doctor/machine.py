@@ -96,7 +96,7 @@ def libusb(system: System) -> Iterator[Finding]:
 
 @check("clock", "machine")
 def clock(system: System) -> Iterator[Finding]:
-    """Check that the time can stand in a signature: plausible, and not before anything signed already."""
+    """Check that the time can be signed: plausible, and not before anything signed already."""
     now = datetime.now(UTC)
     fix = "sudo timedatectl set-ntp true, or: sudo date --utc --set '2026-01-31 12:00'"
     if not _FIRST_YEAR <= now.year <= _LAST_YEAR:

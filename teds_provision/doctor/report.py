@@ -117,7 +117,7 @@ def _names(config: Mapping[str, Any], table: str = "") -> Iterable[str]:
 
 
 def _last_errors(system: System, mask: Mask) -> list[dict[str, str]]:
-    """Return what failed or was refused last, oldest first; empty if the store cannot be read (a check says why)."""
+    """Return what failed or was refused last, oldest first; empty if the store cannot be read (see its check)."""
     if not has_store(system.home):
         return []
     try:

@@ -89,7 +89,7 @@ def retire(station: Station, uuid: bytes, receipt: ResetReceipt | None, *, as_: 
 
 @dataclass(frozen=True)
 class TakeoverPlan:
-    """What a spare takes over; ``calibration`` counts the channels whose calibration goes along."""
+    """Data that a spare takes over; ``calibration`` counts the channels whose calibration goes along."""
 
     old: NodeRecord
     new: NodeRecord

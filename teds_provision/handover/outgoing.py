@@ -1,6 +1,6 @@
 """``export-keys``: node keys into a sealed bundle for other stations (profile.md, "Handover between base stations").
 
-What a killed run leaves behind: a move's tombstones and its row are durable before any file exists, so the key rests
+After a killed run: a move's tombstones and its row are durable before any file exists, so the key rests
 whatever happens; the same command then seals the same move again, under the same id.
 """
 
@@ -327,7 +327,7 @@ class _SharedFields:
 def export_bundle(station: Station, plan: ExportPlan, output: Path, now: datetime | None = None) -> ExportResult:
     """Seal the bundle into a new file of mode 0600; a move's keys rest before the file can be opened.
 
-    What is written before the store has it is a draft without signature and tag, under a temporary name. The same
+    Until the store has it, the file is a draft without signature and tag, under a temporary name. The same
     command over its own file finds nothing to do. Raises UsageError (the path holds another file), StoreError,
     VaultError.
     """

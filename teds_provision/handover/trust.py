@@ -435,7 +435,7 @@ def _by_file(known: list[TrustRecord], file: str) -> TrustRecord:
 
 @dataclass(frozen=True)
 class Removal:
-    """What ends with the trust in a key.
+    """Consequences of ending the trust in a key.
 
     ``shared`` are nodes whose key that station holds: each is rotated at the next contact. ``cas`` are CAs that count
     for some nodes only because this key's owner brought them, or that were trusted by themselves; ``under`` counts the

@@ -75,13 +75,13 @@ class Trace(Protocol):
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a link can do, so that callers never check for its name.
+    """Features of a link, so that callers never check for its name.
 
     ``tapped``: a person holds the node to this reader, so that a key that comes this way may be pinned and agreed.
     ``wired``: an answer comes over this very wire, so that a new node's first key may be accepted as its own.
     ``streams``: data messages of measuring nodes can be heard (``links.streaming``), and ``triggers``: one message
     starts them all. ``connectionless``: a question to one node, or to all, needs neither a tap nor a connection.
-    ``shared``: each station, and each of its processes, has a source address of its own (:class:`SharedBus`).
+    ``shared``: each station, and each of its processes, has its own source address (:class:`SharedBus`).
     ``many``: several nodes are there at once, and may be talked to from one thread each, ``max_parallel`` of them at a
     time. ``octets_a_second`` is about how fast a long transfer goes, for an estimate.
     """
@@ -266,8 +266,8 @@ class Contact:
 
     ``address`` is its CAN address, ``connection`` the number of its BLE connection. ``charging`` and ``ble`` are hints
     of its initial NFC message, as unauthenticated as the rest. ``trace`` records its messages, ``bus`` is the place of
-    the bus or the air (``can:socketcan:can0``), "" at a reader. ``pressed`` returns True if this board alone says that
-    its button was pressed a moment ago, a hint too.
+    the bus or the air (``can:socketcan:can0``), "" at a reader. ``pressed`` returns True if this board alone reports
+    that its button was pressed a moment ago, a hint too.
     """
 
     identity: Identity
@@ -283,7 +283,7 @@ class Contact:
 
     @property
     def line(self) -> int:
-        """What identifies its data messages on its port: CAN address, or number of the connection."""
+        """Identifier of its data messages on its port: CAN address, or number of the connection."""
         return self.address or self.connection or 0
 
     def note(

@@ -115,7 +115,7 @@ class MeasuringLink(Port, ABC):
     # -- who is there ----------------------------------------------------------------------------------------------
 
     def discover(self, sightings: SightingSink, *, poll: float | None = None) -> Discovery:
-        """Begin to find nodes, in a thread of its own: while one is missing, and every ``poll`` seconds."""
+        """Begin to find nodes, in another thread: while one is missing, and every ``poll`` seconds."""
         return PolledDiscovery(self, sightings, poll=poll)
 
     def identify(self, node: int, *, seconds: float, until_announced: bool = False) -> Identity | None:

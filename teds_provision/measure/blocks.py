@@ -196,7 +196,7 @@ class StationFacts:
 class ClockSet:
     """The system's clock was put forward by so many seconds (back: negative), seen at ``time`` on the new clock.
 
-    What is dated before it was handed on follows the old clock, all that comes later the new one.
+    Values dated before it was passed on follow the old clock, later ones the new clock.
     """
 
     time: float

@@ -1,7 +1,7 @@
 """One line of times for all channels of a group: the "synchronized data" of the second paper.
 
 There is a row at every multiple of the grid's period. Each channel gives its last value that is not newer than the row
-(never one from the future), with its age; after two of its own periods without a value both are NaN. A row waits until
+(never one from the future), with its age; after two of its periods without a value both are NaN. A row waits until
 every live stream has come past it, but no longer than ``patience``, so that no row waits for the slowest.
 """
 

@@ -36,7 +36,7 @@ class RateProposal:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What carries a measurement: the link of a node (None: not known), messages to topics, values of this machine."""
+    """Limits around a measurement: the node's link (None: not known), messages to topics, values of this machine."""
 
     bus: Callable[[bytes], tuple[str, BusTime] | None] = lambda _uuid: None
     budget: float | None = None

@@ -77,7 +77,7 @@ class Requirements:
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementRequest(MeasurementSpec):
-    """What to measure of each node: the settings of its measurement, and what holds for this run alone."""
+    """Request for a measurement: settings that are stored, and what holds for this run alone."""
 
     lease: int = LEASE
     timeout: float = 60.0
@@ -91,7 +91,7 @@ class MeasurementRequest(MeasurementSpec):
 
     @property
     def stream_kind(self) -> StreamKind | None:
-        """How each channel samples, None: as the datasheet says."""
+        """How each channel samples, None: by the datasheet."""
         return None if self.kind is None else StreamKind[self.kind.upper()]
 
 

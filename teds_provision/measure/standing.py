@@ -76,7 +76,7 @@ def require_whitelisted(station: Station, uuid: bytes) -> None:
 
 
 class NodeStanding:
-    """What a node may do while its session lasts, by today's decisions and today's verdict on its datasheet.
+    """Rights of a node while its session lasts, by today's decisions and today's verdict on its datasheet.
 
     ``drives``: True while set points are taken for its actuators. ``unsigned``: True if an unsigned datasheet is
     enough. ``mark`` is why its values are unproven, "" if they are not. ``ended`` is the error with which this station

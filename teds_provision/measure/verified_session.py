@@ -197,8 +197,8 @@ def exchange_clock(node: Conversation, clock: ClockMap) -> ClockReply:
 def ask_clock(node: Conversation) -> tuple[ClockReply, Exchange]:
     """Run one Clock command, for a map that others read meanwhile; return reply and exchange.
 
-    What this process took over sealing, opening and waking up is not the link's delay: a link that knows when the first
-    copy left and when the reply was whole is believed (operation.md section 5).
+    Time that this process spent on sealing, opening and waking up is not the link's delay: a link that knows when the
+    first copy left and when the reply was whole is believed (operation.md section 5).
     """
     link = node.contact.link
     if isinstance(link, TimestampedLink):

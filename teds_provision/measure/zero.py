@@ -62,7 +62,7 @@ class ZeroOrder:
 
 @dataclass(frozen=True)
 class ZeroResult:
-    """What was done, or with a dry run would be: numbers are in SI units, ``offset`` and ``moved`` are differences.
+    """Result of a zero, or of its dry run: numbers are in SI units, ``offset`` and ``moved`` are differences.
 
     ``before`` is the channel's reading before, ``after`` the one now (for a dry run: expected). ``moved`` is 0 if there
     was nothing to do.

@@ -138,7 +138,7 @@ class _Bins:
 
 @dataclass(frozen=True)
 class _Meaning:
-    """What a value of a channel means: values of two meanings are not compared."""
+    """Meaning of a channel's values: values of two meanings are not compared."""
 
     unit: str = ""
     units: Units | None = None

@@ -1,7 +1,7 @@
 """The measurements of the service: kept in the store, carried on after every start, ended in order.
 
 One table has every measurement with its nodes, one lock guards it, and one thread decides: which node joins which
-measurement, when one begins, when it is over. What takes long (a selection among all nodes, a question to a node) is
+measurement, when one begins, when it is over. Slow work (a selection among all nodes, a question to a node) is
 done by workers, and values go through the threads of :class:`MeasurementJob`. Two things happen in other threads: a
 node that answers on a bus is locked there, before any other part works on it, and a loan is the borrower's.
 

@@ -70,7 +70,7 @@ class _LostNode:
 
 
 class AfterEnd(Enum):
-    """What follows when a node's session has ended by itself."""
+    """Next state of a node whose session has ended by itself."""
 
     NOTHING = "nothing"
     ASK = "ask it at its last place"

@@ -67,7 +67,7 @@ class MeasuringHandler(Protocol):
 
 
 class BleHandler(NodeHandler, MeasuringHandler, Protocol):
-    """What a node's BLE needs in addition (profile.md, "BLE")."""
+    """A node's handler with the events of BLE (profile.md, "BLE")."""
 
     def in_factory_state(self) -> bool:
         """Return True if the node holds no key."""

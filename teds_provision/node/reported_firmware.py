@@ -1,4 +1,4 @@
-"""What a virtual node reports of its firmware (128.21), from its description, and what it does to be found (128.22)."""
+"""Report of a virtual node's firmware (128.21), from its description, and its reaction to being located (128.22)."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ class VirtualNode:
             self.board.clock.due, self.board.clock.guard = self._simulated, self._core.interrupt
 
     def _start(self) -> Tim:
-        """Start the board: the boot loader chooses the image, and what lay in RAM is gone."""
+        """Start the board: the boot loader chooses the image, and the RAM is lost."""
         slots = self._slots
         if slots is not None:
             slots.start()

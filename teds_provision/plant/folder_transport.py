@@ -1,6 +1,6 @@
 """Transfer folder: a stick or a share. ``roster/VERSION.jws``, ``FINGERPRINT/N.jws``, ``to/FINGERPRINT/ID``.
 
-It carries the pages of all stations. A file is written whole, or not at all, and never over another: a roster or page
+It carries the pages of all stations. A file is written atomically, and never over another: a roster or page
 that exists with other content gets a second file beside it, named by the first 16 digits of its H, and readers take
 both.
 """

@@ -47,7 +47,7 @@ _NO_CALIBRATION: Final = BuildOrder(drop_calibration=True)
 
 @dataclass
 class LineRun:
-    """What all boards of a run share: a job, or (``job`` None) only the request for evidence.
+    """State that all boards of a run share: a job, or (``job`` None) only the request for evidence.
 
     ``order``: what every board gets if there is no job. ``calibrations`` is a folder with a file ``UUID.*`` for each
     board, or one file for a job whose rule is ``one``. Everything that can be refused before a tap is refused when this
@@ -94,7 +94,7 @@ class LineRun:
 
     @property
     def base(self) -> BuildOrder:
-        """What all boards get, as far as it is the same for all."""
+        """Settings that are the same for all boards."""
         return self.order_of_all
 
     @property
@@ -494,7 +494,7 @@ def _named_in(image: Image | None, shown: SecurityTeds) -> tuple[tuple[tuple[int
 
 
 def _step_facts(steps: Sequence[StepResult]) -> tuple[tuple[str, str, int], ...]:
-    """Return name, result and milliseconds of steps; a verdict is a step of its own, with the code of its error."""
+    """Return name, result and milliseconds of steps; a verdict is a separate step, with the code of its error."""
     return tuple(
         (step.name, DONE if step.result == STEP_FAILED else step.result, round(step.seconds * 1000)) for step in steps
     )

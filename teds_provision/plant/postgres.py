@@ -304,7 +304,7 @@ class Registry:
     def append(self, pages: Sequence[tuple[int, str, bytes]]) -> None:
         """Push own pages (number, H of the one before or "", octets): one round trip, one transaction.
 
-        Whether a push that was cut came through, the same push again finds out: pages that are there are done.
+        A push that was cut off is simply repeated: pages that arrived are skipped.
         """
         with self._connected() as connection, connection.pipeline():
             for n, previous, octets in pages:
@@ -549,7 +549,7 @@ def where_of(url: str) -> str:
 
 @contextmanager
 def _cut_after(connection: psycopg.Connection[Any], seconds: float, ended: threading.Event) -> Iterator[None]:
-    """Cut the connection if the block takes longer: a server that hangs keeps TCP alive and answers nothing."""
+    """Cut the connection if the block takes longer: a stuck server keeps TCP alive and answers nothing."""
 
     def cut() -> None:
         ended.set()

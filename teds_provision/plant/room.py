@@ -1,4 +1,4 @@
-"""What the plant and the line add to the program."""
+"""The additions of plant and line to the program."""
 
 from __future__ import annotations
 

@@ -289,7 +289,7 @@ class FileOffice:
 
 @dataclass(frozen=True)
 class SignatureOrder:
-    """What an office has to sign: the image without its Security TEDS, for which job, with which name, from what.
+    """Order to an office: the image without its Security TEDS, for which job, with which name, from what.
 
     ``profile`` is kept with the draft.
     """

@@ -1,6 +1,6 @@
 """Step 3: agree on a link key, or find that one is agreed (profile.md, "Key agreement").
 
-What a lost message left half done is found and finished here.
+Steps that a lost message left half done are found and finished here.
 """
 
 from __future__ import annotations
@@ -237,7 +237,7 @@ def _shown_security(node: Conversation) -> bytes:
 def _signed_for_another_ca(station: Station, uuid: bytes, teds: bytes) -> bool:
     """Return True if the datasheet is signed by a station that the CA to agree under here did not certify.
 
-    A node accepts datasheets and keys from stations of its own CA only, so it would refuse an agreement (14).
+    A node accepts datasheets and keys from stations of the CA that it keeps only, so it would refuse an agreement (14).
     """
     try:
         shown = security.decode(teds)

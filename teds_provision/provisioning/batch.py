@@ -542,8 +542,8 @@ class BatchRun:
 def _load_ahead() -> threading.Thread:
     """Load what a board needs in a thread, while the vault is opened and a board is waited for; return the thread.
 
-    Loaded at its first use, it would hold up the conversation while the sensors are claimed. What cannot be loaded
-    fails there.
+    Loaded at its first use, it would hold up the conversation while the sensors are claimed. Anything that cannot be
+    loaded fails there.
     """
 
     def load() -> None:

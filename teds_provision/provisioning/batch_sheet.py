@@ -102,7 +102,7 @@ class BatchTotals:
 
     @property
     def error(self) -> TedsProvisionError | None:
-        """What the command ends with: None if all passed, else the worst error."""
+        """Error that the command ends with: None if all passed, else the worst one."""
         if not self.failed and not self.skipped:
             return None
         text = f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped."

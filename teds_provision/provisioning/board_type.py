@@ -225,7 +225,7 @@ def is_remembered(station: Station, uuid: bytes, wanted: str | None, *, factory:
 
     Then it is no retype. ``wanted`` None: of the profile that it was given before.
 
-    What was merely built for it does not count; what was written, or came in a bundle, does.
+    An image that was merely built does not count; one that was written, or came in a bundle, does.
     """
     history = station.datasheets.history(uuid)
     if factory and history:

@@ -1,6 +1,6 @@
 """Step 4: the TEDS of a node from its profile and calibration, and the Security TEDS still unsigned.
 
-What is written to a node that has a datasheet is what the user just asked for. Anything else (a trial build, a run that
+A node that has a datasheet gets only what the user just asked for. Anything else (a trial build, a run that
 was cut, a newer profile, another datasheet than this station remembers) is shown as the changes in physical units and
 asked about; the store never silently wins over the node.
 """
@@ -72,7 +72,7 @@ _NOBODY: Final = bytes(10)
 
 @dataclass(frozen=True)
 class BuildOrder:
-    """What the user ordered: profile (None: the one that the node had), calibration file, name, and overrides.
+    """The user's order: profile (None: the one that the node had), calibration file, name, and overrides.
 
     ``name`` may hold ``{uuid}`` (20 hex digits) or ``{n}`` (the first free number from 1). ``accept_calibration`` is
     the reason given for a calibration that the guard would refuse. ``channel`` is the one that the calibration is for
@@ -283,7 +283,7 @@ def digest_of(profile: Profile) -> str:
 def profile_files_digest(station: Station, record: NodeRecord | None) -> str | None:
     """Return the SHA-256 (hex) of the files of the profile that a node's datasheet was built of.
 
-    None if no profile is known, its files are gone, or they say something else by now.
+    None if no profile is known, its files are gone, or they have changed.
     """
     if record is None or record.profile is None or record.profile_digest is None:
         return None

@@ -42,7 +42,7 @@ class SheetPlan:
 
 @dataclass(frozen=True)
 class SheetEditResult:
-    """What was done, step by step, and the node's verdict now."""
+    """Result of an edit: its steps, and the node's verdict now."""
 
     plan: SheetPlan
     steps: tuple[StepResult, ...]

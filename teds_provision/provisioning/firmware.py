@@ -98,7 +98,7 @@ def require_good_firmware(uuid: bytes, known: KnownFirmware | None) -> None:
 
 
 def firmware_warning(known: KnownFirmware | None) -> str:
-    """Return what a measurement says of a node's firmware, "" for nothing."""
+    """Return a measurement's warning about a node's firmware, "" for none."""
     if known is None or known.state in ("good", "unjudged"):
         return CHANGED if known is not None and known.changed else ""
     return f"its firmware is {known.state}" + (f", and {CHANGED}" if known.changed else "")

@@ -1,7 +1,7 @@
 """The station's side of SMP inside a session: a board's images, the upload, trial and confirm (profile.md, "Manage").
 
-``smp`` makes packets and reads replies. What it would accept too easily is refused before: replies of another request,
-CBOR tags, an upload that does not advance.
+``smp`` makes packets and reads replies. Replies that it would accept too easily are refused before:
+those of another request, CBOR tags, an upload that does not advance.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ class Operator:
     def take_over(self, question: str, refusal: PolicyError) -> None:
         """Ask before a node with another station's key gets one of ours, which locks that station out.
 
-        Raises ``refusal`` if nobody can be asked.
+        Raises ``refusal`` if no person can be asked.
         """
         raise refusal
 

@@ -150,7 +150,7 @@ class Unit(Protocol):
 
 
 class ProductionLine(Protocol):
-    """What all boards of a run share."""
+    """State that all boards of a run share."""
 
     @property
     def total(self) -> int:
@@ -162,7 +162,7 @@ class ProductionLine(Protocol):
 
     @property
     def base(self) -> BuildOrder:
-        """What all boards get."""
+        """Settings of all boards."""
 
     def order(self, who: IdentifiedNode) -> PreparedOrder:
         """Return what this board gets; raises PolicyError if it gets nothing."""

@@ -109,7 +109,7 @@ class BoardUpdate:
 def plan_update(
     station: Station, links: LinkSettings, uuid: bytes, order: UpdateOrder, reporter: Reporter
 ) -> UpdatePlan:
-    """Look at one board in its session and say what an update would do; changes nothing.
+    """Look at one board in its session and return what an update would do; changes nothing.
 
     Raises NoUpdateError, DowngradeError, PolicyError (other image on trial, claimed actuator), LinkError.
     """
@@ -253,7 +253,7 @@ def require_free_actuators(node: Conversation) -> None:
 
 @dataclass(frozen=True)
 class _BeforeRestart:
-    """What must be unchanged after the restart: Security TEDS, identity, and c of the session (which must not be)."""
+    """State before the restart: Security TEDS and identity, which must be unchanged after it, and c, which must not."""
 
     security: bytes
     identity: Identity
@@ -262,7 +262,7 @@ class _BeforeRestart:
 
 
 class _Look:
-    """What the update of one board looks at before it begins."""
+    """State of one board before its update begins."""
 
     def __init__(self, station: Station, uuid: bytes, order: UpdateOrder) -> None:
         self._station, self._uuid, self._order = station, uuid, order

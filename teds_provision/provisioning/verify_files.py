@@ -110,7 +110,7 @@ def verify_files(
 
 @dataclass(frozen=True)
 class _Work:
-    """What a process needs to judge files and to report them."""
+    """Data that a process needs to judge files and to report them."""
 
     judging: TrustSource
     tell: Tell

@@ -2,7 +2,7 @@
 
 A pinned key is never replaced by a command that adds; the entry has to be removed first (profile.md, "Keys and trust").
 
-Whitelist files that other tools write are XML in the style of the NCAP, CSV or JSON, and are taken whole or not at all.
+Whitelist files of other tools are XML in the style of the NCAP, CSV or JSON; a file with a mistake changes nothing.
 XML is read with defusedxml, without a DTD: neither entity bombs nor external entities. It is read liberally: an element
 is an entry if it has an attribute ``uuid``, a child ``uuid`` beside its other fields, or a UUID as its text.
 """
@@ -57,7 +57,7 @@ class ListedNode:
 
 @dataclass
 class _WhitelistReader:
-    """What has been read so far, and every mistake with its line and field."""
+    """State of reading a whitelist, with every mistake by line and field."""
 
     file: str
     entries: dict[bytes, ListedNode] = field(default_factory=dict)

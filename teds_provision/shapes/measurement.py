@@ -3,7 +3,7 @@
 One more setting is a field of :class:`MeasurementSpec` here, with its :class:`Meta` if the API has it and its
 :class:`CommandOption` if ``measure`` has it, and a column in ``station/store/schema.py``. The option, the request body
 and the answer with their schemas, the row, the request to each node and the client take it from here. Type checkers
-read no annotation at run time, so its name stands twice more below, in the typed dictionaries of request and answer;
+read no annotation at run time, so its name is repeated twice below, in the typed dictionaries of request and answer;
 ``tests/api/test_measurement_spec.py`` holds the three together.
 """
 

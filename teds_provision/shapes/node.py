@@ -1,7 +1,7 @@
 """A node as this station's store knows it: ``nodes --json``, and what the API's node has besides its link.
 
 One more member is a field of :class:`KnownNode` and its value in ``provisioning/inventory.py``. If the API has it, it
-has a :class:`Meta`, and its name stands once more in ``Node`` of ``api/answers.py``, for type checkers: the answer, its
+has a :class:`Meta`, and its name is repeated in ``Node`` of ``api/answers.py``, for type checkers: the answer, its
 description and ``client`` have it then. ``tests/shapes/test_node.py`` holds them together.
 """
 

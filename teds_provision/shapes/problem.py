@@ -37,11 +37,11 @@ class Explained(Protocol):
 
     @property
     def message(self) -> str:
-        """What is wrong."""
+        """The fault, as one sentence."""
 
     @property
     def hint(self) -> str:
-        """What to do, empty for nothing."""
+        """The remedy, empty for none."""
 
 
 def problem_of(error: Explained) -> Problem:

@@ -1,7 +1,7 @@
 """The checks of a datasheet, their one verdict, and how it is known.
 
 ``verify``, the API, its description and ``client`` take them from here. One more member is a field, its value in
-``to_json`` and its type in the typed dictionary below, which type checkers hold against ``to_json``. What is checked:
+``to_json`` and its type in the typed dictionary below, which type checkers hold against ``to_json``. The checks:
 step 7, ``provisioning/verify.py``.
 """
 

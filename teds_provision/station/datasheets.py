@@ -1,4 +1,4 @@
-"""What was read of each node last, the datasheets that it had (the present one and ten older ones), and its draft.
+"""The last reading of each node, the datasheets that it had (the present one and ten older ones), and its draft.
 
 Images are kept as octets, deflated, with facts of their Security TEDS beside them.
 """

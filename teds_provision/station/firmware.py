@@ -1,4 +1,4 @@
-"""What a node reported of its firmware, judged by its type (profiles.md, "[firmware]").
+"""Firmware that a node reported, judged by its type (profiles.md, "[firmware]").
 
 It does not affect the verdict, which covers only the datasheet: both are shown side by side.
 """
@@ -78,7 +78,7 @@ def same_firmware(one: FirmwareReport | None, other: FirmwareReport | None) -> b
 
 
 class PlantFirmware(NamedTuple):
-    """What the plant hears of a node's firmware: text, version and digest; ``runs`` None: the node reports none."""
+    """Statement to the plant about a node's firmware: text, version, digest; ``runs`` None: it reports none."""
 
     runs: tuple[str, str, str | None] | None
 
@@ -131,7 +131,7 @@ def _demand(path: Path, folders: tuple[Path, ...], _changed: int, _second: int) 
 
 @dataclass(frozen=True)
 class KnownFirmware:
-    """What is known of a node's firmware; ``changed``: another image than at the last signature runs."""
+    """Firmware of a node as known; ``changed``: another image runs than at the last signature."""
 
     reading: FirmwareReading
     state: FirmwareState

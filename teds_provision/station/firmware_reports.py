@@ -1,4 +1,4 @@
-"""What each node last reported of its firmware (About), and under which report its datasheet was signed."""
+"""The last firmware report (About) of each node, and the report under which its datasheet was signed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class FirmwareReports:
     def all(self, sample: RowSample | None = None) -> Iterator[FirmwareRecord]:
         """Yield what every node last reported, by UUID, or those in ``sample``.
 
-        What another program wrote does not count.
+        Rows that another program wrote do not count.
         """
         rows = ALL_ROWS if sample is None else sample.rows(self._store, "firmware")
         found = self._store.read(_record, f"SELECT * FROM firmware WHERE {rows} ORDER BY uuid")

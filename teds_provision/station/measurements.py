@@ -1,4 +1,4 @@
-"""What this station measures (operation.md section 7), how it detects nodes, and the names under which it publishes.
+"""Measurements of this station (operation.md section 7), its detection of nodes, and the names that it publishes.
 
 Each kept measurement has an owner. One of ``ncap``, the page or a token of the API is kept until it is deleted, and
 ``ncap run`` carries it on after ``kill -9``, power loss or a restart. One of a ``measure`` command is kept while that

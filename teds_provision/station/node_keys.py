@@ -470,8 +470,8 @@ class NodeKeys:
     def end_removal_mark(self, record: KeyRecord) -> None:
         """End a rotation that a removal demanded: a session was opened under a key that no removed station has had.
 
-        Another holder has rotated the node. What only a page after the removed station's last one shows, the next
-        review of removals finds.
+        Another holder has rotated the node. A key that only a page after the removed station's last one shows
+        is found by the next review of removals.
         """
         if (self.rotation_due(record.uuid) or "").startswith(REMOVED) and not self._plant.removed_had(
             record.uuid, record.epoch, record.key_id, self.holders_of_key(record)

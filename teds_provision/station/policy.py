@@ -44,7 +44,7 @@ _tombstone = attrgetter(*(column.name for column in fields(Tombstone)))
 
 
 class Policy:
-    """What this station trusts and refuses."""
+    """Trust and refusals of this station."""
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class Policy:
         return sorted([*others, *members], key=lambda trusted: trusted.name)
 
     def trust_rows(self) -> list[TrustRecord]:
-        """Return every station and CA that was added, by name, whatever a roster or its MAC says."""
+        """Return every station and CA that was added, by name, whatever its MAC or a roster."""
         return list(self._store.recall(TrustRecord, "SELECT * FROM trust ORDER BY name"))
 
     def _trust_holds(self, record: TrustRecord) -> bool:

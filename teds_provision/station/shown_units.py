@@ -1,4 +1,4 @@
-"""What the profile of a node adds to its channels beside the datasheet: the display unit, frame, deviation."""
+"""Facts that a node's profile adds to its channels beside the datasheet: display unit, frame, deviation."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ class CertificateReference:
 
 
 def read_certificate_reference(teds: bytes) -> CertificateReference:
-    """Return what a framed Certificate TEDS says; raises BadDataError for any form but the one of the profile."""
+    """Return the reference in a framed Certificate TEDS; raises BadDataError for any form but the profile's."""
     values = read_lines(AccessCode.CERTIFICATE, teds, _KEYS)
     if not _DIGEST.fullmatch(values["sha256"]) or not _DATE.fullmatch(values["date"]) or not values["certificate"]:
         raise BadDataError("The Certificate TEDS has no number, date or digest in the form of the profile.")

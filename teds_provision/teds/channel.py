@@ -110,7 +110,7 @@ class Channel:
     unit: ``display`` if a profile names one, else ``unit``. ``kind`` is None for a ChanType that is not known, ``halt``
     is ActHalt (field 36). ``described`` is False if there is no TransducerChannel TEDS. ``calibration`` is None if
     there is none or none that can be computed; ``calibration_problem`` is then the reason. ``value_table`` holds
-    the texts of raw numbers that stand for states.
+    the texts of raw numbers that mean states.
     """
 
     number: int

@@ -63,7 +63,7 @@ class Origin:
 
 
 def read_origin(teds: bytes) -> Origin:
-    """Return what a framed Origin TEDS says; raises BadDataError for any form but the one of the profile."""
+    """Return the origin in a framed Origin TEDS; raises BadDataError for any form but the one of the profile."""
     return _origin(read_lines(AccessCode.ORIGIN, teds, *_ORDERS))
 
 

@@ -259,7 +259,7 @@ def _find_or_make(session: TokenSession, store_id: str, uri: Pkcs11Uri, role: st
 
 
 def _save(home: Path, store_id: str, content: _Content, *, replace: bool) -> dict[str, Any]:
-    """Seal the master keys to the station key, sign, write whole or not at all; return what was written."""
+    """Seal the master keys to the station key, sign, write atomically; return the octets written."""
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
     one_time, nonce = SoftwareKey.generate(), os.urandom(_NONCE_OCTETS)

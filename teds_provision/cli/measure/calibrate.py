@@ -268,7 +268,7 @@ def fit(
 def _write_dcc(
     app: App, path: Path, laboratory: Path | None, fitted: Mapping[int, Calibration], file: Path, text: str
 ) -> str:
-    """Write the certificate, and say what it does not state; returns its path."""
+    """Write the certificate, print what it does not state, and return its path."""
     write = teds.dcc.write
     known = write.Laboratory()
     if laboratory is not None:

@@ -65,7 +65,7 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool, locating: bo
 
 
 class PressLines:
-    """A reporter that prints a line of its own for each board whose button was pressed."""
+    """A reporter that prints a separate line for each board whose button was pressed."""
 
     def __init__(self, app: App, inner: Reporter) -> None:
         self._app, self._inner = app, inner

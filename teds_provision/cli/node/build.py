@@ -172,7 +172,7 @@ def calibration_json(certificate: CertificateReference | None) -> dict[str, Any]
 
 
 def write_file(path: Path, text: str | Iterable[str]) -> None:
-    """Write a result file whole or not at all; its parts as they come."""
+    """Write a result file part by part; if anything fails, no file is left."""
     parts = (text,) if isinstance(text, str) else text
     write_whole(path, (part.encode("utf-8") for part in parts), mode=SHARED)
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 class NodeView(Protocol):
-    """What an optional room knows about nodes."""
+    """Facts that an optional room adds about nodes."""
 
     def named(self, station: Station, text: str) -> list[bytes]:
         """Return the one node that the room knows by this name, empty if none; raises NotFoundError, UsageError."""

@@ -44,7 +44,7 @@ else:  # loads the steps
 
 
 class LineChoice(Protocol):
-    """What an optional room makes of its options: what all boards of a run share."""
+    """Choice that an optional room makes from its options, for all boards of a run."""
 
     @property
     def names_boards(self) -> bool:
@@ -446,7 +446,7 @@ def big(text: str) -> list[str]:
 
 
 class BatchState(Protocol):
-    """What the screen needs to know of the batch: :class:`BatchRun` is one."""
+    """State of the batch as the screen needs it: :class:`BatchRun` is one."""
 
     def __len__(self) -> int:
         """Return the number of boards on the sheet."""

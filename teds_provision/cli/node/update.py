@@ -116,7 +116,7 @@ def update(
 
 
 def _require_image_last(uuids: Sequence[str], image: Path) -> None:
-    """Raise UsageError if a file stands where a board is expected, and the last argument is no file."""
+    """Raise UsageError if a file is given in place of a board, and the last argument is no file."""
     files = [uuid for uuid in uuids if Path(uuid).is_file()]
     if files and not image.exists():
         boards = " ".join(quote(word) for word in (*(uuid for uuid in uuids if uuid not in files), str(image)))

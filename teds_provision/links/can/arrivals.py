@@ -112,7 +112,7 @@ class Arrivals:
             self._port.report_rivals(self._notice)
 
     def pressed(self) -> list[bytes]:
-        """Return the UUIDs of the nodes that say their button was pressed, each press once, a second later."""
+        """Return the UUIDs of nodes that report a press of their button, each press once, a second later."""
         crcs = self._bus.presses.news() if self._bus is not None else []
         return [uuid for uuid in self._seen if uuid_crc(uuid) in crcs]
 

@@ -95,7 +95,7 @@ def single(body: bytes, *, fd: bool = False) -> bytes:
 class Pair:
     """Our end of one pair of addresses. Not thread-safe; ``send_frame`` is called from within every method.
 
-    What fits into one frame is read and written here while nothing else is under way: can-isotp's states have nothing
+    Messages of one frame are read and written here while nothing else is under way: can-isotp's states have nothing
     to add to it, and take ten times as long over it.
     """
 

@@ -129,7 +129,7 @@ class CanPort(MeasuringLink):
             return self._transaction
 
     def close(self) -> None:
-        """Release the bus for good; never raises. An exchange of another thread ends with LinkClosedError."""
+        """Release the bus; never raises. An exchange of another thread ends with LinkClosedError."""
         with self._lock:
             self._closed = True
         self._release()

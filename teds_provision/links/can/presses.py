@@ -1,4 +1,4 @@
-"""Find the board of a bus whose button was pressed: a hint for the person who stands beside it.
+"""Find the board of a bus whose button was pressed: a hint for the person beside it.
 
 Two boards within a second, or two CRCs from one address, and neither is marked: anyone can send an Announce.
 """
@@ -41,7 +41,7 @@ class ButtonPressLog:
                 del self._presses[:-_MOST]
 
     def marks(self, address: int, crc: int) -> bool:
-        """Return True if the board at this address, with this CRC of its UUID, alone says it was pressed."""
+        """Return True if only the board at this address, with this CRC of its UUID, reports a press."""
         with self._lock:
             return any(press[1:] == (address, crc) and self._is_clear(press) for press in self._presses)
 

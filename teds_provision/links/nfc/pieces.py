@@ -60,7 +60,7 @@ class Piece:
 def room(max_ndef: int, others: int = 0) -> int:
     """Return how many octets of body one message of at most ``max_ndef`` octets holds beside ``others`` octets.
 
-    ``others`` counts the whole records in the same message. At least 1 when the profile can work at all; 0 or less when
+    ``others`` counts the whole records in the same message. At least 1 when the profile can work; 0 or less when
     it cannot.
     """
     left = max_ndef - others - 3 - len(TIM_TYPE)  # a short record: flags, type length, payload length

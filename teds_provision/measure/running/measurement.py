@@ -408,7 +408,7 @@ def _summary(supervisor: NodeSupervisor) -> dict[str, Any]:
 
 
 def _as_error(sink: Sink) -> TedsProvisionError | None:
-    """Return what ended a sink: of a recording the disk (7), of one that took nothing at all its transport (5)."""
+    """Return the error that ended a sink: of a recording the disk (7), of one that took nothing its transport (5)."""
     stats, recorder = sink.stats, sink.recorder
     if stats.dropped and not stats.written and not recorder:
         why = stats.error or f"{sink.name} accepted nothing: all {stats.dropped} values were dropped."

@@ -43,7 +43,7 @@ CLOSING = 30.0  # seconds for a recorder to write what it owes
 class Sink(Protocol):
     """Takes what is measured. ``write``, ``write_group``, ``describe`` and ``report`` return at once, from any thread.
 
-    ``open`` raises TedsProvisionError if the sink cannot work at all (no folder, no library). Later failures are in
+    ``open`` raises TedsProvisionError if the sink cannot work (no folder, no library). Later failures are in
     ``stats``; the measurement goes on.
     """
 

@@ -142,6 +142,6 @@ class FoxgloveSink(ThreadedSink):
 def foxglove_sink(
     spec: str, _commands: CommandTaker | None = None, *, scalars: bool = True, exposure: Exposure | None = None
 ) -> FoxgloveSink:
-    """Return the sink of ``foxglove`` or ``foxglove:HOST:PORT``, with a server of its own; raises UsageError."""
+    """Return the sink of ``foxglove`` or ``foxglove:HOST:PORT``, with its server; raises UsageError."""
     address = spec.removeprefix(FOXGLOVE).removeprefix(":")
     return FoxgloveSink(FoxgloveServer(address or USUAL, exposure), own=True, scalars=scalars)

@@ -2,7 +2,7 @@
 
 One topic is one channel, whichever measurements publish on it; it is removed after the last of them has ended. The SDK
 accepts a connection from any page in a local browser (its Origin is not checked), so nothing here changes anything: the
-facts of channels are parameters that nobody can set. For a client that reads too slowly the SDK drops the oldest
+facts of channels are read-only parameters. For a client that reads too slowly the SDK drops the oldest
 messages (1,024 are kept for each client).
 """
 
@@ -131,7 +131,7 @@ class FoxgloveServer:
 
 
 class MeasurementTopics:
-    """What one measurement publishes: channels by topic, and for late subscribers its last facts by topic."""
+    """Topics of one measurement: channels by topic, and for late subscribers its last facts by topic."""
 
     def __init__(self, server: FoxgloveServer) -> None:
         self._server = server

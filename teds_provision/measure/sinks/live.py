@@ -2,7 +2,7 @@
 
 The cost of a topic is its messages, not its values (notes of measurements in docs/ros.md). So a group's rows go out as
 one array at full rate, each channel on its topic at ``StationFacts.scalar_rate``, and the sink counts its
-messages per second and says when that is more than what one process bears.
+messages per second and reports when that is more than one process can carry.
 
 | topic | type | when |
 |---|---|---|

@@ -1,18 +1,18 @@
 """MQTT with Home Assistant discovery: each channel shows up as an entity, with unit and name from the datasheet.
 
 Topics: ``<station>/<node>`` carries the newest values of a node as one JSON object (not retained, QoS 0) at
-``StationFacts.scalar_rate``; ``homeassistant/sensor/<uuid>/<channel>/config`` (retained) tells Home Assistant where to
+``StationFacts.scalar_rate``; ``homeassistant/sensor/<uuid>/<channel>/config`` (retained) shows Home Assistant where to
 look; ``<station>/<group>/status`` is ``online`` or, by the broker's will, ``offline``: each measurement has its own,
 for several may run and one that ends must not end the others. An entity is available while that is online and its node
 runs, so the last value of a node that is lost is not taken for one of now. One client identifier serves every
 connection of a measurement: a broker that still holds one that was cut then ends it when the next one begins, and its
-will cannot say ``offline`` over the new ``online`` half a minute later. Values are in the unit for people (°C), for
+will cannot publish ``offline`` over the new ``online`` half a minute later. Values are in the unit for people (°C), for
 Home Assistant knows units by their signs. Nothing is subscribed: no actuator is moved by MQTT.
 
 A password is read from the file that the URL names (``mqtt://user@host?password-file=PATH``): never from the URL. With
 TLS (``mqtts://``) the broker's certificate has to verify, by the system's CAs or those of ``ca=PATH``, for the name in
 the URL; ``cert=PATH`` and ``key=PATH`` are this client's own certificate. Files are regular and small, and read when
-the sink opens. Why a broker does not take anything is told in words, and kept as the reason where it never did.
+the sink opens. The reason why a broker takes nothing is reported, and kept if it never took anything.
 """
 
 from __future__ import annotations

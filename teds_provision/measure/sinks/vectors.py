@@ -7,8 +7,8 @@
 | three of N and three of N·m | geometry_msgs/WrenchStamped | ``…/wrench`` |
 | one in m of a channel named as range finder | sensor_msgs/Range | the channel's own |
 
-The members of a vector group (Meta-TEDS, VGroup) are its axes x, y, z in their order. What is not measured is said as
-sensor_msgs asks: the first element of its covariance is -1. A covariance of 0 is unknown.
+The members of a vector group (Meta-TEDS, VGroup) are its axes x, y, z in their order. Whatever is not measured is
+marked as sensor_msgs asks: the first element of its covariance is -1. A covariance of 0 is unknown.
 """
 
 from __future__ import annotations

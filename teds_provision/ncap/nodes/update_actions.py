@@ -1,4 +1,4 @@
-"""What is kept of firmware updates by request: who asked for what, how each board ended, and the image until the end.
+"""Records of requested firmware updates: who asked for which, how each board ended, and the image until the end.
 
 One action is a record (JSON) and an image in ``updates/`` of the home, a folder of this user alone.
 """
@@ -62,7 +62,7 @@ class BoardRow:
 
 @dataclass(frozen=True)
 class UpdateRequest:
-    """What was asked for: which boards may get an image that does not name them, and whether an older version may."""
+    """The request: which boards may get an image that does not name them, and whether an older version is allowed."""
 
     uuids: tuple[str, ...]
     other_board: frozenset[str] = frozenset()

@@ -197,7 +197,7 @@ class Resources:
 
         One whose actuator is in use is not let go for an update: its restart would end that.
 
-        Over the socket alone. A caller that dies closes it, and one that hangs has the node for a limited time.
+        Over the socket alone. A caller that dies closes it, and a silent one has the node for a limited time.
         """
         caller: Caller = request.scope[CALLER]
         if caller.kind != "socket":

@@ -84,7 +84,7 @@ async def _connected(virtual: Virtual) -> tuple[asyncio.StreamReader, asyncio.St
 
 @dataclass
 class _News:
-    """What was not taken as it came: how often, why last, and whether the simulation knows it."""
+    """Lines that were refused: how many, why last, and whether the simulation knows it."""
 
     count: int = 0
     why: str = ""

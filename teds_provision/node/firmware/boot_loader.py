@@ -30,7 +30,7 @@ _OTHER: Final = {"a": "b", "b": "a"}
 
 @dataclass(frozen=True)
 class BootState:
-    """What the boot loader keeps: the slot that runs, whether on trial, the image that starts next, the counter.
+    """State of the boot loader: the slot that runs, whether on trial, the image that starts next, the counter.
 
     ``pending`` is the digest (hex) of the image in the other slot that starts at the next start.
     """

@@ -46,7 +46,7 @@ def answer_seconds(command: bytes, octets: bytes) -> float:
 class AirTime:
     """Holds each answer back until command and answer would have passed; called with every frame of a tag.
 
-    What the processes themselves take runs inside that time, so that a paced exchange lasts as long as on air.
+    The time of the processes themselves counts within it, so that a paced exchange lasts as long as on air.
     """
 
     def __init__(self) -> None:
@@ -138,7 +138,7 @@ class NfcServer:
             self._tnep.stop()
 
     def restarted(self) -> None:
-        """Begin again with a node that has restarted: what was said is forgotten."""
+        """Begin again with a node that has restarted; earlier replies are forgotten."""
         self._tnep.lost()
 
     def _bound(self) -> bool:

@@ -39,7 +39,7 @@ OUR_GROUPS: Final = frozenset({0xDA00, 0xDB00, 0xEF00, *range(0xFF00, 0x10000)})
 
 
 class FrameKey(NamedTuple):
-    """What a frame is matched by: its identifier, or for J1939 its parameter group number."""
+    """Key by which a frame is matched: its identifier, or for J1939 its parameter group number."""
 
     number: int
     extended: bool
@@ -73,7 +73,7 @@ class DbcMessage:
 
     @property
     def key(self) -> FrameKey:
-        """What its frames are matched by."""
+        """Key by which its frames are matched."""
         identifier = self.message.frame_id
         if self.message.protocol == "j1939":
             return FrameKey(pgn_of(identifier), extended=True, pgn=True)

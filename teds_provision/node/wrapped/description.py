@@ -85,7 +85,7 @@ _AMBIGUOUS: Final = {
 def written_unit(text: str) -> tuple[str, str]:
     """Return the unit of our table for one of a file, and a note for people ("" if there is nothing to note).
 
-    A unit that nothing knows counts as none: the values are plain numbers, and the note says so.
+    A unit that nothing knows counts as none: the values are plain numbers, with a note.
     """
     stripped = text.strip()
     if stripped.lower() in _ALIASES and not (stripped.lower() in _KEEP_CASE and stripped != "Nm"):
@@ -328,7 +328,7 @@ class WrappedSensor:
     def blocks(self, uuid: bytes, name: str = "") -> dict[BlockId, bytes]:
         """Return the TEDS of a node around this sensor, without Security TEDS; raises BadDataError.
 
-        What no file states is not stated (NaN): the uncertainty, as a step of the raw number is none, and the limits of
+        Facts that no file states are NaN: the uncertainty, as a step of the raw number is none, and the limits of
         a float without a range.
         """
         profile = parse_profile(self.profile_text("wrapped"), "wrapped")

@@ -60,7 +60,7 @@ _UNITS: Final = {
 
 
 class ScanElement(NamedTuple):
-    """How a channel lies in a scan of the buffer: ``place`` orders them, sizes are in bits."""
+    """Place of a channel in a scan of the buffer: ``place`` orders them, sizes are in bits."""
 
     place: int
     order: str

@@ -24,7 +24,7 @@ Notify = Callable[[str], None]
 
 
 class Reader(Protocol):
-    """What reads the sensors, in threads of its own."""
+    """Reader of the sensors, which has its own threads."""
 
     def start(self) -> None:
         """Begin; raises an error of ours with the cause."""

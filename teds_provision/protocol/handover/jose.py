@@ -225,7 +225,7 @@ def decrypt(octets: bytes, key: PrivateKey, *, cty: str, max_octets: int) -> byt
 
 @dataclass(frozen=True)
 class ContentSeal:
-    """What opens a ciphertext beside its key: initialisation vector, tag, additional authenticated data."""
+    """Inputs that open a ciphertext beside its key: initialisation vector, tag, additional authenticated data."""
 
     iv: bytes
     tag: bytes

@@ -1,6 +1,6 @@
 """About, Locate and the number of Manage (128.21 to 128.23): what runs on a node (profile.md, "About and Locate").
 
-About is a statement: in a session by the holder of the node's key, outside one by anybody. It measures no image.
+About is a statement: in a session by the holder of the node's key, outside one unauthenticated. It measures no image.
 """
 
 from __future__ import annotations

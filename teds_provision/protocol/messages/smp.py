@@ -26,7 +26,7 @@ SMP_ERROR_KEYS: Final = ("rc", "err")
 
 
 class SmpCommand(NamedTuple):
-    """What a packet asks for: first octet, group, command id."""
+    """Command of a packet: first octet, group, command id."""
 
     first: int
     group: int

@@ -121,7 +121,7 @@ class BoardFacts:
 
 @dataclass(frozen=True)
 class EvidenceClaim:
-    """What is to be proven of a board: its UUID, the Security TEDS that it shows (framed), and the facts."""
+    """Facts to be proven of a board, with its UUID and the Security TEDS that it shows (framed)."""
 
     uuid: bytes
     teds: bytes = field(repr=False)

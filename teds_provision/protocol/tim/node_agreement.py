@@ -29,7 +29,7 @@ PENDING_SECONDS: Final = 60.0
 
 @dataclass
 class _PendingAgreement:
-    """What a good Request left in RAM, and the link of its Confirm."""
+    """State that a good Request leaves in RAM, and the link of its Confirm."""
 
     agreement: NodeAgreement = field(repr=False)
     link: str

@@ -1,4 +1,4 @@
-"""What follows from the pages that count: claims about nodes, digests of datasheets, bans, conflicts.
+"""Rows that follow from the pages that count: claims about nodes, digests of datasheets, bans, conflicts.
 
 A row that this station believes without verifying its signer again (a digest, the lifting of a ban) has a MAC.
 """
@@ -18,7 +18,7 @@ _DIGITS = 16
 
 
 class Claims:
-    """What the stations of the plant state, as one station has read it."""
+    """Statements of the plant's stations, as one station has read them."""
 
     def __init__(self, store: Store, row_macs: RowMacs) -> None:
         self._store, self._row_macs = store, row_macs

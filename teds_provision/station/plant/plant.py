@@ -170,7 +170,7 @@ class Plant:
 
     @property
     def joined(self) -> PlantRecord | None:
-        """What this station joined and has not left; None if others' statements count as without a plant."""
+        """The registry that this station joined and has not left, None for none."""
         record = self.record()
         return record if record is not None and record.left is None else None
 

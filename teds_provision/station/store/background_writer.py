@@ -1,6 +1,6 @@
 """Durable steps that a run takes behind its own back while it talks to a node: a thread that lives as long as the run.
 
-What the run asks of the store next waits for them (:class:`.connection.Connection`), so it never
+The run's next access to the store waits for them (:class:`.connection.Connection`), so it never
 reads what is older than its own steps, and what it writes comes after them: the order of durable writes is that of the
 program, as if each step had been taken at once. Only messages to the node may overtake one.
 """

@@ -57,7 +57,7 @@ class WhitelistEntry:
 
 @dataclass(frozen=True, slots=True)
 class NodeRecord:
-    """What is known of one node.
+    """One node as the store knows it.
 
     ``state`` is that of Identify (0 factory, 1 keyed, 2 provisioned); ``can_address`` 1 to 239, 0 for none;
     ``teds_sha256`` is the digest (hex) of the Security TEDS last committed; ``channels`` counts TransducerChannels;
@@ -131,7 +131,7 @@ class NodeReading:
 
 @dataclass(frozen=True, slots=True)
 class FirmwareRecord:
-    """What a node last reported of its firmware.
+    """The last firmware report of a node.
 
     ``report`` is the payload of the reply to About, empty if the node reports none; ``at`` is when this very report
     first came, or came again after another station had seen other firmware.
@@ -147,7 +147,7 @@ class FirmwareRecord:
 
 
 class ExportEligibility(NamedTuple):
-    """What decides whether one node may leave: its identity key with its seal, and whether it was retired."""
+    """Facts that decide whether a node may leave: its identity key with its seal, and whether it was retired."""
 
     uuid: bytes
     point: bytes | None
@@ -156,7 +156,7 @@ class ExportEligibility(NamedTuple):
 
 
 class ExportedNode(NamedTuple):
-    """What a bundle contains about a node beside its link key; as in :class:`NodeRecord`, with the node's groups."""
+    """Facts of a node that a bundle contains beside its link key; as in :class:`NodeRecord`, with the node's groups."""
 
     uuid: bytes
     point: bytes | None
@@ -217,7 +217,7 @@ class DatasheetRecord:
 
 @dataclass(frozen=True)
 class StationRecord:
-    """What a station knows of itself: name, keystore, and the points (65 octets) and signature (64) of its key.
+    """The station's own record: name, keystore, and the points (65 octets) and signature (64) of its key.
 
     ``requested`` is the point for which a certificate was requested; ``point``, ``ca`` and ``signature`` come together
     when init is complete. ``master`` is the number of the master key that wraps link keys, ``rewrapping`` the number of
@@ -239,7 +239,7 @@ class StationRecord:
 
 @dataclass(frozen=True)
 class KeyFlags:
-    """What holds for the keys of one node until something ends it.
+    """Flags of one node's keys, each until something ends it.
 
     ``ca``: P(CA) that it keeps, if that is not the owner's; ``next_ca`` the one that it keeps if the pending key
     ``next_key_id`` turns out to be good; ``rotation``: why a rotation is due; ``former``: fingerprint of the board that
@@ -269,7 +269,7 @@ COMMAND: Final = "command"
 
 @dataclass(frozen=True)
 class KeptMeasurement(MeasurementSpec):
-    """What the station measures after every start: its settings, and whose it is.
+    """A measurement that the station resumes after every start: its settings, and whose it is.
 
     ``owner`` is ``ncap``, ``page``, ``api:TOKEN`` or :data:`COMMAND`; of a command ``pid`` is the process ID and
     ``started`` the start of that process (unix seconds). ``ends`` is when (unix seconds), None for never.

@@ -99,7 +99,7 @@ def _runs(store: Database, table: str, key: Sequence[str], count: int, *, whole:
     """Yield so many rows in runs of neighbours that begin at random, and the last run: the key's first column of each.
 
     A start is drawn between the first and the last value of each column of the key in turn, not among the rows, which
-    are not counted. So rows that are close together by their key are read as one run or not at all.
+    are not counted. So rows that are close together by their key are read as one run, or all left out.
     """
     columns, what = ", ".join(key), "*" if whole else key[0]
     places = ", ".join("?" * len(key))

@@ -288,7 +288,7 @@ def load_calibrations(
 ) -> dict[int, Calibration]:
     """Read a calibration file for the channels of a profile: by channel number, fitted as file or profile ask.
 
-    ``choice`` says how a certificate is to be read; ``due`` is when the next calibration is due, whatever the file and
+    ``choice`` decides how a certificate is read; ``due`` is when the next calibration is due, whatever the file and
     the profile state. Raises NotFoundError (no such file) and BadDataError (file, line, field, and what is wrong), and
     for a certificate UsageError (an unclear item, no lxml) and NotAuthenticError (a bad signature).
     """

@@ -49,7 +49,7 @@ class SampleStatistics:
 def reading_of(values: NDArray[np.float64], turn: float = math.inf) -> SampleStatistics:
     """Return the reading of samples; ``turn``: they are angles in a unit with this turn, and their mean is circular.
 
-    The mean of angles lies within half a turn of the first one.
+    The mean of angles is within half a turn of the first one.
     """
     first = float(values[0])
     away = values - first

@@ -383,7 +383,7 @@ class _Walk(Head):
         return Field(spec.type, spec.name, units_of(bytes(packed)), raw, at, children)
 
     def nested(self, parent: FieldSpec, start: int, end: int) -> tuple[Field, ...]:
-        """Return the tuples inside a structure, only those of its own table."""
+        """Return the tuples inside a structure, only those of its table."""
         octets, width, by_type = self.octets, self.width, parent.by_type
         fields: list[Field] = []
         seen: set[int] = set()

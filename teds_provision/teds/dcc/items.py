@@ -1,7 +1,7 @@
 """Which result of a certificate calibrates a channel, and the calibration that comes of it.
 
 A certificate may hold several results that could be meant: two quantities, the state as found beside the state as left.
-An item is one of them. What fits a channel is found by its unit; if more than one fits, the caller chooses.
+An item is one of them. Items that fit a channel are found by unit; if more than one fits, the caller chooses.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ def _misfit(item: CertificateItem, channel: ChannelProfile) -> str:
 
 
 def _is_raw(quantity: Quantity, channel: ChannelProfile) -> bool:
-    """Return True if indications are raw numbers; of a channel without a unit only if their reference type says so."""
+    """Return True if indications are raw numbers; of a channel without a unit only by their reference type."""
     if not _is_plain(quantity.unit):
         return False
     return quantity.has_role("rawvalue") or not (_is_plain(channel.unit) or channel.units.interpretation == RATIO)

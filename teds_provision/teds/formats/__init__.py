@@ -1,4 +1,4 @@
-"""TEDS in files: told apart, read and written in every format that is known here.
+"""TEDS in files: recognised, read and written in every format that is known here.
 
 ==========  =======================================  ==========================================================
 kind        what                                     holds
@@ -12,7 +12,7 @@ image       all TEDS of one node (``teds-image/1``)  framed TEDS with channels; 
 toml        profile of a transducer type             what a type has: see :func:`lost`
 ==========  =======================================  ==========================================================
 
-A sealed handover ``bundle`` is told apart, but holds no TEDS that could be read here.
+A sealed handover ``bundle`` is recognised, but holds no TEDS that could be read here.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """TEDS as a TOML profile, and a profile as TEDS.
 
-A profile holds less than TEDS do: it has no calibration, no signatures, no fields without a key. What it cannot hold is
+A profile holds less than TEDS do: it has no calibration, no signatures, no fields without a key. Losses are
 found by building the TEDS again from the text and comparing octet for octet.
 """
 

@@ -52,7 +52,7 @@ def parse_release(text: str) -> Release | None:
 
 
 def firmware_demand(top: Section) -> FirmwareDemand | None:
-    """Read the table; None for a profile without it. What is wrong is reported to the section."""
+    """Read the table; None for a profile without it. Mistakes are reported to the section."""
     part = top.section("firmware")
     if part is None:
         return None

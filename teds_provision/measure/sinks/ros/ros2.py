@@ -1,6 +1,6 @@
 """ROS 2 without ROS: a DDS participant that ROS 2 tools take for a node (Humble to Lyrical).
 
-What makes it one: ``enclave=/;`` as the participant's user data, topics ``rt/…`` of types ``pkg::msg::dds_::Type_`` in
+It is recognised by ``enclave=/;`` as the participant's user data, topics ``rt/…`` of types ``pkg::msg::dds_::Type_`` in
 XCDR1, the type's hash in each endpoint's user data, and ``ros_discovery_info``, rewritten after each new endpoint.
 Unless the user brings a configuration (CYCLONEDDS_URI), nothing leaves this machine: loopback only, no multicast.
 Writers are reliable with a short history, so that best-effort and reliable readers both match; metadata is transient
