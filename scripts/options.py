@@ -157,7 +157,7 @@ def configuration() -> str:
         options = options_of(command)
         if not options:
             continue
-        lines += [f"## {path or 'Global options'}", "", "| option | variable | says |", "|---|---|---|"]
+        lines += [f"## {path or 'Global options'}", "", "| option | variable | meaning |", "|---|---|---|"]
         for option in options:
             name = _long(option)
             variable = f"`{ENVIRONMENT_PREFIX}_{name.replace('-', '_').upper()}`"

@@ -304,7 +304,7 @@ def agreement_epoch(probe: Probe) -> str:
     }.get(offered)
     if offered != before.epoch + 1:
         raise RuleBrokenError(f"Request offers epoch {offered}; {before.epoch + 1} is due.", slip)
-    holds(probe.identity() == before, "Request changed what Identify says before its Confirm.")
+    holds(probe.identity() == before, "Request changed the reply to Identify before its Confirm.")
     return f"epoch {offered} offered"
 
 
@@ -420,7 +420,7 @@ def agreement(probe: Probe) -> str:
     before = probe.identity()
     confirm(probe, sealed=False)
     after = probe.identity()
-    holds(after.state != NodeState.FACTORY, "After a good Confirm (128.2) Identify still says factory.")
+    holds(after.state != NodeState.FACTORY, "After a good Confirm (128.2) Identify still reports factory state.")
     holds(after.epoch == before.epoch + 1, f"After Confirm the epoch is {after.epoch}; {before.epoch + 1} was offered.")
     holds(after.sequence == before.sequence, f"Confirm took the sequence from {before.sequence} to {after.sequence}.")
     return f"keyed, epoch {after.epoch}"
@@ -468,7 +468,7 @@ def open_a_session(probe: Probe) -> str:
     """En is a point, the tag shows that the node holds the key, and a sealed command gets a sealed reply."""
     probe.open()
     inside, outside = probe.sealed_good(IDENTIFY), probe.good(IDENTIFY)
-    holds(inside == outside, "Identify says another thing in the session than outside it.")
+    holds(inside == outside, "Identify replies differently in the session and outside it.")
     return "a good tag; Identify the same inside and outside"
 
 

@@ -103,7 +103,7 @@ class _Stranger:
                 raise RuleBrokenError("The first frame of a long request got no flow control.")
             if control.octets[0] != WAIT:
                 return control.octets[1], gap_seconds(control.octets[2])
-        raise RuleBrokenError("The first frame of a long request got ten flow controls that say wait.")
+        raise RuleBrokenError("The first frame of a long request got ten flow controls with Wait.")
 
     def request(self, body: bytes, bend: Callable[[int, bytes], bytes] = lambda _, data: data) -> bool:
         """Send a request; ``bend`` changes a consecutive frame, counted from 1. False if the node asks for no more."""
@@ -276,7 +276,7 @@ def _reply_in_blocks(probe: Probe, due: bytes) -> str:
             raise RuleBrokenError("Read (1.2) of the Security TEDS: no first frame of a reply.")
         stranger.flow(WAIT)
         early = stranger.next(_QUIET)
-        _obeyed(stranger, early is None, "A frame of the reply came after a flow control that says wait.")
+        _obeyed(stranger, early is None, "A frame of the reply came after a flow control with Wait.")
         stranger.flow(CONTINUE, _BLOCK, _GAP_MS)
         came = [frame for _ in range(_BLOCK) if (frame := stranger.next(_ANSWER, _CONSECUTIVE)) is not None]
         _obeyed(

@@ -42,7 +42,7 @@ _REGISTERS = (
     measuring_rules,
 )
 """The modules whose rules are registered by being imported."""
-_ONLY_FACTORY = "The node has a key. Ask with --factory to have it reset and keyed anew."
+_ONLY_FACTORY = "The node has a key. Use --factory to have it reset and keyed again."
 _NEEDS_FACTORY = "Changes the node's key. Ask with --factory."
 _NEEDS_KEY = "The node has no key. Ask with --factory to give it one."
 

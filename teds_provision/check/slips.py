@@ -208,7 +208,7 @@ class Agreement:
             transcript_without_node=(over(label, request, nonce, epoch, en, uuid, digest), "T leaves out P(node)"),
             transcript_points_without_04=(
                 over(label, request, nonce, epoch, en[1:], uuid, node[1:], digest),
-                "En and P(node) stand in T without their first octet 04",
+                "En and P(node) are in T without their first octet 04",
             ),
             transcript_request_with_header=(
                 over(label, header, request, nonce, epoch, rest, digest),
@@ -328,7 +328,7 @@ def _confirmations(key: bytes, own: bytes, other: bytes, script: bytes) -> list[
             f'the MAC label is "{other.decode()}"; "{own.decode()}" is due',
         ),
         mac_without_label=(_hmac(key, script)[:16], "the MAC has no label"),
-        mac_label_last=(_hmac(key, script + own)[:16], "the MAC label stands behind T"),
+        mac_label_last=(_hmac(key, script + own)[:16], "the MAC label comes after T"),
         mac_last_16_octets=(whole[16:], "the tag is the last 16 octets of the MAC, not the first"),
         mac_reversed=(whole[:16][::-1], "the tag is reversed"),
     )
@@ -382,7 +382,7 @@ def _forms(signature: bytes) -> Iterator[tuple[Slip | None, bytes]]:
     r, s = signature[:32], signature[32:]
     yield None, normalise_signature(signature)
     yield Slip("signature-little-endian", "r and s are little-endian"), normalise_signature(r[::-1] + s[::-1])
-    yield Slip("signature-s-first", "s stands before r"), normalise_signature(s + r)
+    yield Slip("signature-s-first", "s comes before r"), normalise_signature(s + r)
 
 
 def of_node_key(uuid: bytes, node: bytes, signature: bytes) -> Slip | None:
@@ -393,8 +393,8 @@ def of_node_key(uuid: bytes, node: bytes, signature: bytes) -> Slip | None:
         label_without_00=(label[:-1] + uuid + node, 'the label "TEDS1 node key" lacks its 00'),
         without_label=(uuid + node, "it is made without its label"),
         without_uuid=(label + node, "it leaves out the UUID"),
-        uuid_last=(label + node + uuid, "the UUID stands behind P(node)"),
-        point_without_04=(label + uuid + node[1:], "P(node) stands in it without its first octet 04"),
+        uuid_last=(label + node + uuid, "the UUID comes after P(node)"),
+        point_without_04=(label + uuid + node[1:], "P(node) is in it without its first octet 04"),
         station_label=(b"TEDS1 station key\0" + node, "it has label and form of field 104"),
     )
     return of_signature(node, signature, ways, digest=hashlib.sha256(node).digest())
@@ -408,8 +408,8 @@ def of_prove(uuid: bytes, node: bytes, challenge: bytes, proof: bytes) -> Slip |
         label_without_00=(label[:-1] + uuid + challenge, 'the label "TEDS1 prove" lacks its 00'),
         without_label=(uuid + challenge, "it is made without its label"),
         without_uuid=(label + challenge, "it leaves out the UUID"),
-        uuid_last=(label + challenge + uuid, "the UUID stands behind the challenge"),
-        challenge_alone=(challenge, "it is over the challenge alone: anybody gets anything signed so"),
+        uuid_last=(label + challenge + uuid, "the UUID comes after the challenge"),
+        challenge_alone=(challenge, "it is over the challenge alone: anyone could get anything signed"),
     )
     return of_signature(node, proof, ways, digest=challenge)
 
@@ -502,14 +502,14 @@ def opens(
     mac("mac-counter-little-endian", "c in mac is little-endian",
         lambda c: _hmac(key, label + uuid + c[::-1] + point)[:16])  # fmt: skip
     mac("mac-without-counter", "mac leaves out c", lambda c: _hmac(key, label + uuid + point)[:16])
-    mac("mac-counter-last", "c stands behind Es in mac", lambda c: _hmac(key, label + uuid + point + c)[:16])
+    mac("mac-counter-last", "c comes after Es in mac", lambda c: _hmac(key, label + uuid + point + c)[:16])
     mac("mac-next-counter", "c in mac is one too high",
         lambda c: _hmac(key, label + uuid + _next(c) + point)[:16])  # fmt: skip
     mac("mac-without-point", "mac leaves out Es", lambda c: _hmac(key, label + uuid + c)[:16])
     mac(
         "mac-with-key-id", "mac is over keyId as well", lambda c: _hmac(key, label + uuid + c + identifier + point)[:16]
     )
-    mac("mac-point-without-04", "Es stands in mac without its first octet 04",
+    mac("mac-point-without-04", "Es is in mac without its first octet 04",
         lambda c: _hmac(key, label + uuid + c + point[1:])[:16])  # fmt: skip
     mac("mac-last-16-octets", "mac is the last 16 octets of the MAC",
         lambda c: _hmac(key, label + uuid + c + point)[16:])  # fmt: skip
@@ -595,7 +595,7 @@ def _sealing(
 
 SEALED: Final[list[tuple[Slip, Seal]]] = [
     (Slip("session-keys-swapped", "k_sn and k_ns are swapped"), _sealing(swapped=True)),
-    (Slip("nonce-counter-first", "the counter stands before the nine zero octets of the nonce"),
+    (Slip("nonce-counter-first", "the counter comes before the nine zero octets of the nonce"),
      _sealing(nonce_first=True)),
     (Slip("nonce-counter-little-endian", "the counter in the nonce is little-endian"), _sealing(little=True)),
     (Slip("aad-counter", "the counter is taken as AAD; the AAD is empty"), _sealing(aad=True)),
@@ -629,7 +629,7 @@ def of_sealed_reply(keys: SessionKeys, payload: bytes, counter: int) -> Slip | N
         (SEALED[2][0], opened(keys.to_station, bytes(9) + number[::-1])),
         (SEALED[3][0], opened(keys.to_station, bytes(9) + number, number)),
         (Slip("nonce-of-zeros", "the nonce of a sealed reply is zeros alone"), opened(keys.to_station, bytes(13))),
-        (Slip("nonce-next-counter", "a sealed reply has a counter of its own in its nonce"),
+        (Slip("nonce-next-counter", "a sealed reply has another counter in its nonce"),
          opened(keys.to_station, bytes(9) + (counter + 1 & 0xFFFFFFFF).to_bytes(4, "big"))),
     ):  # fmt: skip
         if made is not None:
@@ -651,7 +651,7 @@ def of_data_message(key: bytes, run: int, counter: int, message: bytes) -> Slip 
         run_little_endian=(run_key(label, run.to_bytes(2, "little")), "run is little-endian in the run's key"),
         run_before=(run_key(label, (run - 1).to_bytes(2, "big")), "the run's key is that of the run before"),
         run_left_out=(run_key(label, b""), "the run's key leaves out run"),
-        run_key_is_km=(key[:16], "messages are sealed under k_m; each run has a key of its own"),
+        run_key_is_km=(key[:16], "messages are sealed under k_m; each run has its own key"),
     )
     nonces = _ways(
         bytes(9) + head,
@@ -682,7 +682,7 @@ def _of_padding(inner: bytes) -> Slip | None:
     if length == len(inner) and not length % 16:
         return Slip("padding-no-full-block", "a reply that is a multiple of 16 octets gets no block of padding")
     if length == len(inner):
-        return Slip("padding-none", "a sealed reply is not padded at all")
+        return Slip("padding-none", "a sealed reply is not padded")
     padding = inner[length:]
     if not any(padding):
         return Slip("padding-zeros", "the padding is zeros; each octet of PKCS #7 is their number")

@@ -34,7 +34,7 @@ class RevokeResult:
 def revoke(station: Station, uuid: bytes, why: str) -> RevokeResult:
     """Ban a node's key: off the whitelist, its keys deleted, and a signed statement that travels in every bundle."""
     if not why.strip() or not is_label(why):
-        raise UsageError("Say why, in printable text of at most 1,024 characters.")
+        raise UsageError("Give the reason, in printable text of at most 1,024 characters.")
     present = station.policy.revocation(uuid)
     if present is not None and not station.keys.held(uuid) and station.pins.entry(uuid) is None:
         return RevokeResult(present, fresh=False)

@@ -192,7 +192,7 @@ class _ZeroRun:
         out = []
         if settled.extrapolated:
             first, last = own.inputs[0].boundaries[0], own.inputs[0].boundaries[-1]
-            out.append(f"The reading lies outside the calibrated range (raw {first:.8g} to {last:.8g}).")
+            out.append(f"The reading is outside the calibrated range (raw {first:.8g} to {last:.8g}).")
         if self.visit.station.datasheets.draft(self.visit.node.uuid) is not None:
             out.append("This node has a draft, which does not include this zero offset; to drop it: draft drop UUID.")
         return tuple(out)

@@ -49,7 +49,7 @@ class Operator:
 
     def jump(self, question: str) -> None:
         """Ask before a datasheet is written that uses up many sequence numbers of its node; raises PolicyError."""
-        raise PolicyError("This needs confirmation, but nobody can be asked.", hint=question)
+        raise PolicyError("This needs confirmation, but no person can be asked.", hint=question)
 
 
 class AcceptingOperator(Operator):

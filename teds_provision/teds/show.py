@@ -238,7 +238,7 @@ def _calibration(decoded: DecodedTeds, context: Context, now: datetime) -> Itera
 def _security(decoded: DecodedTeds, context: Context) -> Iterator[Line]:
     ours = decoded.field(_PROFILE_VERSION) is not None
     if not ours:
-        yield "kind", "somebody else's Security TEDS (no field 105): shown, never trusted"
+        yield "kind", "another vendor's Security TEDS (no field 105): shown, never trusted"
     yield from _keys(decoded)
     signature = decoded.field("Signature")
     when = decoded.get("LastModified")

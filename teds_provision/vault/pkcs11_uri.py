@@ -77,7 +77,7 @@ def _attributes(part: str, separator: str) -> dict[str, bytes]:
 def _refuse(found: dict[str, bytes]) -> None:
     if any(name.removeprefix("?") in _SECRETS for name in found):
         raise UsageError(
-            "A PKCS #11 URI may not hold a PIN or say where one lies.",
+            "A PKCS #11 URI may not contain a PIN or its place.",
             hint="Remove pin-value and pin-source: you are asked for the PIN, or pass it with --passphrase-fd.",
         )
     if "?module-name" in found:

@@ -132,7 +132,7 @@ def test_a_security_teds_shows_fingerprints_and_weak_algorithms(show, show_json,
     _, out, _ = show(path)
     assert "DES: weak" in out
     assert "MD5: weak" in out
-    assert "somebody else's Security TEDS" in out
+    assert "another vendor's Security TEDS" in out
     _, shown = show_json(path)
     assert {field["name"] for field in shown["fields"] if field.get("weak")} == {
         "UsedVerAlg",

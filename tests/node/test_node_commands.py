@@ -110,7 +110,7 @@ def test_a_copy_of_a_known_node_gets_a_uuid_of_its_own_or_is_refused(tmp_path: P
 
     asked = run(*make, tmp_path / "twin", "--teds", file, "--uuid", UUID.hex())
     assert (asked.code, asked.json["uuid"]) == (0, UUID.hex())
-    assert "cannot be told apart" in asked.err
+    assert "cannot be distinguished" in asked.err
     assert run(*make, tmp_path / "no", "--new-uuid").code == 2
 
     answered = on_terminal(home, "node", "create", tmp_path / "third", "--teds", file, answers=["y"])

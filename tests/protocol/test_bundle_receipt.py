@@ -39,7 +39,7 @@ def test_the_same_receipt_is_the_same_octets():
 
 
 def test_a_receipt_of_a_stranger_is_refused():
-    with pytest.raises(NotAuthenticError, match="Nobody trusted"):
+    with pytest.raises(NotAuthenticError, match="not trusted here"):
         open_receipt(seal_receipt(receipt(sender=fingerprint(STRANGER.point)), STRANGER), trusts(RECEIVER))
 
 

@@ -207,7 +207,7 @@ def capture(
     "teds-provision calibrate fit joint3.csv --dcc joint3.xml --laboratory laboratory.toml",
 )
 @click.argument("file", type=FileToRead(), metavar="FILE.csv")
-@click.option("--method", type=click.Choice(METHODS), help="How to fit (default: as the file says, else table).")
+@click.option("--method", type=click.Choice(METHODS), help="How to fit (default: the file's method, else table).")
 @click.option("--degree", type=WholeNumber(1, 12), metavar="N", help="Degree of a polynomial (default: 3).")
 @click.option("--profile", "-p", metavar="P", help="Also check it against this transducer type and the guard.")
 @click.option(

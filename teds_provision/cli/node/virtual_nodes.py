@@ -97,7 +97,7 @@ def _name(_ctx: click.Context, _parameter: click.Parameter, text: str) -> str:
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--uuid", callback=_uuid, metavar="HEX", help="UUID, 20 hex digits (default: from the file, or random).")
 @click.option(
-    "--new-uuid", is_flag=True, help="Replace the UUID in the file: two nodes with one UUID cannot be told apart."
+    "--new-uuid", is_flag=True, help="Replace the UUID in the file: two nodes with one UUID cannot be distinguished."
 )
 @click.option(
     "--name",
@@ -229,9 +229,9 @@ def _free_uuid(app: App, folder: Path, uuid: bytes | None, teds: Path | None, ne
     if stated is None or known is None:
         return uuid
     if uuid is not None:
-        app.warn(f"{known} has this UUID: two nodes with one UUID cannot be told apart. Run only one of them.")
+        app.warn(f"{known} has this UUID: two nodes with one UUID cannot be distinguished. Run only one of them.")
         return uuid
-    found = f"{known} has the UUID {stated.hex()} of {teds}; two nodes with one UUID cannot be told apart."
+    found = f"{known} has the UUID {stated.hex()} of {teds}; two nodes with one UUID cannot be distinguished."
     if not app.interactive:
         raise KnownUuidError(
             found,

@@ -199,7 +199,7 @@ class Virtuals:
         if uuid.hex() in self._all or self._station.overview.is_known(uuid) or uuid.hex() in on_bus:
             raise KnownUuidError(
                 f"The datasheet has the UUID of node {uuid.hex()}, which this station already knows.",
-                hint='Two nodes with one UUID cannot be told apart. Give the new one its own UUID ("new_uuid": true).',
+                hint='Two nodes cannot share a UUID. Give the new one another UUID ("new_uuid": true).',
             )
         if address in self._addresses():
             raise UsageError(

@@ -292,7 +292,7 @@ def _what(every: bool, group: str | None, profile: str | None) -> Any:
 @click.argument("name")
 @click.option("--retired", is_flag=True, help="Taken out of service in an orderly way.")
 @click.option("--lost", is_flag=True, help="Its whereabouts are unknown.")
-@click.option("--stolen", is_flag=True, help="Somebody else has it: its sessions end at once.")
+@click.option("--stolen", is_flag=True, help="Someone else has it: its sessions end at once.")
 @click.option("--last", type=WholeNumber(0, 1 << 31), metavar="N", help="Its last page that counts.")
 @_change_options
 @pass_app

@@ -134,7 +134,7 @@ def check_signature(
     signer = find_key(kid)
     if signer is None or fingerprint(signer) != kid:
         raise NotAuthenticError(
-            f"Nobody trusted here has the key {kid[:16]!r} that signed this.",
+            f"The key {kid[:16]!r} that signed this is not trusted here.",
             hint="Compare the fingerprint with its owner by voice, then: teds-provision trust add NAME FILE.",
         )
     if not _es256_good(signer, digest, decode_base64url(signature_text, "The signature")):

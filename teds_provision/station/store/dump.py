@@ -79,7 +79,7 @@ def load(source: RowSource) -> Store:
             raise BadDataError("The store in the backup is damaged.")
     except (sqlite3.IntegrityError, sqlite3.DataError, UnicodeDecodeError) as error:
         connection.close()
-        raise BadDataError("The store in the backup breaks a rule of its own tables.") from error
+        raise BadDataError("The store in the backup breaks a rule of its tables.") from error
     except sqlite3.Error as error:
         connection.close()
         raise StoreError(

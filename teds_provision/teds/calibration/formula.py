@@ -304,7 +304,9 @@ def fit(
             part, coefficients = _steps(_require_room(_averaged(pairs)))
     curve = CalibrationInput(channel, *part)
     if not curve.ascending:
-        raise BadDataError("Two inputs of the calibration lie so close together that a Float32 cannot tell them apart.")
+        raise BadDataError(
+            "Two inputs of the calibration are so close together that a Float32 cannot distinguish them."
+        )
     return Calibration(channel, method, (curve,), coefficients, points=tuple(points), actuator=actuator)
 
 

@@ -101,7 +101,7 @@ class Head:
         if int.from_bytes(self.octets[end - 2 : end], "big") != checksum(self.octets[: end - 2]):
             return False
         more = len(self.octets) - end
-        self.find("error", "frame-trailing", f"{more} octets stand behind the checksum of this TEDS.", end, "", 0, more)
+        self.find("error", "frame-trailing", f"{more} octets follow the checksum of this TEDS.", end, "", 0, more)
         return True
 
     def tedsid(self, start: int, end: int) -> None:
@@ -112,7 +112,7 @@ class Head:
             first = f"type {self.octets[start]}"
             self.find("error", "tedsid-first", "The TEDSID tuple is not first.", start, "TEDSID", "type 3", first)
         if at is None:
-            self.find("note", "no-class", "There is no TEDSID: nothing says what the fields mean.", start)
+            self.find("note", "no-class", "There is no TEDSID, so the meaning of the fields is unknown.", start)
             return
         size = self.octets[at + 1] if at + 1 < end else 0
         if size not in (4, 5) or at + 2 + size > end:

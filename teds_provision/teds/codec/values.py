@@ -360,7 +360,7 @@ def split_text(fields: list[Field], area: bytes, at: int, find: Callable[..., No
         return _cut(area, [length + 2 for length in known], at, find)
     tagged = _tagged(area)
     if tagged is not None:
-        message = "The text stands in a tuple of type 128; it should stand bare."
+        message = "The text is in a tuple of type 128; it should be bare."
         find("warning", "text-tagged", message, at, "", "bare", "128")
         return tagged
     if area:

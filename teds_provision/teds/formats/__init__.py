@@ -143,7 +143,7 @@ def write_blocks(blocks: Sequence[TedsBlock], format: Format) -> bytes | str:
     if format == "binary":
         if len(blocks) > 1 and not is_run(blocks):
             raise BadDataError(
-                "Several TEDS stand in one binary file only if each has a right Length and checksum.",
+                "Several TEDS can be in one binary file only if each has a right Length and checksum.",
                 hint="Use hex, json or xml.",
             )
         return b"".join(block.octets for block in blocks)

@@ -462,7 +462,7 @@ def _shapeless(number: int) -> bytes:
 
 def _nameless(number: int) -> bytes:
     """Return a channel of which nothing is known any more but its messages."""
-    note = text("note") + text("the description of this topic stood in a damaged chunk")
+    note = text("note") + text("the description of this topic was in a damaged chunk")
     topic = text(f"/recovered/channel_{number}")
     content = struct.pack("<HH", number, 0) + topic + text("cdr") + struct.pack("<I", len(note)) + note
     return record(CHANNEL, content)

@@ -74,7 +74,7 @@ export function virtualView(main) {
         return;
       }
       const offer = h("button", { type: "button", onclick: () => make.busy(() => create(true)) }, "Create it with a new UUID");
-      fill(error, trouble({ message: refusal.message, hint: "Two nodes with one UUID cannot be told apart." }), h("div", { class: "row" }, offer));
+      fill(error, trouble({ message: refusal.message, hint: "Two nodes with one UUID cannot be distinguished." }), h("div", { class: "row" }, offer));
     }
   }
 
