@@ -798,7 +798,7 @@ PATTERNS = (
     Pattern(
         "a folder that lacks pages forgot nothing",
         "_own_head",
-        "connected and there < joined.acknowledged and (not post.everybody)",
+        "connected and there < joined.acknowledged and (not transport.everybody)",
         "connected and there < joined.acknowledged",
         "tests/plant/test_own_head.py",
     ),
