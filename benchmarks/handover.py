@@ -32,7 +32,7 @@ from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.station.station import Station, initialise
-from teds_provision.station.store import NodeRecord, TrustRecord, WhitelistEntry
+from teds_provision.station.store.records import NodeRecord, TrustRecord, WhitelistEntry
 from teds_provision.vault import passphrase
 
 ROUNDS = 3

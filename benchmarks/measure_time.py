@@ -42,7 +42,7 @@ from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import provision
 from teds_provision.station.station import Station, initialise
-from teds_provision.station.store import KeptMeasurement
+from teds_provision.station.store.records import KeptMeasurement
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
 from teds_provision.vault import passphrase

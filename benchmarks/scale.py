@@ -27,7 +27,7 @@ from typing import Any
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.bulk import BulkRows
 from teds_provision.station.station import Station, initialise
-from teds_provision.station.store import KeyRecord, NodeRecord, WhitelistEntry, utc_now
+from teds_provision.station.store.records import KeyRecord, NodeRecord, WhitelistEntry, utc_now
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.vault import passphrase

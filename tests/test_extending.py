@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.station.store import NodeRecord
+from teds_provision.station.store.records import NodeRecord
 from tests.bench import make_station
 from tests.cli.shell import clean_environment
 
@@ -140,8 +140,8 @@ from teds_provision.measure.buses import Buses
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.running.measurement import Watcher
 from teds_provision.measure.running.measurement_job import MeasurementJob
-from teds_provision.station.store import KeptMeasurement
-from teds_provision.station.store import NodeRecord
+from teds_provision.station.store.records import KeptMeasurement
+from teds_provision.station.store.records import NodeRecord
 from tests.bench import make_station
 from tests.measure.hall import provisioned
 

@@ -60,7 +60,7 @@ LATE_MODULES = {
 LATE_ROOMS = {
     "check", "demo", "describe", "measure", "measure/recordings", "measure/running", "measure/sinks",
     "measure/sinks/mcap", "node", "node/firmware", "node/wrapped",
-    "plant", "plant/demo", "provisioning", "station/store", "teds", "teds/calibration", "teds/dcc",
+    "plant", "plant/demo", "provisioning", "teds", "teds/calibration", "teds/dcc",
 }  # fmt: skip
 """Rooms that give their modules at the first use (PEP 562): users name a room where a module would slow --help."""
 

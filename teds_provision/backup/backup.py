@@ -16,7 +16,7 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.sanitize import counted
 from teds_provision.station.snapshot import totals
 from teds_provision.station.station import Station
-from teds_provision.station.store import utc_now
+from teds_provision.station.store.records import utc_now
 from teds_provision.vault.base import Ask, Vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
 

@@ -26,8 +26,8 @@ from teds_provision.station.node_keys import RESTORED
 from teds_provision.station.plant.plant import new_home
 from teds_provision.station.snapshot import Relation, is_damage, place, relation, set_aside, totals
 from teds_provision.station.station import Station
-from teds_provision.station.store import StoreLock
-from teds_provision.station.store.database import has_store
+from teds_provision.station.store.lock import StoreLock
+from teds_provision.station.store.sqlite import has_store
 from teds_provision.vault.base import Ask, Vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
 from teds_provision.vault.selection import asked_first, create_vault, open_vault

@@ -45,7 +45,7 @@ from teds_provision.provisioning.verify import require_authentic
 from teds_provision.provisioning.verify_node import judge_and_keep
 from teds_provision.shapes.problem import problem_in
 from teds_provision.station.station import Station, initialise
-from teds_provision.station.store import TrustRecord
+from teds_provision.station.store.records import TrustRecord
 from teds_provision.vault.passphrase import THROWAWAY
 
 if TYPE_CHECKING:

@@ -16,9 +16,10 @@ from teds_provision.sanitize import counted
 from teds_provision.station.firmware import FirmwareDemands, known_firmware
 from teds_provision.station.node_keys import deferred_until
 from teds_provision.station.station import Station
-from teds_provision.station.store import chunks, utc_now
-from teds_provision.station.store.database import has_store
+from teds_provision.station.store.database import chunks
+from teds_provision.station.store.records import utc_now
 from teds_provision.station.store.row_sample import SAMPLED, RowSample
+from teds_provision.station.store.sqlite import has_store
 
 _SHOWN: Final = 5
 

@@ -15,7 +15,7 @@ from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import StoreError
 from teds_provision.lazy import REQUIRED, install_command
 from teds_provision.station.station import Station
-from teds_provision.station.store.database import has_store
+from teds_provision.station.store.sqlite import has_store
 from teds_provision.vault.passphrase import THROWAWAY, SealingKey
 
 _MIN_PYTHON: Final = (3, 11)

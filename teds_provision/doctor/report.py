@@ -20,8 +20,8 @@ from teds_provision import __version__
 from teds_provision.doctor.checks import Finding, System
 from teds_provision.errors import TedsProvisionError
 from teds_provision.station.station import Station
-from teds_provision.station.store import AuditFilter
-from teds_provision.station.store.database import has_store
+from teds_provision.station.store.audit import AuditFilter
+from teds_provision.station.store.sqlite import has_store
 
 FORMAT: Final = "teds-report/1"
 _LAST_ERRORS: Final = 20

@@ -17,10 +17,10 @@ from teds_provision.files import open_to_read
 from teds_provision.sanitize import counted
 from teds_provision.station.snapshot import totals
 from teds_provision.station.station import Station
-from teds_provision.station.store import AuditFilter, AuditLog
-from teds_provision.station.store.database import has_store
+from teds_provision.station.store.audit import AuditFilter, AuditLog
 from teds_provision.station.store.lock import holder_of
 from teds_provision.station.store.row_sample import SAMPLED, RowSample
+from teds_provision.station.store.sqlite import has_store
 from teds_provision.vault import agent
 from teds_provision.vault.file_vault import read_sealed
 from teds_provision.vault.keyring_vault import KeyringVault, inspect

@@ -14,7 +14,7 @@ from teds_provision.protocol.handover.revocation import Revocation as Statement
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
-from teds_provision.station.store import RevocationRecord
+from teds_provision.station.store.records import RevocationRecord
 
 
 def why_not(station: Station, statement: Statement, bundle: Bundle) -> str:

@@ -34,7 +34,8 @@ from teds_provision.station.bulk import BulkRows
 from teds_provision.station.groups import valid_name
 from teds_provision.station.node_keys import MAX_PENDING
 from teds_provision.station.station import Station
-from teds_provision.station.store import Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, chunks, utc_now
+from teds_provision.station.store.database import chunks
+from teds_provision.station.store.records import Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, utc_now
 
 # Nodes that come with a bundle: what becomes of each, and the rows of those that are taken in.
 

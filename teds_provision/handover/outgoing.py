@@ -27,14 +27,14 @@ from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.bulk import BulkRows
 from teds_provision.station.station import Station
-from teds_provision.station.store import (
+from teds_provision.station.store.database import chunks
+from teds_provision.station.store.records import (
     ExportEligibility,
     Handover,
     Holder,
     NodeRecord,
     Tombstone,
     TrustRecord,
-    chunks,
     utc_now,
 )
 

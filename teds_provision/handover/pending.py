@@ -20,7 +20,8 @@ from teds_provision.protocol.handover.receipt import Receipt, open_receipt
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object
 from teds_provision.sanitize import counted
 from teds_provision.station.station import Station
-from teds_provision.station.store import Handover, Holder, chunks
+from teds_provision.station.store.database import chunks
+from teds_provision.station.store.records import Handover, Holder
 
 OPEN, CLOSED, UNDONE, IMPORTED = "open", "closed", "undone", "imported"
 

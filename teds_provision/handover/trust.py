@@ -15,9 +15,9 @@ from teds_provision.protocol.handover.jose import point_of, public_jwk
 from teds_provision.protocol.handover.strict_json import decode_base64url, dump, encode_base64url, load_object
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, from_pem, station_key_message, verify
 from teds_provision.station.station import Station
-from teds_provision.station.store import StoreLock, TrustRecord
-from teds_provision.station.store.database import has_store
-from teds_provision.station.store.records import TrustRole
+from teds_provision.station.store.lock import StoreLock
+from teds_provision.station.store.records import TrustRecord, TrustRole
+from teds_provision.station.store.sqlite import has_store
 from teds_provision.vault.base import Ask, Vault
 from teds_provision.vault.ca_file import read_ca
 from teds_provision.vault.selection import asked_first, create_vault

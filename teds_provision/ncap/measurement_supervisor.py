@@ -58,7 +58,7 @@ from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.shapes.measurement import MeasurementSpec
 from teds_provision.shapes.problem import problem_of
 from teds_provision.station.station import Station
-from teds_provision.station.store import KeptMeasurement
+from teds_provision.station.store.records import KeptMeasurement
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
 

@@ -12,7 +12,7 @@ from teds_provision.measure.matching import ListedNodes, NodeMatch, UnsignedNode
 from teds_provision.measure.running.measurement import Measurement
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.ncap.membership import Budget, Membership
-from teds_provision.station.store import KeptMeasurement
+from teds_provision.station.store.records import KeptMeasurement
 
 
 class Phase(Enum):

@@ -19,7 +19,7 @@ from teds_provision.measure.display_units import FileUnits
 from teds_provision.measure.sinks import FILES, CommandTaker, Sink, in_units, open_sink, without_scalars
 from teds_provision.measure.sinks.foxglove import FoxgloveSink
 from teds_provision.measure.sinks.foxglove_server import FoxgloveServer
-from teds_provision.station.store import KeptMeasurement
+from teds_provision.station.store.records import KeptMeasurement
 
 RECORDINGS: Final = "recordings"
 STARTED: Final = "mqtt"

@@ -31,7 +31,7 @@ from teds_provision.station.plant.alarms import Alarm
 from teds_provision.station.plant.pages import Chain, PageRow
 from teds_provision.station.plant.plant import RosterRow
 from teds_provision.station.station import Station
-from teds_provision.station.store import KeyRecord, NodeRecord, WhitelistEntry, utc_now
+from teds_provision.station.store.records import KeyRecord, NodeRecord, WhitelistEntry, utc_now
 
 AT_ONCE: Final = 500
 """Nodes that are judged in one transaction: others write in between."""

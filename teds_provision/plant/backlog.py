@@ -18,7 +18,7 @@ from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.handover.revocation import open_revocation
 from teds_provision.station.firmware import plant_event
 from teds_provision.station.station import Station
-from teds_provision.station.store import KeyRecord
+from teds_provision.station.store.records import KeyRecord
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import Image
 

@@ -11,7 +11,7 @@ from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.lazy import install_command, late
 from teds_provision.sanitize import counted
 from teds_provision.station.station import Station
-from teds_provision.station.store.database import has_store
+from teds_provision.station.store.sqlite import has_store
 
 if TYPE_CHECKING:
     from teds_provision.protocol.plant import roster as rosters

@@ -16,7 +16,7 @@ from teds_provision.protocol.plant.evidence import NONCE_OCTETS, EvidenceClaim, 
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.station.plant.line import EvidenceRow
 from teds_provision.station.station import Station
-from teds_provision.station.store import utc_now
+from teds_provision.station.store.records import utc_now
 from teds_provision.teds.codec import security
 
 TOOL = f"teds-provision {__version__}"

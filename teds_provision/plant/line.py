@@ -34,7 +34,7 @@ from teds_provision.provisioning.teds_read import NodeSnapshot
 from teds_provision.station.label import label_of, read_label, write_label
 from teds_provision.station.plant.line import EvidenceRow, UnitRow
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry, utc_now
+from teds_provision.station.store.records import WhitelistEntry, utc_now
 from teds_provision.teds.certificate import certificate_reference_of
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds

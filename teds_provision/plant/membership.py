@@ -19,7 +19,7 @@ from teds_provision.provisioning.verify import snapshot_trust, verify_image
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.plant.pages import Chain
 from teds_provision.station.station import Station
-from teds_provision.station.store import utc_now
+from teds_provision.station.store.records import utc_now
 from teds_provision.teds.codec import security
 
 FILES = "file:"

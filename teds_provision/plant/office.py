@@ -38,7 +38,7 @@ from teds_provision.provisioning.calibration_guard import guard
 from teds_provision.provisioning.sign import sign
 from teds_provision.station.plant.line import SignRequestRow, UnitRow
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry, utc_now
+from teds_provision.station.store.records import WhitelistEntry, utc_now
 from teds_provision.teds.calibration.files import read_calibrations
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.image import SECURITY, Image

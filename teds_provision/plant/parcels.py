@@ -32,7 +32,8 @@ from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.plant.alarms import Alarm
 from teds_provision.station.plant.parcels import ParcelKind, ParcelRow
 from teds_provision.station.station import Station
-from teds_provision.station.store import TrustRecord, chunks
+from teds_provision.station.store.database import chunks
+from teds_provision.station.store.records import TrustRecord
 
 NODES: Final = 10_000
 """So many nodes go into one copy."""

@@ -22,7 +22,7 @@ from teds_provision.protocol.plant.claim import Claim, had_key
 from teds_provision.protocol.plant.roster import RemovedMember, Roster, open_roster
 from teds_provision.station.node_keys import REMOVED, STOLEN, deferred
 from teds_provision.station.station import Station
-from teds_provision.station.store import KeyRecord
+from teds_provision.station.store.records import KeyRecord
 
 OTHERS: Final = timedelta(hours=24)
 """So long the station whose turn it is has to rotate a key, before others do."""

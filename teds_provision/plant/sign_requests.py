@@ -59,7 +59,7 @@ from teds_provision.provisioning.teds_read import read_identity
 from teds_provision.provisioning.visit import at_node
 from teds_provision.station.plant.line import SignRequestRow
 from teds_provision.station.station import Station
-from teds_provision.station.store import Draft
+from teds_provision.station.store.records import Draft
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY, Image
 

@@ -41,7 +41,8 @@ from teds_provision.station.plant.line import UnitRow
 from teds_provision.station.plant.pages import Chain
 from teds_provision.station.plant.plant import new_home
 from teds_provision.station.station import Station
-from teds_provision.station.store import StoreLock, WhitelistEntry, utc_now
+from teds_provision.station.store.lock import StoreLock
+from teds_provision.station.store.records import WhitelistEntry, utc_now
 
 LOCK_FILE: Final = "registry.lock"
 _ROOM: Final = 20_000

@@ -34,7 +34,7 @@ from teds_provision.provisioning.progress import Reporter
 from teds_provision.provisioning.teds_read import read_block, read_identity
 from teds_provision.provisioning.visit import at_node
 from teds_provision.station.station import NodeKey, Station
-from teds_provision.station.store import KeyRecord, WhitelistEntry, utc_now
+from teds_provision.station.store.records import KeyRecord, WhitelistEntry, utc_now
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
 

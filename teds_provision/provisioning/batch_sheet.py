@@ -42,7 +42,7 @@ from teds_provision.provisioning.provision import ProvisionResult
 from teds_provision.provisioning.verify import require_authentic
 from teds_provision.station.label import read_label
 from teds_provision.station.station import Station
-from teds_provision.station.store import utc_now
+from teds_provision.station.store.records import utc_now
 from teds_provision.teds.certificate import split_channel
 
 Result = Literal["passed", "failed", "skipped"]

@@ -42,7 +42,7 @@ from teds_provision.provisioning.verify import FreshnessFloor, verify_image
 from teds_provision.sanitize import printable
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
-from teds_provision.station.store import Draft, NodeRecord
+from teds_provision.station.store.records import Draft, NodeRecord
 from teds_provision.teds import guard as guarding
 from teds_provision.teds.calibration import Calibration
 from teds_provision.teds.calibration.files import load_calibrations

@@ -15,7 +15,7 @@ from teds_provision.provisioning.teds_read import take_snapshot
 from teds_provision.provisioning.visit import at_node
 from teds_provision.provisioning.write import WriteResult, write
 from teds_provision.station.station import Station
-from teds_provision.station.store import DatasheetRecord, Draft
+from teds_provision.station.store.records import DatasheetRecord, Draft
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.image import Image
 

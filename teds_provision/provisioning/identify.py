@@ -33,8 +33,7 @@ from teds_provision.provisioning.teds_read import read_block
 from teds_provision.sanitize import printable
 from teds_provision.station.firmware import KnownFirmware, firmware_of
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry, utc_now
-from teds_provision.station.store.records import Assurance
+from teds_provision.station.store.records import Assurance, WhitelistEntry, utc_now
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import SECURITY

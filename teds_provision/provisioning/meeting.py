@@ -28,7 +28,7 @@ from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.provisioning.progress import Reporter
 from teds_provision.station.station import Station
-from teds_provision.station.store import utc_now
+from teds_provision.station.store.records import utc_now
 
 _log = logging.getLogger(__name__)
 _SHOWN = 5

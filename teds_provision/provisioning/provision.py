@@ -51,7 +51,7 @@ from teds_provision.shapes.verdict import Verification
 from teds_provision.station.firmware import FirmwareDemands, FirmwareReading
 from teds_provision.station.shown_units import shown_units, units_of
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from teds_provision.teds.calibration.formula import sentence
 from teds_provision.teds.certificate import CertificateReference
 from teds_provision.teds.image import SECURITY, Image

@@ -27,7 +27,7 @@ from teds_provision.provisioning.verify import (
 )
 from teds_provision.shapes.verdict import MERELY_UNSIGNED, Check, NodeVerdict, Origin, Verification
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeReading, utc_now
+from teds_provision.station.store.records import NodeReading, utc_now
 from teds_provision.teds.image import SECURITY, Image
 
 _DIGEST = 35  # octets: channel u16, access code u8, SHA-256

@@ -29,7 +29,7 @@ from teds_provision.provisioning.meeting import meet
 from teds_provision.provisioning.progress import Reporter
 from teds_provision.provisioning.teds_read import NodeSnapshot, take_snapshot
 from teds_provision.station.station import Station
-from teds_provision.station.store import Draft
+from teds_provision.station.store.records import Draft
 from teds_provision.teds.codec import security
 from teds_provision.teds.diff import diff_blocks
 from teds_provision.teds.image import SECURITY, Image

@@ -16,7 +16,7 @@ from teds_provision.protocol.messages.identity import Identity
 from teds_provision.shapes.verdict import FRESHNESS, PAGES, SESSION, Check, Verification
 from teds_provision.station.plant.plant import SignerRules
 from teds_provision.station.station import Station
-from teds_provision.station.store import RevocationRecord, WhitelistEntry
+from teds_provision.station.store.records import RevocationRecord, WhitelistEntry
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.codec.security import NotCanonicalError, SecurityTeds

@@ -23,8 +23,8 @@ from teds_provision.files import read_text
 from teds_provision.limits import check_count, load_json
 from teds_provision.protocol.fingerprints import read_fingerprint, same_key
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry, chunks
-from teds_provision.station.store.records import UUID_OCTETS
+from teds_provision.station.store.database import chunks
+from teds_provision.station.store.records import UUID_OCTETS, WhitelistEntry
 
 MAX_FILE_OCTETS: Final = 64 * 1024 * 1024
 MAX_ENTRIES: Final = 250_000

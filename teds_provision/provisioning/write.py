@@ -41,7 +41,7 @@ from teds_provision.provisioning.verify import freshness_floor_of
 from teds_provision.provisioning.visit import at_node
 from teds_provision.station.firmware import FirmwareReading
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeRecord
+from teds_provision.station.store.records import NodeRecord
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId, Image

@@ -12,8 +12,7 @@ from teds_provision.errors import StoreError
 from teds_provision.files import whole_draft
 from teds_provision.station.station import Station
 from teds_provision.station.store.connection import as_store_failure
-from teds_provision.station.store.database import FILE_NAME
-from teds_provision.station.store.sqlite import sqlite3
+from teds_provision.station.store.sqlite import FILE_NAME, sqlite3
 
 _COUNTED: Final = ("whitelist", "nodes", "keys", "trust")
 _DAMAGE: Final = (11, 26)  # SQLITE_CORRUPT, SQLITE_NOTADB (sqlite.org, rescode): for --help sqlite3 is not loaded

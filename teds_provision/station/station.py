@@ -56,11 +56,14 @@ from teds_provision.station.pins import Pins
 from teds_provision.station.plant.plant import Plant
 from teds_provision.station.policy import Policy
 from teds_provision.station.row_macs import RowMacs
-from teds_provision.station.store import AuditLog, KeyRecord, NodeLock, Store, StoreLock
+from teds_provision.station.store.audit import AuditLog
 from teds_provision.station.store.background_writer import BackgroundWriter
-from teds_provision.station.store.database import has_store
 from teds_provision.station.store.dump import RowSource, dump, load
+from teds_provision.station.store.lock import NodeLock, StoreLock
+from teds_provision.station.store.records import KeyRecord
 from teds_provision.station.store.row_sample import RowSample
+from teds_provision.station.store.sqlite import has_store
+from teds_provision.station.store.store import Store
 from teds_provision.vault.base import Ask, Vault, node_key_context
 from teds_provision.vault.master import MasterKeys
 

@@ -16,7 +16,7 @@ from teds_provision.cli.service import ncap
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.running.measurement_job import request_of
 from teds_provision.shapes.measurement import NAMES, OPTIONS, PUBLISHED, MeasurementMembers, MeasurementSpec
-from teds_provision.station.store import KeptMeasurement
+from teds_provision.station.store.records import KeptMeasurement
 
 from ..bench import make_station
 from ..test_architecture import PACKAGE, parsed

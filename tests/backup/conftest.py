@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.station.station import Station
-from teds_provision.station.store import Draft, NodeRecord, TrustRecord, WhitelistEntry
+from teds_provision.station.store.records import Draft, NodeRecord, TrustRecord, WhitelistEntry
 from teds_provision.teds.image import Image
 from teds_provision.vault.selection import forget_vaults
 from tests.backup.backups import ONE, POINT, TWO, add_key

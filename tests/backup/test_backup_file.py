@@ -17,7 +17,7 @@ from teds_provision.backup.sealed_file import SealedFile, Sealer
 from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError, WrongPassphraseError
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeRecord
+from teds_provision.station.store.records import NodeRecord
 from tests.backup.backups import ONE, POINT, TWO, back_up, copy_of, opened, opened_octets, restored_into
 
 

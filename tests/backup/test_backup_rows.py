@@ -18,8 +18,8 @@ from teds_provision.backup.content import BackupHead
 from teds_provision.backup.sealed_file import SealedFile, Sealer, write
 from teds_provision.errors import BadDataError, NotAuthenticError, StoreError
 from teds_provision.station.station import Station
-from teds_provision.station.store import Draft
 from teds_provision.station.store import dump as rows
+from teds_provision.station.store.records import Draft
 from teds_provision.station.store.schema import SCHEMA_VERSION
 from teds_provision.teds.image import Image
 from teds_provision.vault.passphrase import THROWAWAY

@@ -15,7 +15,7 @@ from teds_provision.backup.content import BackupHead
 from teds_provision.backup.restore import rebuild
 from teds_provision.errors import PolicyError, StoreError, StoreLockedError, UsageError
 from teds_provision.station.station import Station
-from teds_provision.station.store import StoreLock
+from teds_provision.station.store.lock import StoreLock
 from teds_provision.vault.passphrase import THROWAWAY
 from tests.backup.backups import ONE, POINT, TWO, ask, back_up, copy_of, opened, restored_into
 

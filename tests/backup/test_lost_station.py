@@ -11,7 +11,7 @@ from teds_provision.backup.restore import open_present
 from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.station.snapshot import place
 from teds_provision.station.station import Station
-from teds_provision.station.store import Store
+from teds_provision.station.store.store import Store
 from teds_provision.vault.selection import forget_vaults
 from tests.backup.backups import ONE, POINT, TWO, ask, back_up, copy_of, keys_of, opened, restored_into
 

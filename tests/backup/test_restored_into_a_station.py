@@ -16,7 +16,7 @@ from teds_provision.errors import PolicyError, UsageError, VaultError
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.snapshot import Relation, place
 from teds_provision.station.station import Station, initialise
-from teds_provision.station.store import (
+from teds_provision.station.store.records import (
     Handover,
     Holder,
     NodeRecord,

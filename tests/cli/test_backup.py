@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.station.station import Station
-from teds_provision.station.store import Draft, KeyRecord, NodeRecord
+from teds_provision.station.store.records import Draft, KeyRecord, NodeRecord
 from teds_provision.teds.image import Image
 from tests.bench import PASSPHRASE, make_station
 

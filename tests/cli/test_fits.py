@@ -10,7 +10,7 @@ import pytest
 from teds_provision.errors import PolicyError
 from teds_provision.provisioning.inventory import NodeFit, require
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeRecord
+from teds_provision.station.store.records import NodeRecord
 from teds_provision.teds.calibration import fit
 from teds_provision.teds.fits import Fit, parse_fits, parse_require
 from teds_provision.teds.image import Image

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.station.station import Station
-from teds_provision.station.store import Group, KeptMeasurement
+from teds_provision.station.store.records import Group, KeptMeasurement
 from tests.terminal import on_terminal
 
 from .shell import call

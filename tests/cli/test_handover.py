@@ -163,7 +163,7 @@ def test_people_are_shown_both_fingerprints_in_fours_and_what_it_means(homes: Ho
 
 
 def test_a_move_tells_who_else_holds_a_copy(homes: Homes) -> None:
-    from teds_provision.station.store import TrustRecord
+    from teds_provision.station.store.records import TrustRecord
 
     north = open_station(homes.north)
     west = SoftwareKey(61)

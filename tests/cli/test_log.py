@@ -16,7 +16,7 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
-from teds_provision.station.store import Store
+from teds_provision.station.store.store import Store
 from tests.terminal import on_terminal
 
 from .shell import call, clean_environment

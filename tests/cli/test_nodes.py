@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.station.station import Station
-from teds_provision.station.store import (
+from teds_provision.station.store.records import (
     Group,
     Holder,
     KeyRecord,

@@ -22,7 +22,8 @@ from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import provision
 from teds_provision.provisioning.sign import SignOrder, sign_image
-from teds_provision.station.store import StoreLock, WhitelistEntry
+from teds_provision.station.store.lock import StoreLock
+from teds_provision.station.store.records import WhitelistEntry
 
 from ..bench import PASSPHRASE, Board, make_station, talk
 from .shell import call, clean_environment, spawn

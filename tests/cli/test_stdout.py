@@ -11,7 +11,8 @@ import pytest
 
 from teds_provision.sanitize import printable, sanitize, sanitize_json
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeRecord, Store
+from teds_provision.station.store.records import NodeRecord
+from teds_provision.station.store.store import Store
 from tests.bench import PASSPHRASE
 from tests.cli.shell import call, clean_environment
 from tests.terminal import on_terminal

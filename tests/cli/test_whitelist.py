@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import pytest
 
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeRecord, WhitelistEntry
+from teds_provision.station.store.records import NodeRecord, WhitelistEntry
 from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, make_station
 

@@ -27,18 +27,11 @@ from teds_provision.links.nfc.usb_listing import READERS
 from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.station.node_keys import deferred
 from teds_provision.station.station import Station
-from teds_provision.station.store import (
-    Draft,
-    KeyFlags,
-    KeyRecord,
-    NodeRecord,
-    StationRecord,
-    Store,
-    StoreLock,
-    WhitelistEntry,
-    row_sample,
-)
+from teds_provision.station.store import row_sample
 from teds_provision.station.store.database import Database
+from teds_provision.station.store.lock import StoreLock
+from teds_provision.station.store.records import Draft, KeyFlags, KeyRecord, NodeRecord, StationRecord, WhitelistEntry
+from teds_provision.station.store.store import Store
 from teds_provision.teds.image import Image
 from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, copy_home

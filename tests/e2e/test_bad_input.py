@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.station.store import StoreLock
+from teds_provision.station.store.lock import StoreLock
 
 from .desk import ANGLE, Desk, Node, Station, limited, results
 

@@ -18,7 +18,7 @@ from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.station.station import Station
-from teds_provision.station.store import Handover, TrustRecord, WhitelistEntry
+from teds_provision.station.store.records import Handover, TrustRecord, WhitelistEntry
 from tests.bench import Board, MemoryLink, make_station, talk
 
 

@@ -32,7 +32,7 @@ from teds_provision.provisioning.verify_node import verify_at_node
 from teds_provision.provisioning.write import write
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station, initialise
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.vault.selection import forget_vaults

@@ -33,7 +33,7 @@ from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.sign import known_node_keys, sign
 from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeRecord
+from teds_provision.station.store.records import NodeRecord
 from tests.bench import Board, MemoryLink, make_station, talk
 from tests.handover.desk import Pair, held, key_up, provisioned, session, trust
 

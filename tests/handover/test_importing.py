@@ -16,7 +16,7 @@ from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.provisioning.agree import agree, reset_node
 from teds_provision.provisioning.identify import identify
-from teds_provision.station.store import TrustRecord
+from teds_provision.station.store.records import TrustRecord
 from tests.bench import Board, make_station, talk
 from tests.handover.desk import Pair, everything, held, key_up, provisioned, session
 

@@ -18,7 +18,7 @@ from teds_provision.provisioning.inventory import inventory
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.verify import verify_image
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from teds_provision.teds.image import Image
 from tests.bench import Board, talk
 from tests.handover.desk import Pair, held, key_up, provisioned, session

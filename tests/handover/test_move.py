@@ -17,7 +17,7 @@ from teds_provision.provisioning.agree import agree, open_session
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.teds_read import read_image
 from teds_provision.provisioning.verify_node import judge_and_keep
-from teds_provision.station.store import RevocationRecord
+from teds_provision.station.store.records import RevocationRecord
 from tests.bench import MemoryLink, make_station, talk
 from tests.handover.desk import Pair, held, node_key_id, provisioned, session, trust
 

@@ -13,7 +13,7 @@ from teds_provision.handover.pending import close, find_handover, list_handovers
 from teds_provision.protocol.handover.receipt import open_receipt
 from teds_provision.provisioning.agree import agree
 from teds_provision.provisioning.identify import identify
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from tests.bench import make_station, talk
 from tests.handover.desk import Pair, everything, held, row, session, trust
 

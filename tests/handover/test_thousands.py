@@ -14,7 +14,7 @@ from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_ex
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.bulk import BulkRows
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeRecord
+from teds_provision.station.store.records import NodeRecord
 from tests.bench import make_station
 from tests.handover.desk import trust
 

@@ -21,7 +21,7 @@ from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import provision
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry, utc_now
+from teds_provision.station.store.records import WhitelistEntry, utc_now
 from tests.bench import make_station, on_reader
 from tests.e2e.desk import ANGLE, Desk, Running
 from tests.e2e.desk import Station as Commands

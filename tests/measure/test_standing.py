@@ -11,7 +11,7 @@ from teds_provision.errors import BadDatasheetError, PolicyError, TedsProvisionE
 from teds_provision.measure.standing import NodeStanding, require_measurable
 from teds_provision.measure.verified_session import open_trusted
 from teds_provision.station.station import Station
-from teds_provision.station.store import RevocationRecord
+from teds_provision.station.store.records import RevocationRecord
 from tests.bench import PASSPHRASE, MemoryLink, talk
 from tests.handover.desk import Pair, provisioned
 

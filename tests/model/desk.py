@@ -38,7 +38,7 @@ from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.teds_read import read_block
 from teds_provision.station import node_keys
 from teds_provision.station.station import Station
-from teds_provision.station.store import TrustRecord, WhitelistEntry
+from teds_provision.station.store.records import TrustRecord, WhitelistEntry
 from teds_provision.teds.image import SECURITY
 from teds_provision.vault.passphrase import THROWAWAY
 from teds_provision.vault.selection import forget_vaults

@@ -19,7 +19,7 @@ import pytest
 
 from teds_provision.client import ApiError, Client
 from teds_provision.ncap.nodes.sheets import curves
-from teds_provision.station.store import Store
+from teds_provision.station.store.store import Store
 from teds_provision.teds.calibration import read_calibrations
 from teds_provision.teds.profile import load_profile
 from tests.e2e.desk import ANGLE

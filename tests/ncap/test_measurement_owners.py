@@ -15,7 +15,7 @@ import pytest
 
 from teds_provision.client import ApiError
 from teds_provision.station.station import Station
-from teds_provision.station.store import KeptMeasurement
+from teds_provision.station.store.records import KeptMeasurement
 from tests.e2e.desk import Running
 from tests.measure.hall import Hall, killed
 from tests.ncap.service import Service

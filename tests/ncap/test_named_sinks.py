@@ -10,7 +10,7 @@ from teds_provision.cli.config_file import brokers_of
 from teds_provision.client import ApiError
 from teds_provision.errors import BadDataError, TedsProvisionError, UsageError
 from teds_provision.ncap.sinks import DaemonSinks, for_readers
-from teds_provision.station.store import KeptMeasurement
+from teds_provision.station.store.records import KeptMeasurement
 from tests.e2e.desk import Desk
 from tests.ncap.service import Service, virtual
 from tests.places import free_tcp_port

@@ -19,7 +19,7 @@ from teds_provision.ncap.live import Live
 from teds_provision.ncap.waits import USUAL
 from teds_provision.ncap.web.app import MOST_LISTENERS, OF_ONE_TOKEN, LiveSlots
 from teds_provision.ncap.web.tokens import Tokens, digest_of
-from teds_provision.station.store import StoreLock
+from teds_provision.station.store.lock import StoreLock
 from tests.ncap.service import Service
 from tests.pace import PATIENCE, until
 

@@ -21,7 +21,7 @@ from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.node_jobs import NodeJobs, NodeLocks
 from teds_provision.ncap.sinks import DaemonSinks
 from teds_provision.station.station import Station
-from teds_provision.station.store import KeptMeasurement, WhitelistEntry
+from teds_provision.station.store.records import KeptMeasurement, WhitelistEntry
 from tests.bench import make_station
 from tests.ncap.short_waits import SHORT
 from tests.pace import until

@@ -23,8 +23,8 @@ from teds_provision.cli.rendering import local_time
 from teds_provision.client import ApiError
 from teds_provision.ncap.settings import own_source
 from teds_provision.station import station as base_station
-from teds_provision.station.store import Store
 from teds_provision.station.store.schema import SCHEMA_VERSION
+from teds_provision.station.store.store import Store
 from tests.bench import make_station
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Desk, Node, Station, limited

@@ -24,7 +24,7 @@ from teds_provision.ncap.nodes.link_watch import MOST_KNOWN, LinkWatch
 from teds_provision.ncap.nodes.node_jobs import NodeLocks
 from teds_provision.ncap.running_measurement import RunningMeasurement
 from teds_provision.provisioning.conversation import Conversation
-from teds_provision.station.store import KeptMeasurement
+from teds_provision.station.store.records import KeptMeasurement
 from tests.bench import MemoryLink, contact, make_station
 from tests.pace import until
 from tests.provisioning.test_firmware import FirmwareBoard

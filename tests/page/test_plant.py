@@ -12,7 +12,7 @@ from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.station.node_keys import REMOVED
 from teds_provision.station.plant.alarms import Alarm
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from tests.plant.stations import ask, certified, request_of
 
 from .lab import Lab, opened

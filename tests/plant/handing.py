@@ -20,7 +20,7 @@ from teds_provision.provisioning.agree import agree
 from teds_provision.provisioning.identify import identify
 from teds_provision.station.plant.plant import PlantRecord, RosterRow
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry, utc_now
+from teds_provision.station.store.records import WhitelistEntry, utc_now
 from tests.bench import PASSPHRASE, Board, make_station, talk
 
 REGISTRY = "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"

@@ -19,8 +19,8 @@ from teds_provision.plant.apply_pages import heads_digest, merged_views
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.sync import sync
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry
 from teds_provision.station.store.connection import Connection
+from teds_provision.station.store.records import WhitelistEntry
 from tests.plant.stations import Plant, ask
 
 NODES = [bytes([n] * 10) for n in range(1, 5)]

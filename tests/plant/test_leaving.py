@@ -18,7 +18,7 @@ from teds_provision.protocol.plant.roster import Share, Why
 from teds_provision.provisioning.agree import session_if_keyed
 from teds_provision.station.node_keys import REMOVED, deferred
 from teds_provision.station.station import Station
-from teds_provision.station.store import Holder
+from teds_provision.station.store.records import Holder
 from tests.bench import talk
 from tests.plant.handing import board_of
 from tests.plant.stations import Plant, ask

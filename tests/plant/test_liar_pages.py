@@ -13,7 +13,7 @@ from teds_provision.cli.rendering import local_time
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.protocol.plant.document import PAGE, hash_of, seal
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from tests.plant.stations import Plant
 
 NODE = bytes.fromhex("8d4d9da65281f7000000")

@@ -35,7 +35,7 @@ from teds_provision.protocol.plant.signing import (
     seal_request,
 )
 from teds_provision.station.station import Station
-from teds_provision.station.store import RevocationRecord, WhitelistEntry
+from teds_provision.station.store.records import RevocationRecord, WhitelistEntry
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.codec.model import AccessCode

@@ -14,8 +14,8 @@ from teds_provision.provisioning.agree import agree
 from teds_provision.provisioning.identify import identify
 from teds_provision.station.plant.plant import PlantRecord
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry
 from teds_provision.station.store.connection import Connection
+from teds_provision.station.store.records import WhitelistEntry
 from tests.bench import Board, make_station, talk
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")

@@ -15,7 +15,7 @@ from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.sync import SyncResult, acknowledge, resume, sync
 from teds_provision.plant.transport import CarriedPage
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from tests.plant.stations import Plant, ask
 
 

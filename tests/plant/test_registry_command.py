@@ -16,7 +16,7 @@ import pytest
 from teds_provision import plant
 from teds_provision.station.plant.pages import PageRow
 from teds_provision.station.station import Station
-from teds_provision.station.store import Holder
+from teds_provision.station.store.records import Holder
 from tests.bench import PASSPHRASE
 from tests.cli.shell import Outcome, call, spawn
 from tests.plant.stations import ask, certified, owner

@@ -22,7 +22,7 @@ from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.inventory import inventory
 from teds_provision.station.firmware import FirmwareReading
 from teds_provision.station.station import Station
-from teds_provision.station.store import TrustRecord
+from teds_provision.station.store.records import TrustRecord
 from tests.bench import talk
 from tests.cli.shell import call
 from tests.plant.handing import keyed

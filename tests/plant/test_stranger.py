@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from teds_provision.plant.demo.cluster import Cluster
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from tests.plant.handing import board_of
 from tests.plant.test_synced_by_database import Office
 

@@ -20,7 +20,7 @@ from teds_provision.plant.transport import CarriedPage
 from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.page import PageDraft, seal_page
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from tests.plant.stations import Plant, ask
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")

@@ -20,7 +20,7 @@ from teds_provision.plant.scram import verifier
 from teds_provision.plant.sync import SyncResult, resume, sync
 from teds_provision.protocol.plant.roster import Share
 from teds_provision.station.station import Station
-from teds_provision.station.store import TrustRecord, WhitelistEntry
+from teds_provision.station.store.records import TrustRecord, WhitelistEntry
 from tests.cli.shell import call
 from tests.plant.handing import board_of
 from tests.plant.postgres import Database

@@ -23,7 +23,7 @@ from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.provisioning.agree import AgreeResult, agree, open_session, require_session
 from teds_provision.provisioning.identify import identify
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from teds_provision.teds.codec import security
 from tests.bench import Board, MemoryLink, make_station, talk
 

@@ -17,7 +17,7 @@ from teds_provision.provisioning.sign import SignOrder, sign_image
 from teds_provision.provisioning.teds_read import NodeSnapshot
 from teds_provision.provisioning.write import write
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from teds_provision.teds.image import Image
 from tests.bench import Board, MemoryLink, contact, talk
 

@@ -31,7 +31,7 @@ from teds_provision.provisioning.teds_read import read_image
 from teds_provision.provisioning.verify import possession_check
 from teds_provision.provisioning.verify_node import NodeVerification, judge_and_keep, verify_at_node, verify_in_session
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeReading, RevocationRecord, utc_now
+from teds_provision.station.store.records import NodeReading, RevocationRecord, utc_now
 from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import SECURITY

@@ -58,7 +58,7 @@ def test_a_node_given_away_and_provisioned_elsewhere_does_not_come_back_on_a_hin
 
     from teds_provision.protocol.messages.identity import NodeState
     from teds_provision.provisioning.agree import agree as step
-    from teds_provision.station.store import Handover, Tombstone
+    from teds_provision.station.store.records import Handover, Tombstone
 
     from .test_provision import run as provision
 

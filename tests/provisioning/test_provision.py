@@ -197,7 +197,7 @@ def test_a_node_reset_by_hand_is_provisioned_again(station: Station, board: Boar
 
 
 def test_a_revoked_node_is_refused(station: Station, board: Board) -> None:
-    from teds_provision.station.store import RevocationRecord
+    from teds_provision.station.store.records import RevocationRecord
 
     run(station, board)
     station.policy.deny(RevocationRecord(board.uuid, None, "stolen", ""))

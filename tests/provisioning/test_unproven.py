@@ -34,7 +34,7 @@ from teds_provision.provisioning.verify_node import verify_at, verify_at_node
 from teds_provision.provisioning.visit import NodeVisit
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from teds_provision.teds.image import SECURITY, Image
 from tests.bench import Board, MemoryLink, contact, make_station, talk
 

@@ -21,7 +21,7 @@ from teds_provision.provisioning.verify_node import judge_and_keep
 from teds_provision.provisioning.write import write
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
-from teds_provision.station.store import TrustRecord
+from teds_provision.station.store.records import TrustRecord
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY, Image

@@ -21,7 +21,7 @@ from teds_provision.provisioning.whitelist import (
     render,
 )
 from teds_provision.station.station import Station
-from teds_provision.station.store import RevocationRecord, WhitelistEntry
+from teds_provision.station.store.records import RevocationRecord, WhitelistEntry
 from tests.pace import costs_at_most
 
 ONE, TWO = bytes.fromhex("8d4d9da65281f7000000"), bytes.fromhex("8d4d9da65281f7000001")

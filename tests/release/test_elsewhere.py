@@ -81,7 +81,7 @@ from pathlib import Path
 from tests.release.elsewhere import hide
 hide()
 from teds_provision.errors import StoreLockedError
-from teds_provision.station.store import StoreLock
+from teds_provision.station.store.lock import StoreLock
 try:
     with StoreLock(Path(sys.argv[1]), command="trust add", wait=0):
         print("held", flush=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.station.station import Station
-from teds_provision.station.store import Store
+from teds_provision.station.store.store import Store
 
 from ..bench import copied_station
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import StoreError
-from teds_provision.station.store import Store
+from teds_provision.station.store.store import Store
 
 NODE = bytes(range(10))
 DROP = "DROP TRIGGER audit_is_never_changed; DROP TRIGGER audit_is_never_shortened; DROP TRIGGER audit_only_grows;"

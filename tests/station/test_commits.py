@@ -19,8 +19,8 @@ from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import provision
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeRecord
 from teds_provision.station.store.audit import ACTOR
+from teds_provision.station.store.records import NodeRecord
 from tests.bench import Board, MemoryLink, make_station, talk
 
 _CHANGES = ("INSERT", "UPDATE", "DELETE", "REPLACE")

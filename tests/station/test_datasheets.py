@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from teds_provision.station.datasheets import packed, unpacked
 from teds_provision.station.station import Station
-from teds_provision.station.store import Draft, NodeRecord
+from teds_provision.station.store.records import Draft, NodeRecord
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 

@@ -18,7 +18,8 @@ import pytest
 
 from teds_provision.errors import StoreError
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeRecord, Store
+from teds_provision.station.store.records import NodeRecord
+from teds_provision.station.store.store import Store
 
 NODE = bytes(range(10))
 
@@ -26,7 +27,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from teds_provision.station.station import Station
-from teds_provision.station.store import KeyRecord, NodeRecord
+from teds_provision.station.store.records import KeyRecord, NodeRecord
 node = bytes(range(10))
 store = Station.make(Path(sys.argv[1]))
 known = store.nodes.get(node)
@@ -84,7 +85,7 @@ def test_a_writer_killed_at_any_instant_loses_nothing_it_had_committed(home: Pat
 @pytest.mark.slow
 def test_init_killed_at_any_instant_can_be_run_again(home: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from teds_provision.station.store import Store\n"
+        "import sys; from pathlib import Path; from teds_provision.station.store.store import Store\n"
         "print('ready', flush=True); print(Store.open(Path(sys.argv[1]), create=True).id, flush=True)"
     )
     moments = random.Random(7)
@@ -100,7 +101,7 @@ def test_init_killed_at_any_instant_can_be_run_again(home: Path) -> None:
 def test_two_processes_write_at_once_and_nothing_is_lost(home: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from teds_provision.station.station import Station\n"
-        "from teds_provision.station.store import NodeRecord\n"
+        "from teds_provision.station.store.records import NodeRecord\n"
         "store = Station.make(Path(sys.argv[1]))\n"
         "for n in range(150):\n"
         "    store.nodes.restore(NodeRecord(bytes([int(sys.argv[2])]) * 8 + n.to_bytes(2, 'big')))\n"
@@ -123,7 +124,7 @@ sys.dont_write_bytecode = True
 from pathlib import Path
 from teds_provision.errors import StoreError
 from teds_provision.station.station import Station
-from teds_provision.station.store import Draft
+from teds_provision.station.store.records import Draft
 from teds_provision.teds.image import Image
 store = Station.make(Path(sys.argv[1]))
 if sys.argv[2] != "0":
@@ -181,7 +182,8 @@ def test_a_read_only_disk_gives_a_clear_error(station: Station, home: Path) -> N
     code = (
         "import sys; from pathlib import Path; from teds_provision.errors import StoreError\n"
         "from teds_provision.station.station import Station\n"
-        "from teds_provision.station.store import NodeRecord, StoreLock\n"
+        "from teds_provision.station.store.lock import StoreLock\n"
+        "from teds_provision.station.store.records import NodeRecord\n"
         "def write():\n"
         "    with Station.make(Path(sys.argv[1])) as made: made.nodes.restore(NodeRecord(bytes(10)))\n"
         "def lock():\n"

@@ -12,8 +12,9 @@ import pytest
 
 from teds_provision.errors import StoreError
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeRecord, Store
 from teds_provision.station.store.database import open_copy
+from teds_provision.station.store.records import NodeRecord
+from teds_provision.station.store.store import Store
 
 ONE, TWO = bytes(range(10)), bytes(range(1, 11))
 READ_ONLY = 'mount --bind "$0" "$0" && mount -o remount,ro,bind "$0" && exec "$@"'
@@ -27,7 +28,7 @@ import sys
 from pathlib import Path
 from teds_provision.errors import StoreError
 from teds_provision.station.station import Station
-from teds_provision.station.store import NodeRecord
+from teds_provision.station.store.records import NodeRecord
 store = Station.inspect(Path(sys.argv[1]))
 print(len(store.nodes.all()), store.audit_log.check().intact, store._store.frozen is not None)
 try:
@@ -46,7 +47,7 @@ def home(tmp_path: Path) -> Path:
         store.audit("test", ONE, "done")
     script = (
         "import os, sys; from pathlib import Path; from teds_provision.station.station import Station\n"
-        "from teds_provision.station.store import NodeRecord\n"
+        "from teds_provision.station.store.records import NodeRecord\n"
         f"Station.inspect(Path({str(home)!r})).nodes.restore(NodeRecord({TWO!r})); os._exit(0)"
     )
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)

@@ -8,7 +8,7 @@ import pytest
 
 from teds_provision.errors import PolicyError, StoreError, UsageError
 from teds_provision.station.station import Station
-from teds_provision.station.store import Handover, Holder, RevocationRecord, Tombstone, TrustRecord
+from teds_provision.station.store.records import Handover, Holder, RevocationRecord, Tombstone, TrustRecord
 
 NODE = bytes(range(10))
 LAB = TrustRecord("lab", "station", b"\x04" + bytes(64), "ab" * 32)

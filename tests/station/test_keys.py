@@ -9,7 +9,7 @@ import pytest
 
 from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.station.station import Station
-from teds_provision.station.store import KeyRecord, NodeRecord, StationRecord
+from teds_provision.station.store.records import KeyRecord, NodeRecord, StationRecord
 
 NODE = bytes(range(10))
 OTHER = bytes(range(1, 11))

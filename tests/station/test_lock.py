@@ -13,14 +13,13 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import StoreError, StoreLockedError
-from teds_provision.station.store import StoreLock
-from teds_provision.station.store.lock import NodeLock
+from teds_provision.station.store.lock import NodeLock, StoreLock
 from tests.pace import PATIENCE
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from teds_provision.station.store import StoreLock
+from teds_provision.station.store.lock import StoreLock
 with StoreLock(Path(sys.argv[1]), command="provision"):
     print("held", flush=True)
     time.sleep(60)

@@ -8,8 +8,7 @@ import pytest
 
 from teds_provision.errors import BadDataError, NotFoundError, TedsProvisionError
 from teds_provision.station.station import Station
-from teds_provision.station.store import Group, KeptMeasurement
-from teds_provision.station.store.records import DetectionMode
+from teds_provision.station.store.records import DetectionMode, Group, KeptMeasurement
 
 ONE, TWO = bytes(range(10)), bytes(range(1, 11))
 

@@ -8,7 +8,7 @@ import pytest
 
 from teds_provision.errors import BadDataError, KeyMismatchError, NotFoundError, StoreError, UsageError
 from teds_provision.station.station import Station
-from teds_provision.station.store import Draft, NodeRecord, WhitelistEntry
+from teds_provision.station.store.records import Draft, NodeRecord, WhitelistEntry
 from teds_provision.teds.image import Image
 
 FINGER = bytes.fromhex("0102030405060708090a")

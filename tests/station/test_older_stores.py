@@ -12,8 +12,8 @@ import pytest
 from teds_provision.errors import StoreError
 from teds_provision.station.groups import is_valid_name, valid_name
 from teds_provision.station.station import Station
-from teds_provision.station.store import Store
 from teds_provision.station.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, statements
+from teds_provision.station.store.store import Store
 from tests.bench import make_station
 
 

@@ -10,7 +10,7 @@ import pytest
 from teds_provision.errors import KeyMismatchError
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station import pins
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from tests.bench import make_station
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")

@@ -16,7 +16,7 @@ import pytest
 
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station
-from teds_provision.station.store import RevocationRecord, TrustRecord, WhitelistEntry
+from teds_provision.station.store.records import RevocationRecord, TrustRecord, WhitelistEntry
 from tests.plant.stations import Plant
 
 ONE, TWO = bytes(range(10)), bytes(range(10, 20))

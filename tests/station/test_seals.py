@@ -15,7 +15,7 @@ from teds_provision.errors import PolicyError, StoreChangedError, WrongPassphras
 from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station, initialise, rewrap
-from teds_provision.station.store import RevocationRecord, TrustRecord, WhitelistEntry
+from teds_provision.station.store.records import RevocationRecord, TrustRecord, WhitelistEntry
 from teds_provision.vault import passphrase
 from teds_provision.vault.selection import forget_vaults
 

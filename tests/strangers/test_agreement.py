@@ -14,7 +14,7 @@ from teds_provision.provisioning.agree import AgreeResult, agree
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.identify import identify
 from teds_provision.station.station import Station as Ours
-from teds_provision.station.store import WhitelistEntry
+from teds_provision.station.store.records import WhitelistEntry
 from tests.bench import Board
 from tests.strangers.agreement import FAULTS, Node, Station
 from tests.strangers.crypto import CURVE, point

@@ -21,7 +21,7 @@ from _pytest.mark.structures import ParameterSet
 from teds_provision.cli.context import App
 from teds_provision.errors import TedsProvisionError
 from teds_provision.station.station import Station, rewrap
-from teds_provision.station.store import StoreLock
+from teds_provision.station.store.lock import StoreLock
 from teds_provision.vault import agent, selection
 from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, make_station

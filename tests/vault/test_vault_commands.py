@@ -14,8 +14,8 @@ import pytest
 
 from teds_provision.errors import VaultChangedError, VaultLockedError, WrongPassphraseError
 from teds_provision.station.station import Station, rewrap
-from teds_provision.station.store import StoreLock
 from teds_provision.station.store.database import Database
+from teds_provision.station.store.lock import StoreLock
 from teds_provision.vault import agent
 from teds_provision.vault.file_vault import FileVault
 from teds_provision.vault.master import MasterKeys

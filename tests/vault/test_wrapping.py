@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import VaultError
 from teds_provision.station.station import Station
-from teds_provision.station.store import KeyRecord
+from teds_provision.station.store.records import KeyRecord
 from teds_provision.vault.base import node_key_context
 from teds_provision.vault.file_vault import FileVault
 from teds_provision.vault.master import MasterKeys, Material

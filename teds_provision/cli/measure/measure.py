@@ -36,8 +36,7 @@ from teds_provision.links.opening import open_ports
 from teds_provision.links.streaming import measuring_links
 from teds_provision.sanitize import counted
 from teds_provision.shapes.measurement import OPTIONS
-from teds_provision.station.store import KeptMeasurement
-from teds_provision.station.store.records import COMMAND
+from teds_provision.station.store.records import COMMAND, KeptMeasurement
 
 if TYPE_CHECKING:
     from teds_provision.cli.measure import measure_view

@@ -17,7 +17,7 @@ from teds_provision.links import LinkSettings, Notice
 from teds_provision.protocol.announce import LAST_ADDRESS
 from teds_provision.protocol.messages.firmware import LOCATE_SECONDS
 from teds_provision.provisioning.progress import Reporter, StepResult
-from teds_provision.station.store import utc_now
+from teds_provision.station.store.records import utc_now
 
 if TYPE_CHECKING:
     from teds_provision.provisioning.identify import ProvenNode

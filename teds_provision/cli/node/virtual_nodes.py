@@ -25,7 +25,7 @@ from teds_provision.errors import KnownUuidError, StoreError, TedsProvisionError
 from teds_provision.lazy import late
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.station import store as store_room
+from teds_provision.station.store.sqlite import has_store
 
 if TYPE_CHECKING:
     from teds_provision import client
@@ -245,7 +245,7 @@ def _free_uuid(app: App, folder: Path, uuid: bytes | None, teds: Path | None, ne
 
 def _known_as(app: App, uuid: bytes) -> str | None:
     """Return what has a UUID already: a node of this home's station, or one on a link of its running ncap."""
-    if not store_room.database.has_store(app.home):
+    if not has_store(app.home):
         return None
     with suppress(StoreError):  # a virtual node can be made beside a store that cannot be read
         station = app.station()

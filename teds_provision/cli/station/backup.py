@@ -26,8 +26,8 @@ from teds_provision.cli.options import FileToRead, command, dry_run_option, yes_
 from teds_provision.errors import NotFoundError, UsageError, VaultChangedError, VaultError, WrongPassphraseError
 from teds_provision.handover.trust import spoken
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, from_pem
-from teds_provision.station import store as store_room
 from teds_provision.station.station import Station
+from teds_provision.station.store.lock import StoreLock
 from teds_provision.vault.ca_file import read_ca
 from teds_provision.vault.selection import asked_first
 
@@ -188,7 +188,7 @@ def _merge(app: App, station: Station, content: Content, keystore: str | None, *
         app.confirm("Restore this?", yes=yes)
 
     def work(known: Callable[[str, bool], str]) -> RestoreResult:
-        with store_room.StoreLock(app.home, command="restore", notice=app.note):
+        with StoreLock(app.home, command="restore", notice=app.note):
             if not yes and merge(station, content, dry_run=True).back not in (plan.back, {}):
                 raise VaultChangedError(
                     "Another command changed the station while you were being asked, so the list is out of date. "

@@ -28,7 +28,7 @@ from teds_provision.errors import BadDataError, UsageError
 from teds_provision.files import write_whole
 from teds_provision.limits import load_toml
 from teds_provision.links.can import spec
-from teds_provision.station.store import StoreLock
+from teds_provision.station.store.lock import StoreLock
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -22,8 +22,7 @@ from teds_provision.cli.rendering import local_time, moment, print_json_list, sh
 from teds_provision.errors import StoreError, UsageError
 from teds_provision.lazy import late
 from teds_provision.sanitize import counted, sanitize
-from teds_provision.station import store
-from teds_provision.station.store import AuditEntry, AuditFilter, AuditVerdict
+from teds_provision.station.store.audit import AuditEntry, AuditFilter, AuditVerdict, is_failure
 
 if TYPE_CHECKING:
     from teds_provision.station.station import Station
@@ -68,7 +67,7 @@ def log(
     station = app.station()
     audit_log = station.audit_log
     wanted = "today" if today else since
-    choice = store.AuditFilter(
+    choice = AuditFilter(
         station.nodes.resolve(uuid) if uuid else None, act, failed, since=moment(wanted) if wanted is not None else None
     )
     after = audit_log.before(choice, last=last)
@@ -80,7 +79,7 @@ def log(
     if app.json:
         _print_json(entries, verdict, after)
     else:
-        _print_lines(app, entries, verdict, after, narrowed=choice != store.AuditFilter())
+        _print_lines(app, entries, verdict, after, narrowed=choice != AuditFilter())
 
 
 class _CountedEntries:
@@ -94,7 +93,7 @@ class _CountedEntries:
     def __iter__(self) -> Iterator[AuditEntry]:
         for entry in self._from:
             self.entries += 1
-            self.failed += store.is_failure(entry.outcome)
+            self.failed += is_failure(entry.outcome)
             self.acts[entry.act] += 1
             yield entry
 

@@ -40,7 +40,7 @@ from teds_provision.protocol import keys as protocol_keys
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import to_pem
 from teds_provision.station.station import Station
-from teds_provision.station.store import TrustRecord
+from teds_provision.station.store.records import TrustRecord
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 

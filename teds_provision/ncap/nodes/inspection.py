@@ -24,7 +24,7 @@ from teds_provision.provisioning.verify_node import verify_in_session
 from teds_provision.shapes.verdict import NodeVerdict, Verification
 from teds_provision.station.firmware import firmware_of
 from teds_provision.station.station import Station
-from teds_provision.station.store import utc_now
+from teds_provision.station.store.records import utc_now
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.sheet import Sheet
 

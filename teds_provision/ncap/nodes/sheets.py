@@ -21,7 +21,7 @@ from teds_provision.provisioning.teds_read import read_image
 from teds_provision.provisioning.verify import freshness_floor_of, session_check, verify_image
 from teds_provision.shapes.verdict import NodeVerdict, Verification
 from teds_provision.station.station import Station
-from teds_provision.station.store import utc_now
+from teds_provision.station.store.records import utc_now
 from teds_provision.teds import curve as curves_of_guard
 from teds_provision.teds.calibration.model import is_finite
 from teds_provision.teds.channel import TURN

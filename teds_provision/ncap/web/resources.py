@@ -37,7 +37,7 @@ from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.guard import CALLER, Caller
 from teds_provision.ncap.web.responses import body_of, changing, moving, reading
 from teds_provision.provisioning.update import WAIT_SECONDS
-from teds_provision.station.store import AuditFilter, is_failure
+from teds_provision.station.store.audit import AuditFilter, is_failure
 from teds_provision.station.store.records import iso
 from teds_provision.teds.profile import default_folders, list_profiles, listed
 

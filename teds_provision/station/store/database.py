@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from teds_provision.errors import StoreError, StoreLockedError
 from teds_provision.portable import NOFOLLOW, is_mine, is_open_to
@@ -30,16 +30,9 @@ from teds_provision.station.store.connection import (
     too_old,
 )
 from teds_provision.station.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, statements
-from teds_provision.station.store.sqlite import sqlite3
+from teds_provision.station.store.sqlite import FILE_NAME, sqlite3
 
 # Before SQLite opens anything in the home of a station: its owner, its permissions, and its content.
-
-FILE_NAME: Final = "store.sqlite3"
-
-
-def has_store(home: Path) -> bool:
-    """Return True if there is a store here, usable or not."""
-    return (home / FILE_NAME).exists()
 
 
 def prepare_home(home: Path, *, create: bool) -> None:

@@ -9,9 +9,9 @@ from typing import Literal, Self
 
 from teds_provision.errors import BadDataError, StoreError
 from teds_provision.station.store.audit import AuditLog
-from teds_provision.station.store.database import FILE_NAME, Database
+from teds_provision.station.store.database import Database
 from teds_provision.station.store.row_sample import ALL_ROWS, RowSample
-from teds_provision.station.store.sqlite import sqlite3
+from teds_provision.station.store.sqlite import FILE_NAME, sqlite3
 
 _ID_OCTETS = 16
 
