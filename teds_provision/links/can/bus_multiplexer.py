@@ -381,7 +381,8 @@ class ReplyEvent:
 class AddressPair:
     """State of one pair of addresses: the incoming message, and the thread that has an exchange.
 
-    ``own`` is the station's address; ``transaction`` that of the running exchange, -1 for none.
+    ``own`` is the station's address; ``transaction`` that of the running exchange, -1 for none. ``heard_at``: when the
+    last frame came, or the flow control left that its next ones wait for (time.monotonic).
     """
 
     node: int
@@ -634,7 +635,7 @@ class BusMultiplexer:
             elif other is not None and not other.number:
                 return  # the same frame twice
             line.partial, line.replies = partial, None
-            self._reply(flow(line.node, line.own, CONTINUE, fd=frame.fd, gap=line.gap))
+            self._ask_on(line, fd=frame.fd)
             line.events.put(ReplyEvent("begun"))
         elif self._gathered(line, frame, transaction):
             return
@@ -665,7 +666,7 @@ class BusMultiplexer:
                 line.partial = None
                 line.events.put(ReplyEvent("whole", bytes(partial.octets), frame.at))
             case "block":
-                self._reply(flow(line.node, line.own, CONTINUE, fd=partial.fd, gap=line.gap))
+                self._ask_on(line, fd=partial.fd)
             case "torn":
                 line.partial = None
                 self._reply(flow(line.node, line.own, OVERFLOW, fd=partial.fd))  # it need not send the rest
@@ -685,6 +686,11 @@ class BusMultiplexer:
             del self._clashes[node]
         if before != (len(gathering.answers), len(gathering.conflicts)):
             asked.news.put(node)
+
+    def _ask_on(self, line: AddressPair, *, fd: bool) -> None:
+        """Ask for the next frames of a reply; only when that has left does the wait for them begin (N_Cr)."""
+        self._reply(flow(line.node, line.own, CONTINUE, fd=fd, gap=line.gap))
+        line.heard_at = time.monotonic()
 
     def _reply(self, frame: Frame) -> None:
         with self._sending:

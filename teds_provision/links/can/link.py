@@ -42,8 +42,10 @@ _PROMPT_SHARES: Final = (0.25, 0.25, 0.5)
 """Parts of the time that an order may take (operation.md section 2, "No late orders")."""
 _FLOW_SECONDS: Final = (0.25, 0.5, 1.0)
 """The wait for a flow control, try after try, at most N_Bs of ISO 15765-2: a lost one ends it early."""
-_GAP_SECONDS: Final = 0.5
-"""The wait for the next consecutive frame (N_Cr, at most 1 s)."""
+_GAP_SECONDS: Final = 1.0
+"""The wait for the next consecutive frame (N_Cr, profile.md, "CAN"): a node that is slower has given up its reply."""
+_PROMPT_GAP_SECONDS: Final = 0.5
+"""The same for an order: the next one is due soon."""
 _HELLO_SECONDS: Final = 1.0
 _BUSY: Final = refusal(Reason.BUSY).encode()
 BUSY_SECONDS: Final = 10.0
@@ -240,6 +242,7 @@ class _Exchange:
         self._bus, self._line, self._body = bus, line, body
         self._tries, self._seconds, self._prompt, self._hopeless = tries, seconds, prompt, hopeless
         self._longest = seconds if prompt else REPEAT_SECONDS
+        self._gap = _PROMPT_GAP_SECONDS if prompt else _GAP_SECONDS
         self._fd = bus.spec.fd
         self._torn = False
         self._clash = False
@@ -365,14 +368,14 @@ class _Exchange:
                     if self._hopeless():
                         return None
                     continue
-                until = self._line.heard_at + _GAP_SECONDS  # it came on meanwhile, or is torn
+                until = self._line.heard_at + self._gap  # it came on meanwhile, or is torn
                 self._torn = self._torn or until <= time.monotonic()
                 continue
             match event.kind:
                 case "whole":
                     return event.body, event.at
                 case "begun":
-                    until = time.monotonic() + _GAP_SECONDS
+                    until = time.monotonic() + self._gap
                 case "clash":
                     self._clash = True
                 case "torn":

@@ -8,8 +8,9 @@ from collections.abc import Callable
 
 import pytest
 
-from teds_provision.errors import LinkError
+from teds_provision.errors import GarbledError, LinkError
 from teds_provision.links import Notice
+from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
 from tests.links.can import lossy
 from tests.links.can.hub import Hub
@@ -82,6 +83,36 @@ def test_a_lost_flow_control_ends_the_wait_at_once(hub: Hub, nodes: Start) -> No
         return time.monotonic() - began
 
     best_of(5, 4.0, took, because="the exchange itself may take seconds, a reply that is waited for five")
+    port.close()
+
+
+@pytest.mark.parametrize("busy", [0.0, 0.4], ids=["free bus", "flow control held up"])
+def test_a_node_has_a_second_from_the_flow_control_to_the_next_frame(
+    hub: Hub, monkeypatch: pytest.MonkeyPatch, busy: float
+) -> None:
+    """N_Cr (profile.md): half a second after its first frame its reply counted as torn, whatever held it up."""
+    port, begun = CanPort(hub.spec), (0x18DAF121, b"\x10\x20")
+    times: list[tuple[str, float]] = []
+    pass_on = port.bus()._bus.send
+
+    def answer(identifier: int, data: bytes) -> bool:
+        if identifier == 0x18DA21F1 and data[0] == 7:
+            times.append(("asked", time.monotonic()))
+            hub.send(begun[0], begun[1] + data[1:2] + bytes(5))  # and no frame after the first
+        return False
+
+    def send(frame: Frame) -> None:
+        if frame.data[0] >> 4 == 3:
+            time.sleep(busy)
+            times.append(("asked on", time.monotonic()))
+        pass_on(frame)
+
+    monkeypatch.setattr(port.bus()._bus, "send", send)
+    hub.lose = answer
+    with pytest.raises(GarbledError):
+        port.link(0x21).exchange_limited(write(b""), tries=2, seconds=5.0)
+    assert [name for name, _ in times] == ["asked", "asked on"] * 2
+    assert times[2][1] - times[1][1] >= 1.0
     port.close()
 
 
