@@ -2,21 +2,26 @@
 
 Untrusted input is checked cheaply (octets, tags, brackets, depth) before anything is built from it, so that no file
 costs more than 10 s and 300 MB. Every check raises BadDataError that names the excess and the limit. This module is
-below every room and imports nothing of ours but the errors and the decoder of JSON.
+below every room and imports nothing of ours but the errors, the decoder of JSON, and ``late``.
 """
 
 from __future__ import annotations
 
 import json
 import re
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadDataError
 from teds_provision.json_decoder import strict_decoder
+from teds_provision.lazy import late
+
+if TYPE_CHECKING:
+    import tomllib
+else:
+    tomllib = late("tomllib")  # most files are JSON
 
 
 @dataclass(frozen=True)

@@ -375,9 +375,9 @@ def _listen_shortly() -> None:
     A node of a test answers at once. The usual time is held by tests/provisioning/test_identify_at.py and by every
     program that a test starts by an interpreter.
     """
-    options = importlib.import_module("teds_provision.cli.options")
-    assert options.LISTEN_SECONDS > LISTENS
-    options.LISTEN_SECONDS = LISTENS  # type: ignore[attr-defined]
+    ports = importlib.import_module("teds_provision.links.ports")
+    assert ports.LISTEN_SECONDS > LISTENS
+    ports.LISTEN_SECONDS = LISTENS  # type: ignore[attr-defined]  # read by the options alone from here on
 
 
 def main() -> None:

@@ -69,9 +69,9 @@ from teds_provision.protocol.operation.stream_commands import (
     stop,
 )
 from teds_provision.protocol.operation.timing import TriggerToken
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.frame import frame
-from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import SECURITY
 from teds_provision.teds.sheet import ChannelKind, channel_from
 

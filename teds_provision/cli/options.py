@@ -18,18 +18,18 @@ from teds_provision.cli.context import SOCKET, App
 from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.files import require_no_pipe
 from teds_provision.lazy import late
-from teds_provision.links import LINKS, LinkSettings, Trace
-from teds_provision.links.ports import LISTEN_SECONDS
 from teds_provision.protocol.fingerprints import read_fingerprint
-from teds_provision.teds.certificate import split_channel
 
 if TYPE_CHECKING:
-    from teds_provision import client
+    from teds_provision import client, links
     from teds_provision.measure.sinks import foxglove_server
+    from teds_provision.teds import certificate
     from teds_provision.trace import recorder
 else:
+    certificate = late("teds_provision.teds.certificate")  # the codec: only with a calibration
     client = late("teds_provision.client")  # HTTP: only if a base station runs
     foxglove_server = late("teds_provision.measure.sinks.foxglove_server")
+    links = late("teds_provision.links")  # for commands that reach a node
     recorder = late("teds_provision.trace.recorder")  # most runs have no trace
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -102,7 +102,7 @@ class CalibrationFile(FileToRead):
         """Read a path and the channel before it; raises NotFoundError."""
         if isinstance(value, tuple):
             return value
-        channel, file = split_channel(os.fsdecode(value))
+        channel, file = certificate.split_channel(os.fsdecode(value))
         if channel is not None and not 1 <= channel <= 255:
             self.fail(f"{channel} is not a channel number, 1 to 255.", param, ctx)
         return channel, super().convert(value if channel is None else file, param, ctx)
@@ -208,14 +208,14 @@ def link_options(function: Function) -> Function:
             via, chosen = here.pop(), True
         with tracing(trace) as opened, readers_for(via):
             # a setting of config.toml is the wait for a tap; the option on the command line means this very search
-            listen = timeout if options_given("timeout") else LISTEN_SECONDS
-            links = LinkSettings(via, nfc or None, named, ble, timeout, opened, listen, chosen)
-            return function(*args, links=links, **rest)
+            listen = timeout if options_given("timeout") else links.ports.LISTEN_SECONDS
+            settings = links.LinkSettings(via, nfc or None, named, ble, timeout, opened, listen, chosen)
+            return function(*args, links=settings, **rest)
 
     options = [
         click.option(
             "--via",
-            type=click.Choice(list(LINKS)),
+            type=click.Choice(list(links.LINKS)),
             default="nfc",
             show_default=True,
             help="The link to use; without it, the one link that is named, or the bus on which the node was last met.",
@@ -338,7 +338,7 @@ def dry_run_option(function: Function) -> Function:
 
 
 @contextmanager
-def tracing(path: Path | None) -> Iterator[Trace | None]:
+def tracing(path: Path | None) -> Iterator[links.Trace | None]:
     """Yield the trace that ``path`` names, None for none. A command with an incomplete trace, and all else well, is 7.
 
     Raises UsageError if the file exists already, NotFoundError without its folder, StoreError.

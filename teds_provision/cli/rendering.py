@@ -15,7 +15,6 @@ import click
 
 from teds_provision.cli.context import App
 from teds_provision.errors import TedsProvisionError, UsageError
-from teds_provision.links import Notice
 from teds_provision.provisioning.progress import FAILED, NOTHING, SKIPPED, Reporter, SilentReporter, StepResult
 from teds_provision.sanitize import sanitize
 from teds_provision.shapes.problem import problem_of
@@ -24,6 +23,8 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
     from rich.live import Live
     from rich.table import Table
+
+    from teds_provision.links import Notice
 
 
 _PIPE_COLUMNS = 1000

@@ -17,8 +17,8 @@ from teds_provision.provisioning.readings import verdict_of
 from teds_provision.provisioning.verify import require_authentic
 from teds_provision.station.shown_units import shown_units
 from teds_provision.station.station import Station
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.formats.xmlform import parse
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet

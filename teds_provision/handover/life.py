@@ -15,7 +15,7 @@ from teds_provision.provisioning.build import BuildOrder, build
 from teds_provision.station.measurements import HandedOn
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeRecord, RevocationRecord
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.image import BlockId, Image
 
 DECOMMISSIONED = "decommissioned"

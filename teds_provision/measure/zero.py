@@ -34,7 +34,7 @@ from teds_provision.station.station import Station
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.zero import offset_for, reading_of, shortest, turn_of, with_zero_offset
 from teds_provision.teds.channel import TURN, Channel, wrapped
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.diff import diff_blocks
 from teds_provision.teds.image import Image
 from teds_provision.teds.units import format_value

@@ -14,16 +14,18 @@ from teds_provision.portable import cores_to_share
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant import evidence as codec
-from teds_provision.protocol.plant.document import ROSTER
 from teds_provision.protocol.plant.evidence import CheckedEvidence, Evidence, Signatures
-from teds_provision.protocol.plant.roster import Roster, open_roster
 from teds_provision.provisioning.forked_workers import map_ranges
 from teds_provision.shapes.problem import failure_of
 from teds_provision.teds.codec import security
 
 if TYPE_CHECKING:
+    from teds_provision.protocol.plant import document
+    from teds_provision.protocol.plant import roster as rosters
+    from teds_provision.protocol.plant.roster import Roster
     from teds_provision.provisioning import whitelist
-else:  # it brings the store along, which nothing else here needs
+else:  # a list of pins brings the store along, a roster the signed documents: nothing else here needs them
+    document, rosters = late("teds_provision.protocol.plant.document"), late("teds_provision.protocol.plant.roster")
     whitelist = late("teds_provision.provisioning.whitelist")
 
 _FEW: Final = 50
@@ -50,7 +52,9 @@ class EvidenceAnchors:
             if pins is None
             else {listed.uuid: listed.fingerprint or "" for listed in whitelist.read_whitelist(pins)}
         )
-        named = None if roster is None else open_roster(read_limited(roster, ROSTER.most, "roster"), ca)
+        named = (
+            None if roster is None else rosters.open_roster(read_limited(roster, document.ROSTER.most, "roster"), ca)
+        )
         return cls(ca, listed, named)
 
     def faults(self, evidence: Evidence) -> list[str]:

@@ -10,7 +10,7 @@ from functools import lru_cache
 from teds_provision.errors import BadDataError
 from teds_provision.protocol.keys import Credentials, Verify, is_point, station_key_message, verify
 from teds_provision.teds.codec import frame, security
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.image import BlockId
 

@@ -16,8 +16,9 @@ from teds_provision.sanitize import printable
 from teds_provision.station.station import Station
 from teds_provision.teds import guard as guarding
 from teds_provision.teds.channel import Channel
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import AccessCode, Field
+from teds_provision.teds.codec.model import Field
 from teds_provision.teds.codec.tables import TEXT_BASED, name_of
 from teds_provision.teds.formats import stated_uuid
 from teds_provision.teds.image import BlockId, Image

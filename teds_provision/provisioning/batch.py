@@ -68,7 +68,7 @@ from teds_provision.provisioning.readings import verdict_of
 from teds_provision.provisioning.teds_read import take_snapshot
 from teds_provision.provisioning.verify_node import verify_in_session
 from teds_provision.station.station import Station
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import default_folders, load_profile
 

@@ -34,7 +34,8 @@ from teds_provision.station.station import Station
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.channel import ChannelKind
-from teds_provision.teds.codec.model import AccessCode, Units
+from teds_provision.teds.codec.access_code import AccessCode
+from teds_provision.teds.codec.model import Units
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.profile.model import ChannelProfile, Profile
 from teds_provision.teds.sheet import Channel, Sheet

@@ -48,7 +48,7 @@ from teds_provision.teds.calibration import Calibration
 from teds_provision.teds.calibration.files import load_calibrations
 from teds_provision.teds.certificate import CertificateChoice, CertificateReference, ChooseItem
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.image import SECURITY, BlockId, Image
 from teds_provision.teds.profile import BuiltDatasheet, Profile

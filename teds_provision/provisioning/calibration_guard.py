@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from teds_provision import teds
 from teds_provision.errors import PolicyError
 from teds_provision.station.station import Station
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.image import Image
 
 if TYPE_CHECKING:

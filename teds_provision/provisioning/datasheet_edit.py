@@ -24,7 +24,7 @@ from teds_provision.provisioning.write import write
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
 from teds_provision.teds.calibration import Calibration
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.formats import stated_uuid, under
 from teds_provision.teds.image import BlockId, Image

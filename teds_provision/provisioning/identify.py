@@ -35,7 +35,7 @@ from teds_provision.station.firmware import KnownFirmware, firmware_of
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import Assurance, WhitelistEntry, utc_now
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.image import SECURITY
 
 

@@ -6,9 +6,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from teds_provision.links import Notice
+if TYPE_CHECKING:
+    from teds_provision.links import Notice
 
 NOTHING = "nothing to do"
 DONE = "done"

@@ -18,7 +18,7 @@ from teds_provision.station.plant.plant import SignerRules
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import RevocationRecord, WhitelistEntry
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.security import NotCanonicalError, SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId, Image
 

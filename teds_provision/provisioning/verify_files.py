@@ -18,7 +18,7 @@ from teds_provision.shapes.problem import Failure, failure_of
 from teds_provision.shapes.verdict import Check, Verification
 from teds_provision.station.station import Station
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.image import Image
 
 _FEW: Final = 50

@@ -22,7 +22,7 @@ from teds_provision.shapes.verdict import Check, NodeVerdict, Verification
 from teds_provision.station.firmware import KnownFirmware, firmware_of
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import utc_now
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.image import SECURITY, Image
 
 

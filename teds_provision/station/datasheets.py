@@ -21,7 +21,7 @@ from teds_provision.station.store.database import places
 from teds_provision.station.store.records import DatasheetRecord, Draft, NodeReading, iso, utc_now
 from teds_provision.station.store.store import Store
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.image import BlockId, Image
 
 if TYPE_CHECKING:

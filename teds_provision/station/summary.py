@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from teds_provision import teds
 from teds_provision.sanitize import printable
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import channel_of
 

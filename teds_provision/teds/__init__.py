@@ -27,11 +27,11 @@ if TYPE_CHECKING:
         show,
         units,
     )
+    from teds_provision.teds.codec.access_code import AccessCode
     from teds_provision.teds.codec.composer import compose, convert, encode, recompose
     from teds_provision.teds.codec.decode import decode
     from teds_provision.teds.codec.keyforms import ParsedKey, read_key
     from teds_provision.teds.codec.model import (
-        AccessCode,
         Conformity,
         DecodedTeds,
         Edition,
@@ -78,10 +78,11 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "codec.access_code": "AccessCode",
             "codec.composer": "compose convert encode recompose",
             "codec.decode": "decode",
             "codec.keyforms": "ParsedKey read_key",
-            "codec.model": "AccessCode Conformity DecodedTeds Edition Field Finding Severity TimeInstance Units Value",
+            "codec.model": "Conformity DecodedTeds Edition Field Finding Severity TimeInstance Units Value",
             "codec.tables": "FieldSpec Table name_of table",
             "codec.uuid": "UuidParts pack_uuid unpack_uuid",
             "sheet": "Sheet",

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from teds_provision.errors import BadDataError
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.text_lines import MOST_OCTETS, compose_lines, read_lines
 from teds_provision.teds.image import BlockId
 

@@ -15,8 +15,9 @@ from teds_provision.arrays import Ends, NDArray, np
 from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import DataModel, SampleForm
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import AccessCode, DecodedTeds, Units
+from teds_provision.teds.codec.model import DecodedTeds, Units
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.units import (
     ARBITRARY,

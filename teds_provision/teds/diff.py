@@ -10,8 +10,9 @@ from teds_provision.arrays import np
 from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.formula import kind_of
 from teds_provision.teds.calibration.model import Calibration, from_decoded, is_sound
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import AccessCode, DecodedTeds, Field, Units
+from teds_provision.teds.codec.model import DecodedTeds, Field, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of, table
 from teds_provision.teds.curve import Curve, CurveChannel, channel_of, curve_of
 from teds_provision.teds.image import BlockId

@@ -19,8 +19,9 @@ from teds_provision.teds.calibration.formula import evaluate, residuals
 from teds_provision.teds.calibration.model import Calibration, from_decoded
 from teds_provision.teds.calibration.samples import Range
 from teds_provision.teds.channel import TURN, Channel
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import AccessCode, DecodedTeds
+from teds_provision.teds.codec.model import DecodedTeds
 from teds_provision.teds.curve import FLOAT32_STEP, Curve, CurveChannel, channel_of, curve_of
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.profile.model import ChannelProfile, Profile

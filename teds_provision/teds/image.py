@@ -10,8 +10,8 @@ from typing import Final, NamedTuple
 
 from teds_provision.errors import BadDataError
 from teds_provision.limits import LIMITS, check_count, load_json
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.frame import MINIMUM_OCTETS, checksum, teds_class
-from teds_provision.teds.codec.model import AccessCode
 
 FORMAT = "teds-image/1"
 

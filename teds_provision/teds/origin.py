@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final, Literal, cast, get_args
 
 from teds_provision.errors import BadDataError
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.text_lines import compose_lines, lines_of, read_lines, values_of
 from teds_provision.teds.image import BlockId
 

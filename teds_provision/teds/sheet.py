@@ -27,8 +27,9 @@ from teds_provision.teds.channel import (
     number_of,
     read_channel,
 )
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import AccessCode, Conformity, DecodedTeds, Severity
+from teds_provision.teds.codec.model import Conformity, DecodedTeds, Severity
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.origin import Origin, origin_of

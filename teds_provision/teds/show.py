@@ -13,9 +13,10 @@ from typing import Any, Final
 from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import calibrated_unit, from_decoded
 from teds_provision.teds.codec import security
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.keyforms import read_key
-from teds_provision.teds.codec.model import AccessCode, DecodedTeds, Field, Finding, TimeInstance, Units
+from teds_provision.teds.codec.model import DecodedTeds, Field, Finding, TimeInstance, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of, table
 from teds_provision.teds.codec.uuid import unpack_uuid
 from teds_provision.teds.formats import TedsBlock

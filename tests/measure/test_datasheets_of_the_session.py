@@ -13,8 +13,8 @@ import pytest
 from mcap.reader import make_reader
 
 from teds_provision.node.flash_file import FlashFile
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.frame import frame, unframe
-from teds_provision.teds.codec.model import AccessCode
 from tests.e2e.desk import ANGLE
 from tests.measure.hall import Hall, of, states
 

@@ -10,7 +10,7 @@ from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.node import node_template
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.teds import compose
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.formats import TedsBlock, write_blocks
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.profile import load_profile

@@ -37,8 +37,8 @@ from teds_provision.protocol.plant.signing import (
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import RevocationRecord, WhitelistEntry
 from teds_provision.teds.codec import security
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.frame import frame
-from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.profile.load import find_profile
 from tests.bench import Board

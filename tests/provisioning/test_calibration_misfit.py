@@ -20,7 +20,7 @@ from teds_provision.station.station import Station
 from teds_provision.teds.calibration import Calibration, read_calibrations
 from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.channel import Channel, ChannelKind
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.guard import misfit
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet

@@ -18,7 +18,7 @@ from teds_provision.provisioning.provision import ProvisionResult, provision
 from teds_provision.station.station import Station
 from teds_provision.teds.calibration.zero import with_zero_offset
 from teds_provision.teds.certificate import certificate_reference_of
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.image import Image
 from tests.bench import Board, talk
 from tests.teds.certificates import ANGLE, EXAMPLES, TEMPERATURE, changed

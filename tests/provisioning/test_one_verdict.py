@@ -32,8 +32,8 @@ from teds_provision.provisioning.verify import possession_check
 from teds_provision.provisioning.verify_node import NodeVerification, judge_and_keep, verify_at_node, verify_in_session
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import NodeReading, RevocationRecord, utc_now
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.frame import frame, unframe
-from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import SECURITY
 from tests.bench import Board, MemoryLink, talk
 from tests.handover.desk import Pair, provisioned

@@ -17,7 +17,7 @@ from teds_provision.limits import LIMITS
 from teds_provision.teds.calibration import fit_points, load_calibrations
 from teds_provision.teds.calibration.files import read_certified
 from teds_provision.teds.certificate import CertificateChoice, CertificateReference, read_certificate_reference
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.dcc.items import UnclearItemError, items_of
 from teds_provision.teds.dcc.read import DigitalCertificate, read_certificate
 from teds_provision.teds.dcc.si_units import parse_si_unit, write_si_unit

@@ -18,7 +18,7 @@ from teds_provision import measure as measure_room
 from teds_provision import provisioning, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.measure.sample import ending, over_the_bus, where_met
-from teds_provision.cli.node.build import read_file
+from teds_provision.cli.named_files import read_file
 from teds_provision.cli.options import (
     Number,
     command,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ import click
 from teds_provision import provisioning
 from teds_provision import teds as teds_room
 from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.named_files import write_file
 from teds_provision.cli.options import (
     CalibrationFile,
     Day,
@@ -28,7 +28,6 @@ from teds_provision.cli.options import (
 )
 from teds_provision.cli.rendering import local_time, reporter_for
 from teds_provision.errors import UsageError
-from teds_provision.files import SHARED, read_limited, write_whole
 from teds_provision.lazy import late
 from teds_provision.links import LinkSettings
 from teds_provision.teds.certificate import CertificateReference
@@ -38,8 +37,6 @@ if TYPE_CHECKING:
     from teds_provision.provisioning.write import WriteResult
 else:  # loads the steps
     terminal_operator = late("teds_provision.cli.terminal_operator")
-
-MAX_INPUT_OCTETS = 32 << 20
 
 
 def order_options(function: Function) -> Function:
@@ -169,17 +166,6 @@ def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, ye
 def calibration_json(certificate: CertificateReference | None) -> dict[str, Any]:
     """Return the member ``calibration`` if a certificate was used for the calibration, else nothing."""
     return {} if certificate is None else {"calibration": certificate.to_json()}
-
-
-def write_file(path: Path, text: str | Iterable[str]) -> None:
-    """Write a result file part by part; if anything fails, no file is left."""
-    parts = (text,) if isinstance(text, str) else text
-    write_whole(path, (part.encode("utf-8") for part in parts), mode=SHARED)
-
-
-def read_file(path: Path) -> bytes:
-    """Read an input file; raises NotFoundError, BadDataError (too large)."""
-    return read_limited(path, MAX_INPUT_OCTETS, "image")
 
 
 @command(

@@ -12,7 +12,7 @@ import click
 from teds_provision import describe as formats
 from teds_provision import measure
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.node.build import write_file
+from teds_provision.cli.named_files import write_file
 from teds_provision.cli.options import command
 from teds_provision.errors import NotFoundError
 

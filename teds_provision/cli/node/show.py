@@ -28,7 +28,8 @@ from teds_provision.limits import LIMITS
 from teds_provision.protocol.messages.message import Argument, Message, decode_message, looks_like_message
 from teds_provision.sanitize import sanitize
 from teds_provision.teds import convert, decode
-from teds_provision.teds.codec.model import AccessCode, Conformity, DecodedTeds, Edition, Finding, TimeInstance
+from teds_provision.teds.codec.access_code import AccessCode
+from teds_provision.teds.codec.model import Conformity, DecodedTeds, Edition, Finding, TimeInstance
 from teds_provision.teds.formats import Format, Kind, TedsBlock, class_of, detect, read_blocks, with_class
 from teds_provision.teds.formats.jsonform import FORMAT, value_to_json
 from teds_provision.teds.guard import GuardFinding, check_calibration

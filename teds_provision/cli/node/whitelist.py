@@ -11,7 +11,7 @@ import click
 
 from teds_provision import provisioning
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.node.build import write_file
+from teds_provision.cli.named_files import write_file
 from teds_provision.cli.node.node_names import resolve
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, fingerprint_option, yes_option
 from teds_provision.cli.rendering import local_time, print_json_list, shown

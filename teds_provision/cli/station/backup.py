@@ -21,7 +21,7 @@ from teds_provision.backup.restore import (
 )
 from teds_provision.backup.sealed_file import SealedFile
 from teds_provision.cli.context import App, pass_app, read_line
-from teds_provision.cli.node.build import read_file
+from teds_provision.cli.named_files import read_file
 from teds_provision.cli.options import FileToRead, command, dry_run_option, yes_option
 from teds_provision.errors import NotFoundError, UsageError, VaultChangedError, VaultError, WrongPassphraseError
 from teds_provision.handover.trust import spoken

@@ -11,7 +11,7 @@ import click
 
 from teds_provision import node as node_room
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.node.build import read_file
+from teds_provision.cli.named_files import read_file
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, command, dry_run_option, examples
 from teds_provision.cli.rendering import print_table
 from teds_provision.errors import BadDataError, StoreError, UsageError

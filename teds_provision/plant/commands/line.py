@@ -14,7 +14,7 @@ import click
 
 from teds_provision import plant, provisioning, teds
 from teds_provision.cli.context import App, pass_app, to_json
-from teds_provision.cli.node.build import read_file, write_file
+from teds_provision.cli.named_files import read_file, write_file
 from teds_provision.cli.options import (
     COMMAND_SETTINGS,
     FileToRead,
@@ -27,10 +27,8 @@ from teds_provision.cli.options import (
 from teds_provision.cli.rendering import local_time, moment, print_table
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, UsageError
 from teds_provision.files import json_files
+from teds_provision.lazy import late
 from teds_provision.protocol.keys import SoftwareKey, from_pem
-from teds_provision.protocol.plant.document import SIGN_REQUEST
-from teds_provision.protocol.plant.job import CalibrationRule, Job, seal_job
-from teds_provision.protocol.plant.signing import open_answer, open_request
 from teds_provision.sanitize import printable
 
 if TYPE_CHECKING:
@@ -39,9 +37,14 @@ if TYPE_CHECKING:
     from teds_provision.plant.office import AnsweredRequest
     from teds_provision.plant.verify_evidence import JudgedEvidence
     from teds_provision.plant.yield_stats import StationYield
+    from teds_provision.protocol.plant import document, signing
+    from teds_provision.protocol.plant import job as jobs
     from teds_provision.protocol.plant.roster import Roster
     from teds_provision.station.plant.line import EvidenceRow
     from teds_provision.station.station import Station
+else:  # `evidence verify` reads neither jobs nor requests
+    document, jobs = late("teds_provision.protocol.plant.document"), late("teds_provision.protocol.plant.job")
+    signing = late("teds_provision.protocol.plant.signing")
 
 
 # -- job ---------------------------------------------------------------------------------------------------------------
@@ -110,10 +113,10 @@ def new(app: App, /, output: Path | None, dry_run: bool, **settings: Any) -> Non
         raise PolicyError("This station is not a keeper, so no station would accept its job.", hint="Ask a keeper.")
     drafted = _drafted(station, roster, settings)
     if dry_run:  # an invalid job is refused in a plan too
-        seal_job(drafted, SoftwareKey.generate())
+        jobs.seal_job(drafted, SoftwareKey.generate())
     else:
         station.unlock()
-        octets = seal_job(drafted, station.credentials().key)
+        octets = jobs.seal_job(drafted, station.credentials().key)
         drafted = plant.jobs.take_job(station, octets)
         if output is not None:
             write_file(output, octets.decode())
@@ -122,7 +125,7 @@ def new(app: App, /, output: Path | None, dry_run: bool, **settings: Any) -> Non
     )
 
 
-def _drafted(station: Station, roster: Roster, settings: dict[str, Any]) -> Job:
+def _drafted(station: Station, roster: Roster, settings: dict[str, Any]) -> jobs.Job:
     if (settings["count"] is None) == (settings["listed"] is None):
         raise UsageError("A job needs a number of boards or a list of boards.", hint="Use one of --count and --list.")
     path = teds.profile.load.find_profile(settings["profile"], teds.profile.load.default_folders(station.home))
@@ -133,7 +136,7 @@ def _drafted(station: Station, roster: Roster, settings: dict[str, Any]) -> Job:
     total = settings["count"] or len(boards)
     sign = settings["sign"]
     begins = settings["not_before"]
-    return Job(
+    return jobs.Job(
         str(uuid4()),
         roster.registry,
         settings["title"],
@@ -166,12 +169,12 @@ def _boards(path: Path) -> dict[bytes, str]:
     return {node.uuid: node.fingerprint or "" for node in listed}
 
 
-def _rule(settings: dict[str, Any], boards: dict[bytes, str]) -> CalibrationRule:
+def _rule(settings: dict[str, Any], boards: dict[bytes, str]) -> jobs.CalibrationRule:
     given = [name for name in ("calibration", "calibrations", "calibration_age") if settings[name] is not None]
     if len(given) > 1:
         named = " and ".join(f"--{name.replace('_', '-')}" for name in given)
         raise UsageError("A job takes one calibration option.", hint=f"Use one of {named}.")
-    rule = CalibrationRule
+    rule = jobs.CalibrationRule
     if settings["calibration"] is not None:
         return rule("one", plant.jobs.digest_of_file(settings["calibration"]))
     if settings["calibration_age"] is not None:
@@ -224,7 +227,7 @@ def _block(text: str) -> tuple[int, int]:
     return int(channel), int(code)
 
 
-def _to_json(station: Station, found: Job) -> dict[str, Any]:
+def _to_json(station: Station, found: jobs.Job) -> dict[str, Any]:
     """Return a job with its state here; its own members as they were signed."""
     row = station.plant.line.job(found.id)
     given, passed, _ = station.plant.line.count_units(found.id)
@@ -238,7 +241,7 @@ def _to_json(station: Station, found: Job) -> dict[str, Any]:
     }
 
 
-def _sentence(found: Job) -> str:
+def _sentence(found: jobs.Job) -> str:
     until = local_time(found.ends.isoformat())
     return f"“{found.title}”, {found.total} × {found.profile}, until {until}."
 
@@ -369,7 +372,7 @@ def status(app: App, which: str, evidence: Sequence[str], csv_file: Path | None)
     app.emit(result, lambda console: _table(console, found, parts, station.fingerprint))
 
 
-def _table(console: Console, found: Job, parts: list[StationYield], here: str) -> None:
+def _table(console: Console, found: jobs.Job, parts: list[StationYield], here: str) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -439,7 +442,7 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     station.unlock()
     transport = plant.sign_requests.transport_for(station, files)
     app.closing(transport.close)
-    inbox = plant.sign_requests.Inbox(station, transport, SIGN_REQUEST)
+    inbox = plant.sign_requests.Inbox(station, transport, document.SIGN_REQUEST)
     app.closing(inbox.close)
     stop = provisioning.meeting.IdleStop(None)
     signal.signal(signal.SIGTERM, lambda *_: stop.request_stop())
@@ -485,8 +488,8 @@ def once(app: App, file: Path, output: Path, jump: bool) -> None:
             f"{file} is not a request from a member of this plant to this office.",
             hint="To create one: teds-provision sign UUID --by OFFICE --output FILE",
         )
-    request = open_request(octets, plant.jobs.roster_of(station).point_of)
-    answered = open_answer(sealed, lambda kid: station.point)
+    request = signing.open_request(octets, plant.jobs.roster_of(station).point_of)
+    answered = signing.open_answer(sealed, lambda kid: station.point)
     if output.suffix != ".json":
         write_file(output, sealed.decode())
     elif answered.security:

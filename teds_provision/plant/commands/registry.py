@@ -13,7 +13,7 @@ import click
 
 from teds_provision import plant
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.node.build import read_file
+from teds_provision.cli.named_files import read_file
 from teds_provision.cli.options import (
     COMMAND_SETTINGS,
     FileToRead,

@@ -49,7 +49,7 @@ from teds_provision.protocol.operation.hardware import ChannelHardware, Hardware
 from teds_provision.protocol.operation.stream_role import StreamRole, demand
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.protocol.session import NodeSession
-from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.sheet import ChannelKind
 
 _OFFSET_OCTETS: Final = 4

@@ -23,7 +23,8 @@ from teds_provision.protocol.messages.frames import (
 )
 from teds_provision.protocol.session import NodeSession
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.model import MANUFACTURER, TEXT_BASED, AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
+from teds_provision.teds.codec.model import MANUFACTURER, TEXT_BASED
 from teds_provision.teds.codec.security import NotCanonicalError, SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId
 

@@ -10,10 +10,12 @@ import time
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
-from typing import Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from teds_provision.shapes.measurement import MeasurementSpec
-from teds_provision.teds.image import Image
+
+if TYPE_CHECKING:
+    from teds_provision.teds.image import Image
 
 UUID_OCTETS = 10
 

@@ -14,10 +14,10 @@ from typing import Final
 from teds_provision.arrays import NDArray, np
 from teds_provision.teds.calibration.model import Calibration, float32, instant
 from teds_provision.teds.channel import TURN
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.composer import Composer, tuple_width
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.frame import RawTuple, frame, raw_tuple, tuples, unframe
-from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.codec.tables import table
 
 _SIGMAS: Final = 3

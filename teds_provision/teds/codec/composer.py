@@ -9,9 +9,9 @@ from typing import Final
 
 from teds_provision.errors import BadDataError
 from teds_provision.teds.codec import values
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.frame import TEDSID, frame, raw_tuple
 from teds_provision.teds.codec.model import (
-    AccessCode,
     DecodedTeds,
     Edition,
     Field,

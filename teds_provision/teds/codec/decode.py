@@ -11,10 +11,10 @@ from functools import partial
 from typing import Final
 
 from teds_provision.errors import BadDataError
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.frame import MINIMUM_OCTETS, TEDSID, checksum, shape_of
 from teds_provision.teds.codec.model import (
     MALFORMED_CODES,
-    AccessCode,
     Conformity,
     DecodedTeds,
     Edition,

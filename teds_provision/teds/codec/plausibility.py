@@ -8,7 +8,8 @@ from math import isinf, isnan
 from typing import Final
 
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.model import AccessCode, Field, TimeInstance, Units
+from teds_provision.teds.codec.access_code import AccessCode
+from teds_provision.teds.codec.model import Field, TimeInstance, Units
 from teds_provision.teds.codec.tables import LEVELS, FieldSpec, Table
 
 Find = Callable[..., None]

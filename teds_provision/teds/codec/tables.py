@@ -13,7 +13,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from teds_provision.teds.codec.model import MANUFACTURER, ONLY_2024, TEXT_BASED, AccessCode
+from teds_provision.teds.codec.access_code import AccessCode
+from teds_provision.teds.codec.model import MANUFACTURER, ONLY_2024, TEXT_BASED
 
 # What a field table is made of, and the names of the TEDS classes (teds.md, "Access codes").
 

@@ -24,9 +24,9 @@ from typing import Final, Literal, get_args
 
 from teds_provision.errors import BadDataError
 from teds_provision.limits import LIMITS, check_count, check_size, load_json
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
-from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.formats.intelhex import looks_like_hex, read_hex, read_intel_hex, write_hex, write_intel_hex
 from teds_provision.teds.formats.jsonform import read_json, write_json
 from teds_provision.teds.formats.profileform import read_profile, write_profile

@@ -13,8 +13,9 @@ from typing import Final
 
 from teds_provision.errors import BadDataError
 from teds_provision.teds.channel import channel_from
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import UNIT_PARTS, AccessCode, DecodedTeds, Edition, Field, Units
+from teds_provision.teds.codec.model import UNIT_PARTS, DecodedTeds, Edition, Field, Units
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.formats.tree import shortest
 from teds_provision.teds.image import TedsBlock

@@ -7,7 +7,8 @@ from typing import Final, cast
 
 from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import METHODS, Monotone
-from teds_provision.teds.codec.model import AccessCode, Units
+from teds_provision.teds.codec.access_code import AccessCode
+from teds_provision.teds.codec.model import Units
 from teds_provision.teds.profile.firmware import firmware_demand
 from teds_provision.teds.profile.keys import (
     CALIBRATION_KEYS,

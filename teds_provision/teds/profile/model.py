@@ -11,9 +11,10 @@ from typing import Final
 from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import Calibration, Monotone
 from teds_provision.teds.calibration.samples import raw_range
+from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.composer import compose
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import AccessCode, Edition, Units
+from teds_provision.teds.codec.model import Edition, Units
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.profile.firmware import FirmwareDemand
 from teds_provision.teds.units import WrittenUnit
