@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # Compiled modules are kept: each of five pytests would else rewrite every assert again, 13 s of CPU each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo demo-page page-picture test test-system lint types unit compiled quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale bench-short test-rclpy test-smp fuzz faults pairs model house words man coverage mutants soak api test-other vectors-c sbom firmware firmware-faults firmware-zephyr firmware-arm firmware-coverage firmware-soak test-c room clean
+.PHONY: demo demo-page page-picture test test-system lint types unit compiled quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale bench-short test-rclpy test-smp fuzz faults pairs model house words man coverage mutants redundant soak api test-other vectors-c sbom firmware firmware-faults firmware-zephyr firmware-arm firmware-coverage firmware-soak test-c room clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -167,6 +167,13 @@ soak: $(VENV)/.dev
 COUNT ?= 300
 mutants: $(VENV)/.dev
 	$(BIN)/python -m tests.mutants.run --count $(COUNT) $(if $(ROOM),--room $(ROOM))
+
+# Which tests do others make redundant? Runs the gate with a probe at each statement and branch and measures each test,
+# then prints the dearest whose every probe two others hit (CONTRIBUTING.md). PATHS="tests/cli tests/e2e" for a part. An hour on two cores.
+redundant: $(VENV)/.dev
+	$(BIN)/python -m tests.redundant.run -n $(WORKERS) $(PATHS)
+	$(BIN)/python -m tests.redundant.choice --rooms
+	$(BIN)/python -m tests.redundant.choice
 
 # What follows from the command line's own definitions: option names, docs/configuration.md, the man page.
 man: $(VENV)/.dev

@@ -28,6 +28,7 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from queue import SimpleQueue
 
 from tests.mutants.changes import ROOT, Mutant, any_of, found, found_in_c, modules
@@ -57,9 +58,9 @@ class Fate:
 class Copy:
     """A copy of the checkout, and a Python that takes the package from there and all else from this environment."""
 
-    def __init__(self, number: int) -> None:
-        self.folder = PLACE / f"copy{number}"
-        self.python = PLACE / f"python{number}" / "bin" / "python"
+    def __init__(self, number: int, place: Path = PLACE) -> None:
+        self.folder = place / f"copy{number}"
+        self.python = place / f"python{number}" / "bin" / "python"
         shutil.rmtree(self.folder, ignore_errors=True)
         shutil.rmtree(self.python.parents[1], ignore_errors=True)
         listed = subprocess.run(
