@@ -23,7 +23,8 @@ from teds_provision.protocol.operation.subscription import Receiver, StreamMessa
 SLICE = 0.004  # seconds between looks at what waits
 REST = 0.003  # seconds that frames gather on one link: to be woken for each of them costs more than to read it
 GATHER = 0.012  # seconds that messages wait to be opened and calibrated together: of a tick's 20 ms to its sink
-HEARD_OUT = 0.25  # seconds for the last message that is wanted to come and to be looked at
+HEARD_OUT = 0.25  # seconds for the last message that is wanted to come
+LOOKED_AT = 10.0  # seconds for the hearing thread to look at what has come: it lacks a processor, or hangs
 MOST_EARLY = 512  # messages of a stream that came before the reply to its Subscribe was looked at
 
 
@@ -49,6 +50,8 @@ class ReceivedStream:
     """Messages that came before it was registered; the hearing thread takes them first."""
     _came: deque[tuple[bytes, int]] = field(default_factory=deque)
     _since: float = 0.0
+    _order: threading.RLock = field(default_factory=threading.RLock)
+    """Held from the taking of messages to their handing on: who ends the stream may do that beside the thread."""
 
     def __post_init__(self) -> None:
         plan = self.receiver.plan
@@ -82,12 +85,13 @@ class ReceivedStream:
 
     def begin(self, start: int) -> None:
         """Begin a triggered stream, as its first instant is known: from now on its silence counts."""
-        self.finish()
-        self.heard = time.monotonic()
-        with self.mapping:
-            messages = self.receiver.begin(start)
-            blocks = self.interpreter.blocks(messages)
-        self._hand_on(messages, blocks)
+        with self._order:
+            self.finish()
+            self.heard = time.monotonic()
+            with self.mapping:
+                messages = self.receiver.begin(start)
+                blocks = self.interpreter.blocks(messages)
+            self._hand_on(messages, blocks)
 
     def flush(self, now: float) -> None:
         """Open and hand on what has waited for GATHER."""
@@ -100,15 +104,16 @@ class ReceivedStream:
 
         All that waits at once, since most of what that costs does not depend on how much it is.
         """
-        came = [self._came.popleft() for _ in range(len(self._came))]
-        if not came:
-            return
-        with self.mapping:
-            messages = self.receiver.open_messages(came, self.clock.ahead(came[-1][1]))
-            if messages:
-                self._note_arrival(came, messages)
-            blocks = self.interpreter.blocks(messages)
-        self._hand_on(messages, blocks)
+        with self._order:
+            came = [self._came.popleft() for _ in range(len(self._came))]
+            if not came:
+                return
+            with self.mapping:
+                messages = self.receiver.open_messages(came, self.clock.ahead(came[-1][1]))
+                if messages:
+                    self._note_arrival(came, messages)
+                blocks = self.interpreter.blocks(messages)
+            self._hand_on(messages, blocks)
 
     def _note_arrival(self, came: list[tuple[bytes, int]], messages: list[StreamMessage]) -> None:
         """Pass the message that came soonest after its samples to the clock.
@@ -139,12 +144,6 @@ class ReceivedStream:
         with self.mapping:
             return self.receiver.begun(self.clock.tick_at(time.monotonic_ns()))
 
-    def hear_out(self, wanted: int) -> None:
-        """Wait for the last of so many messages; it may be on its way, or in the queue of the hearing thread."""
-        until = time.monotonic() + HEARD_OUT
-        while self.receiver.last < wanted - 1 and time.monotonic() < until:
-            time.sleep(0.002)
-
 
 @dataclass
 class EarlyMessages:
@@ -163,6 +162,7 @@ class StreamReceiver:
         self._early: dict[tuple[int, int], EarlyMessages] = {}
         self._lock = threading.Lock()
         self._stop = threading.Event()
+        self._looks = 0
         self.lost_frames = 0
         self.failure: LinkError | None = None
         """Why the link itself cannot be heard now; None if it can."""
@@ -186,6 +186,26 @@ class StreamReceiver:
                 heard.early = self._early[key].messages
             self._streams = {**self._streams, key: heard}
             self._early.pop(key, None)
+
+    def hear_out(self, heard: ReceivedStream, wanted: int) -> None:
+        """Wait for the last of so many messages of a stream, and hand on what has come.
+
+        It may be on its way, or in the queue of the hearing thread: what has come in time counts, however late that
+        thread looks at it.
+        """
+
+        def wait(until: float, enough: Callable[[], bool] = lambda: False) -> None:
+            while heard.receiver.last < wanted - 1 and not enough() and time.monotonic() < until:
+                time.sleep(0.002)
+
+        wait(time.monotonic() + HEARD_OUT)
+        looks = self._looks  # the look that goes on may have begun before the last message came
+        wait(time.monotonic() + LOOKED_AT, lambda: self._looks > looks + 1 or not self._is_hearing)
+        heard.finish()
+
+    @property
+    def _is_hearing(self) -> bool:
+        return self.failure is None and not self._stop.is_set() and self._thread.is_alive()
 
     def forget(self, node: int, stream: int) -> ReceivedStream | None:
         """Hear it no more, and hand on what is left of it."""
@@ -226,14 +246,16 @@ class StreamReceiver:
                     if heard is not None and heard.due:
                         heard.finish()
                 looked = self._flush(looked, listener.lost)
+                self._looks += 1
                 time.sleep(REST)
 
     def _dispatch(self, message: DataMessage) -> ReceivedStream | None:
         key = (message.node, message.stream)
+        early = self._early.get(key)  # first: one that is registered meanwhile is found below, and takes what waits
         heard = self._streams.get(key)
         if heard is not None:
             heard.whole(message.octets, message.at)
-        elif (early := self._early.get(key)) is not None and message.at >= early.since:
+        elif early is not None and message.at >= early.since:
             early.messages.append(message)
         return heard
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -21,14 +22,14 @@ from teds_provision.links.streaming import MeasuringLink
 from teds_provision.measure.blocks import Block
 from teds_provision.measure.clock import ClockMap, Exchange, HostClock, MonotonicStamps, WallClock
 from teds_provision.measure.interpreter import BLOCKS, StreamInterpreter
-from teds_provision.measure.stream_receiver import GATHER, ReceivedStream, StreamReceiver
+from teds_provision.measure.stream_receiver import GATHER, HEARD_OUT, ReceivedStream, StreamReceiver
 from teds_provision.protocol.operation.can_frames import DataAddress, StreamAssembly, cut
 from teds_provision.protocol.operation.datagram import DatagramSealer, stream_key
 from teds_provision.protocol.operation.stream_commands import StreamKind, SubscribeReply
 from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
 from teds_provision.teds.calibration import fit
 from teds_provision.teds.calibration.vectorized import ManyChannels
-from tests.pace import until
+from tests.pace import best_of, until
 from tests.teds.test_interpreter import sheet_of
 
 KEY, MS, SECOND = bytes(32), 1_000_000, 10**9
@@ -206,11 +207,7 @@ def test_what_comes_before_its_stream_is_registered_is_no_loss() -> None:
     """On a busy machine the first message comes before the reply to Subscribe is looked at."""
     scene, port = Scene(ago=-60, fd=False), Silent()
     with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
-        frames = [
-            Frame(DataAddress(0xF1, 0, piece.segment, 0x21).identifier, piece.data, at=scene.arrival(counter) / 1e9)
-            for counter in range(3)
-            for piece in cut(scene.message(counter), fd=False)
-        ]
+        frames = frames_of(scene, 3)
         old = replace(frames[0], at=time.monotonic() - 1.0)  # of a stream of the session before
         half = len(frames) // 2
         scene.heard.pieces = hearing.expect(0x21, 0, scene.plan.length)
@@ -221,6 +218,116 @@ def test_what_comes_before_its_stream_is_registered_is_no_loss() -> None:
         until(lambda: scene.heard.receiver.counts.good == 3)
     counts = scene.heard.receiver.counts
     assert (counts.good, counts.lost, counts.bad, scene.heard.pieces.wrong) == (3, 0, 0, 0)
+
+
+class Meanwhile(dict[tuple[int, int], Any]):
+    """A table in which something happens beside each search."""
+
+    def __init__(self, table: dict[tuple[int, int], Any], happens: Callable[[], None]) -> None:
+        super().__init__(table)
+        self._happens = happens
+
+    def get(self, key: tuple[int, int], default: Any = None) -> Any:
+        found = super().get(key, default)
+        self._happens()
+        return found
+
+
+@pytest.mark.parametrize("table", ["_streams", "_early"])
+def test_what_comes_while_its_stream_is_registered_is_no_loss(table: str) -> None:
+    """It was looked for among the streams before that was one, and among those to come when it was none any more."""
+    scene, port = Scene(ago=-60, fd=False), Silent()
+    with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
+        scene.heard.pieces = hearing.expect(0x21, 0, scene.plan.length)
+
+        def register() -> None:
+            if (0x21, 0) in hearing._early:
+                setattr(hearing, table, dict(getattr(hearing, table)))
+                hearing.register(0x21, 0, scene.heard)
+
+        setattr(hearing, table, Meanwhile(getattr(hearing, table), register))
+        port.frames = frames_of(scene, 2)
+        until(lambda: scene.heard.receiver.last == 1)
+    assert (scene.heard.receiver.counts.good, scene.heard.receiver.counts.lost) == (2, 0)
+
+
+def frames_of(scene: Scene, messages: int) -> list[Frame]:
+    return [
+        Frame(DataAddress(0xF1, 0, piece.segment, 0x21).identifier, piece.data, at=scene.arrival(counter) / 1e9)
+        for counter in range(messages)
+        for piece in cut(scene.message(counter), fd=False)
+    ]
+
+
+class Held(Silent):
+    """A bus whose hearing thread has no processor until ``free``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.free = threading.Event()
+
+    def get_all(self, seconds: float) -> list[Frame]:
+        self.free.wait()
+        return super().get_all(seconds)
+
+
+def test_what_came_before_the_end_is_no_loss_however_late_it_is_looked_at() -> None:
+    """A measurement of 100 Hz lost its last three messages on a busy machine: they waited to be looked at."""
+    scene, port = Scene(ago=-60, fd=False), Held()
+    with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
+        scene.heard.pieces = hearing.expect(0x21, 0, scene.plan.length)
+        hearing.register(0x21, 0, scene.heard)
+        port.frames = frames_of(scene, 3)
+        late = threading.Timer(2 * HEARD_OUT, port.free.set)
+        late.start()
+        hearing.hear_out(scene.heard, 3)
+        scene.heard.receiver.finish(3, 3)
+        late.join()
+    counts = scene.heard.receiver.counts
+    assert (counts.good, counts.lost, counts.late) == (3, 0, 0)
+
+
+def test_a_message_that_never_came_is_waited_for_no_longer_than_it_may_take() -> None:
+    scene, port = Scene(ago=-60, fd=False), Silent()
+    with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
+        hearing.register(0x21, 0, scene.heard)
+        best_of(3, 2 * HEARD_OUT, lambda: timed(lambda: hearing.hear_out(scene.heard, 1)))
+    best_of(3, 2 * HEARD_OUT, lambda: timed(lambda: hearing.hear_out(scene.heard, 1)))
+    scene.heard.receiver.finish(1, 1)
+    assert scene.heard.receiver.counts.lost == 1
+
+
+def timed(act: Callable[[], object]) -> float:
+    began = time.monotonic()
+    act()
+    return time.monotonic() - began
+
+
+class Beside(deque[tuple[bytes, int]]):
+    """Messages that another thread would take, too, as soon as one of them is taken."""
+
+    def __init__(self, other: Callable[[], None]) -> None:
+        super().__init__()
+        self.other = threading.Thread(target=other)
+
+    def popleft(self) -> tuple[bytes, int]:
+        taken = super().popleft()
+        if self.other.ident is None:
+            self.other.start()
+            self.other.join(0.2)  # it waits for its turn, or takes what is left
+        return taken
+
+
+def test_two_threads_that_take_what_came_take_it_in_order() -> None:
+    """Who ends a stream takes what is left, and the hearing thread may be about to: it found nothing, and ended."""
+    scene = Scene()
+    scene.heard._came = beside = Beside(scene.heard.finish)
+    for counter in range(4):
+        scene.heard.whole(scene.message(counter), scene.arrival(counter))
+    scene.heard.finish()
+    beside.other.join()
+    counts = scene.heard.receiver.counts
+    assert (counts.good, counts.lost, counts.late) == (4, 0, 0)
 
 
 def test_a_stream_that_is_forgotten_is_taken_no_more_by_its_link() -> None:

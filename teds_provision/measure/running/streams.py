@@ -178,13 +178,13 @@ class NodeStreams:
         """
         wanted = {number: heard.ending() for number, heard in self.running.items()} if trusted is not None else {}
         for number, due in wanted.items():
-            self.running[number].hear_out(due)
+            bus.receiver.hear_out(self.running[number], due)
         for number, heard in list(self.running.items()):
             if trusted is not None:
                 with suppress(TedsProvisionError, SessionLostError):
                     counter = decode_stopped(trusted.node.request(stop(number), "to stop a stream"))
                     due = min(counter, wanted[number]) if wanted[number] else counter
-                    heard.hear_out(due)
+                    bus.receiver.hear_out(heard, due)
                     heard.receiver.finish(counter, due)
             bus.receiver.forget(address, number)
             self.totals[number].add(heard)
