@@ -30,13 +30,14 @@ def lazy(package: str, names: Mapping[str, str] = _NOTHING) -> Callable[[str], o
     """Return the ``__getattr__`` of a package, which resolves its modules, and names out of them.
 
     ``names`` maps a module to its names: ``{"fitting": "fit residuals"}`` is ``package.fit`` and ``package.residuals``
-    of ``package.fitting``. No such name may be a module's too: Python would put the module in its place.
+    of ``package.fitting``; ``{"running": "job"}`` is the module ``package.running.job``. No such name may be a module's
+    of the package too: Python would put the module in its place.
     """
     where = {name: module for module, listed in names.items() for name in listed.split()}
 
     def load(name: str) -> object:
         if name in where:
-            value: object = getattr(import_module(f"{package}.{where[name]}"), name)
+            value = _part_of(f"{package}.{where[name]}", name)
             setattr(sys.modules[package], name, value)
             return value
         module = f"{package}.{name}"
@@ -49,6 +50,12 @@ def lazy(package: str, names: Mapping[str, str] = _NOTHING) -> Callable[[str], o
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
     return load
+
+
+def _part_of(module: str, name: str) -> object:
+    """Return what a module has under a name, or the module of that name in a room."""
+    loaded = import_module(module)
+    return getattr(loaded, name) if hasattr(loaded, name) else import_module(f"{module}.{name}")
 
 
 class _LateModule:

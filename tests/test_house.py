@@ -59,9 +59,8 @@ LATE_MODULES = {
 """Files that load a module of ours at its first use, by `late`, and what that spares a command that people wait for."""
 
 LATE_ROOMS = {
-    "check", "demo", "describe", "measure", "measure/recordings", "measure/running", "measure/sinks",
-    "measure/sinks/mcap", "node", "node/firmware", "node/wrapped",
-    "plant", "plant/demo", "provisioning", "teds", "teds/calibration", "teds/dcc",
+    "check", "demo", "describe", "measure", "measure/recordings", "node",
+    "plant", "provisioning", "teds", "teds/calibration",
 }  # fmt: skip
 """Rooms that give their modules at the first use (PEP 562): users name a room where a module would slow --help."""
 

@@ -20,20 +20,21 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-from teds_provision import provisioning
 from teds_provision.errors import LinkError, NotAuthenticError, PolicyError
 from teds_provision.handover.incoming import ImportResult, NodeProof, import_bundle, plan_import, prove_nodes
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import close
 from teds_provision.handover.trust import Candidate, add
-from teds_provision.lazy import late
 from teds_provision.links import LinkSettings
 from teds_provision.links.can.port import open_port
 from teds_provision.links.ports import free_port
+from teds_provision.measure import blocks, held_actuator, request, sinks, verified_session
+from teds_provision.measure import buses as buses_room
+from teds_provision.measure.running import measurement
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.provisioning.agree import require_session
+from teds_provision.provisioning.agree import agree, require_session
 from teds_provision.provisioning.build import BuildOrder
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.meeting import meet
@@ -47,17 +48,6 @@ from teds_provision.shapes.problem import problem_in
 from teds_provision.station.station import Station, initialise
 from teds_provision.station.store.records import TrustRecord
 from teds_provision.vault.passphrase import THROWAWAY
-
-if TYPE_CHECKING:
-    from teds_provision.measure import blocks, held_actuator, request, sinks, verified_session
-    from teds_provision.measure import buses as buses_room
-    from teds_provision.measure.running import measurement
-else:  # numpy and what measuring needs are loaded when the demo gets there
-    blocks, buses_room, held_actuator, measurement, sinks, verified_session, request = (
-        late(f"teds_provision.measure.{name}")
-        for name in ("blocks", "buses", "held_actuator", "running.measurement", "sinks", "verified_session", "request")
-    )
-
 
 # What the demo works on: its folder, its links, the node, and the look at it from one station.
 
@@ -324,7 +314,7 @@ def new_station(demo: Demo, name: str) -> Station:
 def _over_can(demo: Demo, station: Station) -> None:
     provision_over(demo, station, "can", demo.uuid, BuildOrder(PROFILE, name="crane slew angle"))
     with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node, demo.steps.step("rotate") as step:
-        agreed = provisioning.agree.agree(station, node, provisioning.identify.identify(station, node), rotate=True)
+        agreed = agree(station, node, identify(station, node), rotate=True)
         step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"
 
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
         presence,
         recordings,
         request,
-        running,
         sample_series,
         sampling,
         sinks,
@@ -32,5 +31,6 @@ if TYPE_CHECKING:
         verified_session,
         zero,
     )
+    from teds_provision.measure.running import measurement_job
 else:
-    __getattr__ = lazy(__name__)
+    __getattr__ = lazy(__name__, {"running": "measurement_job"})

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
         apply_pages,
         backlog,
         connecting,
+        demo,
         evidence,
         fetching,
         folder_transport,

@@ -138,7 +138,7 @@ def measure(
     kept = _asked(group, uuids, sinks, wished | {"require": _requirements(require)})
     if group and duration is None:
         kept = _carried_on(app, station, kept)
-    job = measure_room.running.measurement_job.MeasurementJob(
+    job = measure_room.measurement_job.MeasurementJob(
         station,
         kept,
         request=measure_room.request.MeasurementRequest(
@@ -200,7 +200,7 @@ def _asked(group: str, uuids: Sequence[bytes], sinks: Sequence[str], wished: Map
         "",
         group=group or None,
         uuids=() if group else tuple(uuids),
-        sinks=tuple(measure_room.running.measurement_job.whole_path(spec) for spec in sinks),
+        sinks=tuple(measure_room.measurement_job.whole_path(spec) for spec in sinks),
         owner=COMMAND,
         **settings,
     )

@@ -61,7 +61,7 @@ def set_name(app: App, node: str, channel: int | str, name: str, *, dry_run: boo
         )
     channel = _require_channel(station, uuid, channel)
     if uuid != STATION:
-        topics = measure.sinks.names.Topics(measure.running.measurement_job.station_facts(station))
+        topics = measure.sinks.names.Topics(measure.measurement_job.station_facts(station))
         topics.learn(facts for _, _, facts in _channels(station))
         topics.require_free(uuid.hex(), channel, chosen)
     if not dry_run:
@@ -163,7 +163,7 @@ def _channels(station: Station) -> list[tuple[bytes, int, ChannelFacts]]:
 
 def _print_names(app: App, station: Station) -> None:
     chosen = station.measurements.names
-    facts = measure.running.measurement_job.station_facts(station)
+    facts = measure.measurement_job.station_facts(station)
     topics = measure.sinks.names.Topics(facts)
     channels = _channels(station)
     topics.learn(facts for _, _, facts in channels)

@@ -72,7 +72,7 @@ def _thing_description(_station: Station, node: DescribedNode) -> dict[str, str]
 
 def _ros2_control(station: Station, node: DescribedNode) -> dict[str, str]:
     ros2_control = formats.ros2_control
-    topics = measure.sinks.names.Topics(measure.running.measurement_job.station_facts(station))
+    topics = measure.sinks.names.Topics(measure.measurement_job.station_facts(station))
     joints = ros2_control.joints(node, topics)
     name = topics.node(node.uuid.hex())
     return {

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from teds_provision.errors import UsageError
-from teds_provision.lazy import lazy
 from teds_provision.measure.display_units import FileUnits
 from teds_provision.measure.exposure import Exposure
+from teds_provision.measure.sinks import foxglove_server, json_events, mcap, names
 from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, as_sink_failure
 from teds_provision.measure.sinks.foxglove import ARRAYS, foxglove_sink
 from teds_provision.measure.sinks.json_lines import JsonLinesSink
@@ -25,12 +24,19 @@ from teds_provision.measure.sinks.shown import SHOWN, ShownJsonLinesSink, ShownT
 from teds_provision.measure.sinks.text import TextSink
 from teds_provision.measure.sinks.wide import WIDE, WideSink
 
-__all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "in_units", "open_sink", "without_scalars"]
-
-if TYPE_CHECKING:
-    from teds_provision.measure.sinks import foxglove_server, json_events, mcap
-else:
-    __getattr__ = lazy(__name__)
+__all__ = [
+    "CommandTaker",
+    "Sink",
+    "ThreadedSink",
+    "as_sink_failure",
+    "foxglove_server",
+    "in_units",
+    "json_events",
+    "mcap",
+    "names",
+    "open_sink",
+    "without_scalars",
+]
 
 TEXT = frozenset({".csv", ".txt"})
 FILES: dict[str, Callable[[Path], Sink]] = {

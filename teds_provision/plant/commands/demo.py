@@ -7,11 +7,11 @@ from typing import Any, Final
 
 import click
 
+from teds_provision import plant as plant_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.extending import add_examples, add_options, callback_of
 from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import UsageError
-from teds_provision.plant import demo as demo_room
 
 _MORE: Final = "\n  teds-provision demo --plant runs three stations that share keys through a registry"
 
@@ -47,7 +47,7 @@ def extend(command: click.Command) -> None:
 
 
 def _line(app: App) -> None:
-    done = demo_room.line.run_line(reporter_for(app), lambda text: app.note(f"\n{text}"))
+    done = plant_room.demo.line.run_line(reporter_for(app), lambda text: app.note(f"\n{text}"))
     rows = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
     words = ", ".join(f"{count} {word}" for word, count in sorted(done.evidence.items()))
     app.emit(
@@ -57,7 +57,7 @@ def _line(app: App) -> None:
 
 
 def _plant(app: App) -> None:
-    done = demo_room.plant.run_plant_demo(reporter_for(app), lambda text: app.note(f"\n{text}"))
+    done = plant_room.demo.plant.run_plant_demo(reporter_for(app), lambda text: app.note(f"\n{text}"))
     steps = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
     result = {"steps": steps, "by": done.by, "before": done.before, "after": done.after, "seconds": done.seconds}
     app.emit(

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from teds_provision import plant
 from teds_provision.demo.story import PROFILE, Demo, make_node, new_station, run_node, temporary_demo
 from teds_provision.errors import LinkError, PolicyError
 from teds_provision.handover import trust
+from teds_provision.plant import apply_pages, jobs, owner
 from teds_provision.plant.evidence import export
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
@@ -99,7 +99,7 @@ def _run(demo: Demo) -> LineDemoResult:
 def _plant(demo: Demo) -> tuple[Station, Station]:
     office = new_station(demo, "office")
     with demo.steps.step("registry") as step:
-        plant.owner.create(office, "demo")
+        owner.create(office, "demo")
         home = demo.folder / "bench"
         secret = secrets.token_hex(16)
         asked = trust.ask_for_certificate(home, name="bench", keystore="file", ask=lambda prompt, confirm: secret)
@@ -109,9 +109,9 @@ def _plant(demo: Demo) -> tuple[Station, Station]:
         now = datetime.now(UTC).replace(microsecond=0)
         request = MemberRequest(bench.name, bench.point, bench.identity.signature, _LOGIN, now)
         roles: frozenset[Role] = frozenset({"line"})
-        plant.apply_pages.put_roster(office, plant.owner.signed(office, plant.owner.add(office, request, roles)))
-        roster = plant.jobs.roster_of(office)
-        plant.owner.join(bench, roster, url=None, events=[])
+        apply_pages.put_roster(office, owner.signed(office, owner.add(office, request, roles)))
+        roster = jobs.roster_of(office)
+        owner.join(bench, roster, url=None, events=[])
         step.detail = f"roster {roster.version}: office keeper, sign; bench line"
     office.unlock()
     bench.unlock()
@@ -123,7 +123,7 @@ def _job(demo: Demo, office: Station, bench: Station) -> LineRun:
         now = datetime.now(UTC).replace(microsecond=0)
         drafted = Job(
             str(uuid.uuid4()),
-            plant.jobs.roster_of(office).registry,
+            jobs.roster_of(office).registry,
             "three angles",
             PROFILE,
             files_digest(find_profile(PROFILE), default_folders()),
@@ -173,7 +173,7 @@ def _proof(demo: Demo, office: Station, bench: Station) -> EvidenceTotals:
         for station in (bench, office):
             rows = station.plant.line.evidence()
             for path in export(station, rows, demo.folder / "evidence" / station.name):
-                totals.add(judge_file(EvidenceAnchors(office.ca, roster=plant.jobs.roster_of(office)), path))
+                totals.add(judge_file(EvidenceAnchors(office.ca, roster=jobs.roster_of(office)), path))
         if totals.exit_code:
             raise LinkError(f"The demo's evidence is not valid: {totals.words}")
         step.detail = f"{totals.files} files valid: " + ", ".join(f"{n} {word}" for word, n in totals.words.items())

@@ -13,11 +13,21 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any, Final
 
-from teds_provision import plant
 from teds_provision.demo.story import PROFILE, Demo, provision_over, temporary_demo, virtual_node
 from teds_provision.errors import NotAuthenticError
 from teds_provision.handover import trust
 from teds_provision.links.ports import free_port
+from teds_provision.plant import (
+    apply_pages,
+    backlog,
+    connecting,
+    folder_transport,
+    membership,
+    owner,
+    schema,
+    status,
+    sync,
+)
 from teds_provision.plant.demo import cluster
 from teds_provision.plant.transport import Transport
 from teds_provision.protocol.plant.document import open_request
@@ -118,39 +128,39 @@ class _Story:
                 self._keep(name, trust.adopt_certificate(self.places / name, certificate, ask=self._ask))
             step.detail = "north, west, south, under one CA"
         with demo.steps.step("registry create") as step:
-            roster, _ = plant.owner.create(north, "demo plant")
+            roster, _ = owner.create(north, "demo plant")
             step.detail = f"registry {roster.registry[:8]}, north is keeper, sign, line, base"
         if self.server is not None:
             with demo.steps.step("registry sql") as step:
                 self.server.psql(f"create database {_DATABASE}")
-                self.server.psql(plant.schema.registry_sql(roster.registry), _DATABASE)
+                self.server.psql(schema.registry_sql(roster.registry), _DATABASE)
                 step.detail = "the schema, by the database's superuser"
         self._login(north)
         for name, roles in _ROLES.items():
             with demo.steps.step("registry add") as step:
-                self._change(plant.owner.add(north, self._login(self[name]), roles))
+                self._change(owner.add(north, self._login(self[name]), roles))
                 step.detail = f"{name} as {' '.join(sorted(roles))}"
         with demo.steps.step("registry share") as step:
-            self._change(plant.owner.shared(north, Share(("all", ""), (self["south"].fingerprint,))))
+            self._change(owner.shared(north, Share(("all", ""), (self["south"].fingerprint,))))
             step.detail = "every key goes to south automatically"
         for name in ("north", *_ROLES):
             with demo.steps.step("registry connect") as step:
                 self._sync("north", show=False)
                 station = self[name]
                 transport = self._transport(station)
-                found = plant.membership.found_roster(station, transport, None)
+                found = membership.found_roster(station, transport, None)
                 transport.close()
-                plant.owner.join(station, found, url=None, events=list(plant.backlog.backlog(station)))
+                owner.join(station, found, url=None, events=list(backlog.backlog(station)))
                 step.detail = f"{name}, roster {found.version}"
 
     def _stolen(self) -> None:
         north, west = self["north"], self["west"]
         self._sync("north")
         with self.demo.steps.step("registry remove") as step:
-            last = plant.status.page_list(north, west.fingerprint)[0][0]
-            self._change(plant.owner.draft_removal(north, "west", "stolen", last))
+            last = status.page_list(north, west.fingerprint)[0][0]
+            self._change(owner.draft_removal(north, "west", "stolen", last))
             if self.server is not None:
-                self.server.psql(plant.schema.close_sql(west.fingerprint), _DATABASE)
+                self.server.psql(schema.close_sql(west.fingerprint), _DATABASE)
             step.detail = f"west, stolen; its pages up to {last} count"
         self._sync("north", "south")
 
@@ -170,10 +180,10 @@ class _Story:
             transport = self._transport(self[name])
             try:
                 if not show:
-                    plant.sync.sync(self[name], transport)
+                    sync.sync(self[name], transport)
                     continue
                 with self.demo.steps.step("registry sync") as step:
-                    done = plant.sync.sync(self[name], transport)
+                    done = sync.sync(self[name], transport)
                     parcels = f", {done.parcels_out} parcels out, {done.parcels_in} in"
                     moved = parcels if done.parcels_in or done.parcels_out else ""
                     step.detail = f"{name}: {done.pushed} pages out, {done.fetched} in{moved}"
@@ -184,18 +194,18 @@ class _Story:
         if self.server is None:
             folder = self.demo.folder / "stick"
             folder.mkdir(exist_ok=True)
-            return plant.folder_transport.FolderTransport(folder)
-        return plant.connecting.database(station, self.server.url(_DATABASE))
+            return folder_transport.FolderTransport(folder)
+        return connecting.database(station, self.server.url(_DATABASE))
 
     def _login(self, station: Station) -> Any:
         """Make the station's request, and its login at the database."""
-        asked = open_request(plant.membership.request(station))
+        asked = open_request(membership.request(station))
         if self.server is not None:
-            self.server.psql(plant.schema.member_sql(asked.fingerprint, asked.login), _DATABASE)
+            self.server.psql(schema.member_sql(asked.fingerprint, asked.login), _DATABASE)
         return asked
 
     def _change(self, draft: Roster) -> None:
-        plant.apply_pages.put_roster(self["north"], plant.owner.signed(self["north"], draft))
+        apply_pages.put_roster(self["north"], owner.signed(self["north"], draft))
 
     def _keep(self, name: str, station: Station) -> None:
         self.stations[name] = station

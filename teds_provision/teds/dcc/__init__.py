@@ -4,15 +4,6 @@ lxml and signxml come with the extra ``bench`` and are loaded when a certificate
 this package (docs/adr/0024-no-dcc-schemas.md): :mod:`read` checks the structure itself.
 """
 
-from __future__ import annotations
+from teds_provision.teds.dcc import items, shown, signature, write
 
-from typing import TYPE_CHECKING
-
-from teds_provision.lazy import lazy
-
-if TYPE_CHECKING:
-    from teds_provision.teds.dcc import items, read, shown, signature, write
-else:
-    __getattr__ = lazy(__name__)
-
-__all__ = ["items", "read", "shown", "signature", "write"]
+__all__ = ["items", "shown", "signature", "write"]
