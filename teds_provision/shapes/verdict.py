@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, Literal, NamedTuple, TypedDict
+from typing import Any, Final, Literal, NamedTuple, NotRequired, TypedDict
 
 CheckResult = Literal["passed", "failed", "skipped"]
-VerdictWord = Literal["authentic", "unsigned", "unverified", "not authentic", "unproven"]
-"""``unverified`` is in the published description alone: no version has given it."""
+VerdictWord = Literal["authentic", "unsigned", "not authentic", "unproven"]
 Scope = Literal["node", "image"]
 Origin = Literal["session", "kept", "plain"]
 
@@ -41,7 +40,9 @@ class Check(NamedTuple):  # a tuple: thirteen of them for each of ten thousand f
     def to_json(self) -> CheckMembers:
         """Return the check as `verify --json` and the API have it; a stored one has also ``from: kept``."""
         found = CheckMembers(name=self.name, result=self.result, why=self.why)
-        return found | {"from": "kept"} if self.kept else found  # type: ignore[return-value]
+        if self.kept:
+            found["from"] = "kept"
+        return found
 
 
 @dataclass(frozen=True)
@@ -98,15 +99,18 @@ class NodeVerdict:
         return {"from": self.origin, "at": self.at, "by": self.by}
 
 
-class CheckMembers(TypedDict):
-    """One check of a verdict."""
+KeptMember = TypedDict("KeptMember", {"from": NotRequired[Literal["kept"]]})  # a keyword of Python
+
+
+class CheckMembers(KeptMember):
+    """One check of a verdict; ``from`` if the TEDS concerned were not read again since the node last started."""
 
     name: str
     result: CheckResult
     why: str
 
 
-OriginMember = TypedDict("OriginMember", {"from": Origin})  # a keyword of Python
+OriginMember = TypedDict("OriginMember", {"from": Origin})
 
 
 class VerdictMembers(OriginMember):

@@ -32,10 +32,12 @@ VERDICT = NodeVerdict(Verification(bytes(10), (PASSED,)), "session", "2026-11-27
 
 def test_a_check_has_the_same_members_as_object_json_and_description() -> None:
     """``kept`` becomes ``from: kept``, which only a check that is not of this start has."""
-    members = list(get_type_hints(CheckMembers))
+    members = [name for name in get_type_hints(CheckMembers) if name != "from"]
     assert [name for name in Check._fields if name != "kept"] == members == list(PASSED.to_json())
     assert list(PASSED._replace(kept=True).to_json().items())[-1] == ("from", "kept")
-    assert list(schema("Check")["properties"]) == schema("Check")["required"] == members
+    assert schema("Check")["required"] == members
+    assert set(schema("Check")["properties"]) == {*members, "from"}
+    assert schema("Check")["properties"]["from"]["enum"] == ["kept"]
 
 
 def test_a_verdict_has_the_same_members_as_object_json_and_description() -> None:
@@ -54,21 +56,25 @@ def test_one_file_of_many_has_the_members_of_one_alone() -> None:
         assert list(FileVerdict(PACKAGE, verified).to_json()) == ["file", *alone, "warnings"]
 
 
-@pytest.mark.parametrize(
-    ("failed", "word"),
-    [
-        ((), "authentic"),
-        (sorted(MERELY_UNSIGNED), "unsigned"),
-        (("signature", "signed"), "not authentic"),
-        ((SESSION, "signature"), "unproven"),
-        ((SESSION, PAGES), "unproven"),
-        ((PAGES, "signature"), "not authentic"),
-        *(((SESSION, name), "not authentic") for name in sorted(FRESHNESS)),
-    ],
-)
+WORDS = [
+    ((), "authentic"),
+    (sorted(MERELY_UNSIGNED), "unsigned"),
+    (("signature", "signed"), "not authentic"),
+    ((SESSION, "signature"), "unproven"),
+    ((SESSION, PAGES), "unproven"),
+    ((PAGES, "signature"), "not authentic"),
+    *(((SESSION, name), "not authentic") for name in sorted(FRESHNESS)),
+]
+
+
+@pytest.mark.parametrize(("failed", "word"), WORDS)
 def test_one_word_stands_for_all_checks(failed: tuple[str, ...], word: str) -> None:
     checks = (PASSED, *(Check(name, "failed", "it is so") for name in failed))
     assert replace(VERDICT.verified, checks=checks).verdict == word
+
+
+def test_the_description_names_the_words_that_are_given_and_no_other() -> None:
+    assert {word for _, word in WORDS} == set(get_args(VerdictWord))
 
 
 def test_no_other_place_writes_a_verdict_or_a_check_as_json() -> None:

@@ -123,7 +123,6 @@ export function grouped(hex) {
 const VERDICTS = {
   authentic: ["good", "good", "Authentic", "Signature, trust and key proof are valid."],
   unproven: ["warn", "ask", "Unproven", "The node could not prove that it holds its key."],
-  unverified: ["warn", "warn", "Unverified", "This station has a key for the node, but nobody signed its datasheet."],
   unsigned: ["warn", "warn", "Unsigned", "Nobody signed this datasheet."],
   "not authentic": ["bad", "bad", "Not authentic", "A security check failed. Do not trust its values."],
 };
