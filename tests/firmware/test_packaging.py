@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 from pathlib import Path
+from shutil import copy
 
 import pytest
 
@@ -135,6 +136,24 @@ def consumer(folder: Path, library: str) -> None:
     template = builds.FIRMWARE / "port/template"
     (folder / "CMakeLists.txt").write_text(CONSUMER.format(library=library, template=template))
     (folder / "sizes.c").write_text(SIZES)
+
+
+def test_objects_of_sources_that_have_another_name_now_are_in_no_library(tmp_path: Path) -> None:
+    """A renamed source was linked under both names: every symbol of it twice."""
+    builds.need("make", "gcc")
+    library, objects = tmp_path / "host" / "memory-1024-4096.so", tmp_path / "host" / "memory-1024-4096"
+
+    def make() -> int:
+        run("make", "-s", "-C", str(builds.FIRMWARE), f"BUILD={tmp_path}", "LEVEL=-O0", str(library))
+        return library.stat().st_mtime_ns
+
+    first = make()
+    assert make() == first, "nothing has changed"
+    names = sorted(path.name for path in objects.iterdir())
+    copy(objects / names[0], objects / "former.o")
+    (tmp_path / "sources").write_text("src/former.c\n", encoding="utf-8")
+    assert make() > first
+    assert sorted(path.name for path in objects.iterdir()) == names
 
 
 def test_a_project_finds_the_installed_library_by_cmake(tmp_path: Path) -> None:
