@@ -395,9 +395,13 @@ class _Judge:
             return f"{MAX_PENDING} of its keys are already waiting for proof here"
         known = self.nodes.get(node.uuid)
         active = max((epoch for state, epoch in held.values() if state == "active"), default=0)
-        latest = max(known.epoch if known is not None else 0, *(epoch for _, epoch in held.values()), 0)
-        if node.epoch < latest:
-            return f"its key epoch {node.epoch} is older than {latest}, which is known here"
+        proven = max(known.epoch if known is not None else 0, active)
+        pending = max((epoch for state, epoch in held.values() if state == "pending"), default=0)
+        if node.epoch < proven:
+            return f"its key epoch {node.epoch} is older than {proven}, which is known here"
+        if node.epoch < pending:
+            of = f"{pending}, that of a key which no session has proven here yet"
+            return f"its key epoch {node.epoch} is older than {of}: verify the node, or agree a new key with it"
         if node.epoch == active:
             return f"another key of epoch {node.epoch} is in use here"
         return ""

@@ -82,6 +82,18 @@ def test_an_older_epoch_than_the_stores_is_refused(pair: Pair) -> None:
         plan_import(pair.south, old.read_bytes())
 
 
+def test_an_older_epoch_than_that_of_a_key_without_proof_is_refused_with_the_way_on(pair: Pair) -> None:
+    """The epoch was "known here", where nothing but the word of a bundle was; once the node was reached it is clear."""
+    pair.take(pair.export("copy")[0])
+    session(pair.south, pair.board)
+    with talk(pair.board) as node:
+        agree(pair.north, node, identify(pair.north, node), rotate=True)
+    bundle, _ = pair.export("copy")
+    pair.south.keys.add_pending(pair.board.uuid, key=bytes(16), key_id=b"no proof", epoch=3)
+    with pytest.raises(PolicyError, match=r"epoch 2 is older than 3, .* no session has proven .*: verify the node"):
+        plan_import(pair.south, bundle.read_bytes())
+
+
 def test_a_newer_epoch_comes_in_beside_the_old_key_until_it_is_proven(pair: Pair) -> None:
     pair.take(pair.export("copy")[0])
     session(pair.south, pair.board)
