@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import click
 
 from teds_provision import check as check_room
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Console, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import print_table, reporter_for
 from teds_provision.errors import NotAuthenticError, TedsProvisionError
 from teds_provision.links import LinkSettings
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from teds_provision.check.agreement_rules import ExplainedRequest
-    from teds_provision.check.run import CheckReport
 
 
 @command(
@@ -94,7 +88,7 @@ def check(app: App, factory: bool, explain: bool, yes: bool, dry_run: bool, link
     )
 
 
-def _explained(explained: ExplainedRequest | str) -> dict[str, str | None]:
+def _explained(explained: check_room.agreement_rules.ExplainedRequest | str) -> dict[str, str | None]:
     """Return the test agreement in hex; without one only ``problem``."""
     if isinstance(explained, str):
         return {"problem": explained}
@@ -133,7 +127,7 @@ _EXPLAINED: Final = {
 }
 
 
-def _table(console: Console, report: CheckReport) -> None:
+def _table(console: Console, report: check_room.run.CheckReport) -> None:
     from rich.markup import escape
     from rich.table import Table
 

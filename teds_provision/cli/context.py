@@ -48,6 +48,9 @@ else:
     json = late("json")
     console = late("teds_provision.cli.console")  # rich
     problem = late("teds_provision.shapes.problem")  # the form of an error as JSON
+    Console = RenderableType = Station = object  # for annotations alone, which nothing evaluates
+
+__all__ = ["App", "Console", "RenderableType", "Station", "pass_app"]
 
 _BEHIND = " [y/N]: "
 _PRINTING = threading.Lock()

@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision.cli.context import App
+from teds_provision.cli.context import App, Console, RenderableType
 from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.provisioning.progress import FAILED, NOTHING, SKIPPED, Reporter, SilentReporter, StepResult
 from teds_provision.sanitize import sanitize
 from teds_provision.shapes.problem import problem_of
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
     from rich.live import Live
     from rich.table import Table
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 from teds_provision import teds
 from teds_provision.errors import PolicyError
@@ -11,19 +10,14 @@ from teds_provision.station.station import Station
 from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.image import Image
 
-if TYPE_CHECKING:
-    from teds_provision.teds.calibration import Calibration
-    from teds_provision.teds.guard import GuardFinding
-    from teds_provision.teds.profile import Profile
-
 
 def guard(
     station: Station,
     image: Image,
     has: Image | None,
     accepted: str | None,
-    calibrations: Mapping[int, Calibration] | None = None,
-    profile: Profile | None = None,
+    calibrations: Mapping[int, teds.calibration.Calibration] | None = None,
+    profile: teds.profile.Profile | None = None,
     *,
     record: bool = True,
     expected: Collection[str] = (),
@@ -56,7 +50,7 @@ def guard(
 
 
 def is_calibrated(*images: Image | None) -> bool:
-    """Return True if one of these datasheets has a Calibration TEDS."""
+    """Return True if one of these datasheets has a teds.calibration.Calibration TEDS."""
     return any(code == AccessCode.CALIBRATION for image in images for _, code in image or ())
 
 
@@ -98,5 +92,5 @@ def _joined(head: str, numbers: list[int], rest: str) -> str:
     return f"{head}s {text}{rest}"
 
 
-def _finding_text(finding: GuardFinding) -> str:
+def _finding_text(finding: teds.guard.GuardFinding) -> str:
     return f"channel {finding.channel}: {finding.message}"

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from teds_provision import __version__, measure, provisioning, teds
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Console, pass_app
 from teds_provision.cli.measure.sample import over_the_bus
 from teds_provision.cli.options import (
     ChannelName,
@@ -31,11 +31,6 @@ from teds_provision.limits import LIMITS
 from teds_provision.links import LinkSettings
 from teds_provision.teds.calibration import Calibration
 from teds_provision.teds.calibration.model import METHODS
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from teds_provision.measure.zero import ZeroResult
 
 _NEGATIVE: dict[str, Any] = {"ignore_unknown_options": True}  # -0.5 is a value, and no option
 
@@ -101,7 +96,7 @@ def zero(
     app.emit(_zero_json(done, dry_run=dry_run), _zero_lines(done, dry_run=dry_run))
 
 
-def _zero_json(done: ZeroResult, *, dry_run: bool) -> dict[str, Any]:
+def _zero_json(done: measure.zero.ZeroResult, *, dry_run: bool) -> dict[str, Any]:
     channel = done.channel
     unit = channel.shown
     differences = {"offset": done.offset, "moved": done.moved, "spread": done.spread}
@@ -126,7 +121,7 @@ def _zero_json(done: ZeroResult, *, dry_run: bool) -> dict[str, Any]:
     }
 
 
-def _zero_lines(done: ZeroResult, *, dry_run: bool) -> str:
+def _zero_lines(done: measure.zero.ZeroResult, *, dry_run: bool) -> str:
     channel = done.channel
     named = f"Channel {channel.number}" + (f" ({shown(channel.name)})" if channel.name else "")
     read = f"{named} read {channel.show_reading(done.before)}"

@@ -16,7 +16,7 @@ from click.core import ParameterSource
 
 from teds_provision import measure as measure_room
 from teds_provision import provisioning, teds
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Station, pass_app
 from teds_provision.cli.measure.sample import ending, over_the_bus, where_met
 from teds_provision.cli.named_files import read_file
 from teds_provision.cli.options import (
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from teds_provision.measure.running.measurement import MeasurementEnd
     from teds_provision.measure.running.measurement_job import MeasurementJob
     from teds_provision.measure.sinks.mcap.recover import RecoveryResult
-    from teds_provision.station.station import Station
 else:  # loads the sinks and numpy
     measure_view = late("teds_provision.cli.measure.measure_view")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -14,10 +14,6 @@ from teds_provision.errors import NotFoundError, UsageError
 from teds_provision.station.measurements import STATION
 from teds_provision.station.shown_units import channel_profiles
 from teds_provision.station.station import Station
-
-if TYPE_CHECKING:
-    from teds_provision.measure.blocks import ChannelFacts
-    from teds_provision.measure.sinks.names import Topics
 
 
 @click.group(
@@ -143,7 +139,7 @@ def _change(app: App, station: Station, uuid: bytes, channel: int, name: str | N
         station.audit("rename", None if uuid == STATION else uuid, "done", channel=channel, name=name)
 
 
-def _channels(station: Station) -> list[tuple[bytes, int, ChannelFacts]]:
+def _channels(station: Station) -> list[tuple[bytes, int, measure.blocks.ChannelFacts]]:
     """Return every channel of a stored datasheet, with the facts that make its name."""
     found = []
     for record in station.nodes.all():
@@ -186,7 +182,13 @@ def _print_names(app: App, station: Station) -> None:
     app.emit({"station": topics.station, "names": rows}, "\n".join(lines) or "No datasheets are known yet.")
 
 
-def _frame(station: Station, chosen: Mapping[tuple[bytes, int], str], topics: Topics, uuid: bytes, number: int) -> str:
+def _frame(
+    station: Station,
+    chosen: Mapping[tuple[bytes, int], str],
+    topics: measure.sinks.names.Topics,
+    uuid: bytes,
+    number: int,
+) -> str:
     of_type = channel_profiles(station, uuid).get(number)
     frame = chosen.get((uuid, number)) or chosen.get((uuid, 0)) or (of_type.frame if of_type else "")
     return frame.replace("{node}", topics.node(uuid.hex()))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from teds_provision import measure as measure_room
+from teds_provision.cli import rendering
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
     COMMAND_SETTINGS,
@@ -27,13 +28,11 @@ from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
 from teds_provision.sanitize import counted
 
 if TYPE_CHECKING:
-    from teds_provision.cli import rendering
     from teds_provision.cli.measure import measure_view
     from teds_provision.measure.display_units import FileUnits
     from teds_provision.measure.recordings.source import Entry, Recording
     from teds_provision.measure.recordings.summary import RecordingSummary
 else:
-    rendering = late("teds_provision.cli.rendering")
     measure_view = late("teds_provision.cli.measure.measure_view")  # numpy and the sinks
 
 SHOWN = 20

@@ -9,12 +9,12 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import click
 
 from teds_provision import measure, provisioning
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Console, Station, pass_app
 from teds_provision.cli.options import ChannelName, Number, command, link_options, options_given
 from teds_provision.cli.rendering import print_table, reporter_for, shown, tidy
 from teds_provision.cli.shape_options import measurement_option
@@ -24,15 +24,6 @@ from teds_provision.protocol.operation.commands import POWER, ChannelState, Oper
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.teds.channel import within_turn
 from teds_provision.teds.sheet import Channel
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from teds_provision.measure.held_actuator import AppliedSetPoint
-    from teds_provision.measure.sampling import Sample
-    from teds_provision.measure.verified_session import VerifiedSession
-    from teds_provision.provisioning.meeting import IdleStop
-    from teds_provision.station.station import Station
 
 
 def over_the_bus(links: LinkSettings, *, streams: bool = False) -> LinkSettings:
@@ -67,7 +58,9 @@ def where_met(station: Station, links: LinkSettings, uuids: Sequence[bytes]) -> 
 
 
 @contextmanager
-def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes, *, by: str) -> Iterator[VerifiedSession]:
+def trusted_node(
+    app: App, station: Station, links: LinkSettings, uuid: bytes, *, by: str
+) -> Iterator[measure.verified_session.VerifiedSession]:
     """Yield a node in a session, its datasheet verified for the command ``by``; left in order."""
     reporter = reporter_for(app)
     with provisioning.meeting.meet(
@@ -104,13 +97,13 @@ def sample(app: App, node: str, channels: Sequence[int | str], links: LinkSettin
     app.emit(result, lambda console: _samples(console, samples))
 
 
-def _text(sample: Sample, value: float) -> str:
+def _text(sample: measure.sampling.Sample, value: float) -> str:
     if sample.turn is None or sample.shown is None:
         return f"{value:.6g}"
     return within_turn(value, sample.shown, sample.turn)
 
 
-def _samples(console: Console, samples: Sequence[Sample]) -> None:
+def _samples(console: Console, samples: Sequence[measure.sampling.Sample]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -265,7 +258,7 @@ _ZERO: Final = 1e-9
 """Part of a channel's range below which a set point is 0 but for rounding."""
 
 
-def _near(channel: Channel, applied: AppliedSetPoint) -> str:
+def _near(channel: Channel, applied: measure.held_actuator.AppliedSetPoint) -> str:
     """Return a set point for people: one that rounding alone keeps from 0 is 0."""
     span = max(abs(channel.low), abs(channel.high))
     zero = math.isfinite(span) and abs(applied.value) < _ZERO * span
@@ -283,7 +276,7 @@ def _require_unit(app: App, channel: Channel, value: float, unit: str | None) ->
 
 
 @contextmanager
-def ending(stop: IdleStop) -> Iterator[None]:
+def ending(stop: provisioning.meeting.IdleStop) -> Iterator[None]:
     """End in order at the first Ctrl-C or SIGTERM, at once with 130 at a second one.
 
     So does a terminal that is closed (SIGHUP, twice if the shell passes it on), unless nohup has it ignored: a

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -18,10 +18,6 @@ from teds_provision.protocol.announce import LAST_ADDRESS
 from teds_provision.protocol.messages.firmware import LOCATE_SECONDS
 from teds_provision.provisioning.progress import Reporter, StepResult
 from teds_provision.station.store.records import utc_now
-
-if TYPE_CHECKING:
-    from teds_provision.provisioning.identify import ProvenNode
-
 
 # -- identify ----------------------------------------------------------------------------------------------------------
 
@@ -91,7 +87,7 @@ class PressLines:
         self._inner.written(octets, total)
 
 
-def _to_json(found: ProvenNode) -> dict[str, Any]:
+def _to_json(found: provisioning.identify.ProvenNode) -> dict[str, Any]:
     who, identity = found.who, found.identity
     return {
         "uuid": who.uuid.hex(),

@@ -5,20 +5,16 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import click
 
 from teds_provision import describe as formats
 from teds_provision import measure
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Station, pass_app
 from teds_provision.cli.named_files import write_file
 from teds_provision.cli.options import command
 from teds_provision.errors import NotFoundError
-
-if TYPE_CHECKING:
-    from teds_provision.describe.described_node import DescribedNode
-    from teds_provision.station.station import Station
 
 FORMS: Final = ("td", "ros2-control", "aas")
 
@@ -65,12 +61,12 @@ def describe(app: App, uuids: tuple[str, ...], forms: tuple[str, ...], output: P
     app.emit({"files": [str(path) for path in made]}, "\n".join(str(path) for path in made))
 
 
-def _thing_description(_station: Station, node: DescribedNode) -> dict[str, str]:
+def _thing_description(_station: Station, node: formats.described_node.DescribedNode) -> dict[str, str]:
     description = formats.thing_description.thing_description(node)
     return {f"{node.uuid.hex()}.td.json": json.dumps(description, ensure_ascii=False, indent=2) + "\n"}
 
 
-def _ros2_control(station: Station, node: DescribedNode) -> dict[str, str]:
+def _ros2_control(station: Station, node: formats.described_node.DescribedNode) -> dict[str, str]:
     ros2_control = formats.ros2_control
     topics = measure.sinks.names.Topics(measure.measurement_job.station_facts(station))
     joints = ros2_control.joints(node, topics)
@@ -81,7 +77,7 @@ def _ros2_control(station: Station, node: DescribedNode) -> dict[str, str]:
     }
 
 
-def _asset_shell(_station: Station, node: DescribedNode) -> dict[str, str]:
+def _asset_shell(_station: Station, node: formats.described_node.DescribedNode) -> dict[str, str]:
     return {f"{node.uuid.hex()}.aas.json": formats.asset_shell.asset_shell(node)}
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from teds_provision.cli.context import Station
 from teds_provision.errors import NotFoundError
 from teds_provision.optional_rooms import Hook
-
-if TYPE_CHECKING:
-    from teds_provision.station.station import Station
 
 NODE_NAMES: Final[Hook[Callable[[Station, str], bytes | None]]] = Hook("cli.node.names")
 """Functions that know nodes by other names than this station does: UUID, or None; UsageError if several fit."""

@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 import click
 
 from teds_provision import provisioning, teds
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Console, pass_app
 from teds_provision.cli.options import WholeNumber, command
 from teds_provision.cli.rendering import (
     FIRMWARE_CHANGED,
@@ -31,9 +31,6 @@ from teds_provision.provisioning.inventory import STATES, inventory, search
 from teds_provision.sanitize import by_name
 from teds_provision.station.label import label_of, write_label
 from teds_provision.station.station import Station
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 
 class NodeView(Protocol):

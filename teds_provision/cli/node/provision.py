@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import click
 
 from teds_provision import firmware_image, provisioning, teds
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Console, pass_app
 from teds_provision.cli.node.build import calibration_json, order_options
 from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, options_given, yes_option
 from teds_provision.cli.rendering import firmware_words, print_table, reporter_for
@@ -32,8 +32,6 @@ from teds_provision.station.station import Station
 from teds_provision.station.summary import NodeSummary, summarise
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from teds_provision.cli import terminal_operator
     from teds_provision.provisioning.batch import BatchRun, ProvisionPlan, ProvisionRequest
     from teds_provision.provisioning.batch_sheet import BoardResult, SheetRow

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import click
 
 from teds_provision import teds
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Console, pass_app
 from teds_provision.cli.context import to_json as dumps
 from teds_provision.cli.options import ChannelName, FileToRead, command
 from teds_provision.errors import BadDataError, UsageError
@@ -46,7 +46,6 @@ from teds_provision.teds.show import (
 if TYPE_CHECKING:
     from rich import markup
     from rich import table as rich_table
-    from rich.console import Console
 
     from teds_provision.protocol.handover import bundle as bundles
     from teds_provision.protocol.handover.bundle import BundleHeader

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from teds_provision import firmware_image, measure, provisioning
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Station, pass_app
 from teds_provision.cli.options import (
     FileToRead,
     Number,
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from rich.live import Live
 
     from teds_provision.provisioning.update import BoardUpdate, UpdateOrder, UpdatePlan
-    from teds_provision.station.station import Station
 
 _WORST_FIRST: Final = (4, 6, 5)
 """Exit codes of boards, the worst first; any other one is less than these."""

@@ -5,24 +5,19 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from teds_provision import provisioning
-from teds_provision.cli.context import App, pass_app, to_json
+from teds_provision.cli.context import App, Console, pass_app, to_json
 from teds_provision.cli.options import command, link_options, options_given
 from teds_provision.cli.rendering import aligned, firmware_words, print_table, reporter_for
 from teds_provision.errors import UsageError
 from teds_provision.files import json_files
 from teds_provision.links import LinkSettings
 from teds_provision.sanitize import printable
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from teds_provision.provisioning.verify_files import FileVerdict
-    from teds_provision.shapes.verdict import Verification
+from teds_provision.shapes.verdict import Verification
 
 
 @command(
@@ -129,12 +124,12 @@ def verify_many(app: App, what: Sequence[str]) -> None:
         raise click.exceptions.Exit(totals.exit_code)
 
 
-def _line(found: FileVerdict) -> str:
+def _line(found: provisioning.verify_files.FileVerdict) -> str:
     why = found.error["message"] if found.error is not None else "; ".join(found.warnings)
     uuid = found.verified.uuid.hex() if found.verified is not None else "-"
     text = f"{found.word:<13}  {uuid:<20}  {found.path}"
     return printable(f"{text}: {why}" if why else text)
 
 
-def _json(found: FileVerdict) -> str:
+def _json(found: provisioning.verify_files.FileVerdict) -> str:
     return to_json(found.to_json())

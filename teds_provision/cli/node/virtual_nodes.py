@@ -29,27 +29,15 @@ from teds_provision.station.store.sqlite import has_store
 
 if TYPE_CHECKING:
     from teds_provision import client
-    from teds_provision.node.ble import address as ble_address
-    from teds_provision.node.ble import peripheral as ble_peripheral
-    from teds_provision.node.ble import server as ble_server
     from teds_provision.node.ble.server import BleServer
-    from teds_provision.node.can import server as can_server
     from teds_provision.node.can.server import CanServer
-    from teds_provision.node.hardware import board as hardware_board
     from teds_provision.node.hardware.board import ActuatorReading, Board
-    from teds_provision.node.nfc import server as nfc_server
-    from teds_provision.node.nfc import tnep as nfc_tnep
     from teds_provision.node.nfc.tnep import ExtraRecords
     from teds_provision.node.virtual import LinkServer, VirtualNode
     from teds_provision.node.wrapped.running import SensorPlace, WrappedRun
     from teds_provision.protocol.operation.streams import DataFrame
 else:
-    client = late("teds_provision.client")
-    # the links and the hardware of a node that runs: not for --help, nor for `node create`
-    ble_address, ble_server = late("teds_provision.node.ble.address"), late("teds_provision.node.ble.server")
-    ble_peripheral = late("teds_provision.node.ble.peripheral")
-    can_server, hardware_board = late("teds_provision.node.can.server"), late("teds_provision.node.hardware.board")
-    nfc_server, nfc_tnep = late("teds_provision.node.nfc.server"), late("teds_provision.node.nfc.tnep")
+    client = late("teds_provision.client")  # HTTP
 
 
 @click.group(
@@ -447,7 +435,7 @@ def _boards(
 ) -> Callable[[FlashFile], Board | None]:
     numbers = itertools.count()
 
-    def make(file: FlashFile) -> hardware_board.Board | None:
+    def make(file: FlashFile) -> node_room.Board | None:
         uuid, hardware = file.load().uuid, file.hardware
         if not hardware and source != _DEFAULT_SOURCE:
             app.warn(
@@ -455,11 +443,11 @@ def _boards(
             )
         if not hardware and percent is None:
             return None
-        return hardware_board.Board(
+        return node_room.Board(
             teds.sheet.Sheet.from_image(teds.image.Image(uuid, hardware)),
             source=source if wrapped is None else wrapped.source(next(numbers)),
             lag=0 if wrapped is None else node_room.wrapped.wrapped_source.LAG,
-            battery=None if percent is None else hardware_board.Battery(percent),
+            battery=None if percent is None else node_room.Battery(percent),
             shown=lines.observer_of(uuid.hex()),
             notify=app.warn,
         )
@@ -504,13 +492,13 @@ def _servers(
     if air is not None:
         servers.append(air)
     if nfc:
-        reader = nfc_server.NfcServer(
+        reader = node_room.NfcServer(
             nfc, nodes[0], tag=tag, pace=pace, wt_int=wait_time // 4 * 4, extras=_extras(nodes[0], air)
         )
         nodes[0].when_restarted(reader.restarted)
         servers.append(reader)
     if can:
-        bus = can_server.CanServer(can, notify=app.warn)
+        bus = node_room.CanServer(can, notify=app.warn)
         for node in nodes:
             tapped = node.in_factory_state if nfc is None else lambda: False
             bus.add(node, counts_as_tapped=tapped, measuring=node)
@@ -522,10 +510,10 @@ def _servers(
 
 
 def _in_the_air(controller: str, node: VirtualNode) -> BleServer:
-    address = ble_address.StaticAddress(node.flash_file.path.parent, factory=node.in_factory_state())
-    server = ble_server.BleServer(controller, node, address)
+    address = node_room.StaticAddress(node.flash_file.path.parent, factory=node.in_factory_state())
+    server = node_room.BleServer(controller, node, address)
     node.when_restarted(server.restarted)
-    node.streams_over(server.send_data, ble_peripheral.BUS)
+    node.streams_over(server.send_data, node_room.peripheral.BUS)
     return server
 
 
@@ -536,7 +524,7 @@ def _send(bus: CanServer, node: VirtualNode, frame: DataFrame) -> None:
 def _extras(node: VirtualNode, air: BleServer | None) -> ExtraRecords:
     """Return the extra records of the initial message: charge, and the address in the air; and the field's effect."""
     battery = node.board.battery if node.board is not None else None
-    charging = nfc_tnep
+    charging = node_room.tnep
 
     def field(present: bool) -> None:
         if battery is not None:

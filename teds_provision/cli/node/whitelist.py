@@ -5,12 +5,12 @@ from __future__ import annotations
 import sys
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from teds_provision import provisioning
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Station, pass_app
 from teds_provision.cli.named_files import write_file
 from teds_provision.cli.node.node_names import resolve
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, fingerprint_option, yes_option
@@ -19,10 +19,6 @@ from teds_provision.errors import NotFoundError
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.sanitize import counted
 from teds_provision.station.label import read_label
-
-if TYPE_CHECKING:
-    from teds_provision.provisioning.whitelist import WhitelistPlan
-    from teds_provision.station.station import Station
 
 
 @click.group(
@@ -200,7 +196,7 @@ def export_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
     )
 
 
-def _emit_plan(app: App, station: Station, plan: WhitelistPlan, *, dry_run: bool) -> None:
+def _emit_plan(app: App, station: Station, plan: provisioning.whitelist.WhitelistPlan, *, dry_run: bool) -> None:
     changed = len(plan.write) - plan.new
     what = f"{plan.new} new, {changed} changed, {plan.unchanged} unchanged"
     text = f"Plan: {what}." if dry_run else f"Whitelist: {what}{'' if plan.write else ' (nothing to do)'}."

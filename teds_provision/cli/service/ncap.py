@@ -19,7 +19,7 @@ import click
 from teds_provision import client
 from teds_provision import measure as measure_room
 from teds_provision.cli.config_file import brokers_of, config_path
-from teds_provision.cli.context import App, pass_app, to_json
+from teds_provision.cli.context import App, Console, Station, pass_app, to_json
 from teds_provision.cli.options import (
     COMMAND_SETTINGS,
     FileToRead,
@@ -40,19 +40,14 @@ from teds_provision.sanitize import by_name, counted
 from teds_provision.station.store.records import COMMAND, iso
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from teds_provision.api.bodies import Mode
-    from teds_provision.measure import matching
     from teds_provision.measure.matching import MatchSurvey
     from teds_provision.ncap import service_part, service_run, settings
     from teds_provision.ncap.web import tokens
-    from teds_provision.station.station import Station
 else:
     service_run, settings = late("teds_provision.ncap.service_run"), late("teds_provision.ncap.settings")
     service_part = late("teds_provision.ncap.service_part")
     tokens = late("teds_provision.ncap.web.tokens")
-    matching = late("teds_provision.measure.matching")
 
 
 MOST: Final = 1000  # lines that may wait for a reader
@@ -160,7 +155,7 @@ def run(
         if kind.name in wanted.parts:
             kind.require(station)
     if wanted.measure is not None:
-        match = matching.NodeMatch.parse(wanted.measure)
+        match = measure_room.matching.NodeMatch.parse(wanted.measure)
         match.require_groups(station)
         unknown = match.unknown_type(station)
         if unknown:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -20,7 +20,7 @@ from teds_provision.cli.config_file import (
     read_config,
     read_config_text,
 )
-from teds_provision.cli.context import App, pass_app, to_json
+from teds_provision.cli.context import App, Console, pass_app, to_json
 from teds_provision.cli.main import COMPLETE
 from teds_provision.cli.option_names import OPTIONS
 from teds_provision.cli.options import COMMAND_SETTINGS, command, examples
@@ -29,9 +29,6 @@ from teds_provision.files import write_whole
 from teds_provision.limits import load_toml
 from teds_provision.links.can import spec
 from teds_provision.station.store.lock import StoreLock
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 _PREFIX = "TEDS_PROVISION_"
 

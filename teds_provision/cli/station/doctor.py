@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from teds_provision.cli.config_file import config_path
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Console, pass_app
 from teds_provision.cli.options import command
 from teds_provision.cli.station.config import check_values
 from teds_provision.cli.table import COMMANDS
@@ -23,10 +23,6 @@ from teds_provision.errors import BadDataError, TedsProvisionError, UsageError
 from teds_provision.files import SHARED, require_new, write_new
 from teds_provision.limits import load_toml
 from teds_provision.sanitize import sanitize
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
 
 _STYLES = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": "dim"}
 

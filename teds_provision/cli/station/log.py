@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from teds_provision import provisioning
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Station, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, WholeNumber, command, examples
 from teds_provision.cli.rendering import local_time, moment, print_json_list, shown
 from teds_provision.errors import StoreError, UsageError
@@ -25,7 +25,6 @@ from teds_provision.sanitize import counted, sanitize
 from teds_provision.station.store.audit import AuditEntry, AuditFilter, AuditVerdict, is_failure
 
 if TYPE_CHECKING:
-    from teds_provision.station.station import Station
     from teds_provision.trace import recorder
     from teds_provision.trace.record import Record
 else:  # the help of this command does without

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from teds_provision import node as node_room
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Console, pass_app
 from teds_provision.cli.named_files import read_file
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, command, dry_run_option, examples
 from teds_provision.cli.rendering import print_table
@@ -33,7 +33,6 @@ from teds_provision.teds.show import seconds
 from teds_provision.teds.units import short_unit
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
 
     from teds_provision.node.wrapped.description import WrappedSensor

@@ -13,7 +13,7 @@ from uuid import uuid4
 import click
 
 from teds_provision import plant, provisioning, teds
-from teds_provision.cli.context import App, pass_app, to_json
+from teds_provision.cli.context import App, Console, Station, pass_app, to_json
 from teds_provision.cli.named_files import read_file, write_file
 from teds_provision.cli.options import (
     COMMAND_SETTINGS,
@@ -32,8 +32,6 @@ from teds_provision.protocol.keys import SoftwareKey, from_pem
 from teds_provision.sanitize import printable
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from teds_provision.plant.office import AnsweredRequest
     from teds_provision.plant.verify_evidence import JudgedEvidence
     from teds_provision.plant.yield_stats import StationYield
@@ -41,7 +39,6 @@ if TYPE_CHECKING:
     from teds_provision.protocol.plant import job as jobs
     from teds_provision.protocol.plant.roster import Roster
     from teds_provision.station.plant.line import EvidenceRow
-    from teds_provision.station.station import Station
 else:  # `evidence verify` reads neither jobs nor requests
     document, jobs = late("teds_provision.protocol.plant.document"), late("teds_provision.protocol.plant.job")
     signing = late("teds_provision.protocol.plant.signing")

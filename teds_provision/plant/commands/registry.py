@@ -7,12 +7,12 @@ from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import click
 
 from teds_provision import plant
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, Station, pass_app
 from teds_provision.cli.named_files import read_file
 from teds_provision.cli.options import (
     COMMAND_SETTINGS,
@@ -31,11 +31,6 @@ from teds_provision.protocol import keys
 from teds_provision.protocol.plant import document, roster
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.sanitize import sanitize
-
-if TYPE_CHECKING:
-    from teds_provision.plant.status import PlantStatus, StationStanding
-    from teds_provision.plant.sync import SyncResult
-    from teds_provision.station.station import Station
 
 _FILE: Final = click.Path(path_type=Path, dir_okay=False)
 _FOLDER: Final = click.Path(path_type=Path, file_okay=False)
@@ -508,7 +503,7 @@ def sync(app: App, files: Path | None) -> None:
         raise click.exceptions.Exit(4)
 
 
-def _synced(station: Station, done: SyncResult, alarms: Sequence[Any]) -> str:
+def _synced(station: Station, done: plant.sync.SyncResult, alarms: Sequence[Any]) -> str:
     lines = [f"{_count(done.pushed, 'page')} out, {done.fetched} in"]
     if done.parcels_in or done.parcels_out:
         lines.append(f"{_count(done.parcels_out, 'parcel')} out, {done.parcels_in} in")
@@ -573,7 +568,7 @@ def status(app: App) -> None:
         raise click.exceptions.Exit(found.exit_code)
 
 
-def _standing(standing: StationStanding) -> dict[str, Any]:
+def _standing(standing: plant.status.StationStanding) -> dict[str, Any]:
     return {
         "name": standing.name,
         "fingerprint": standing.fingerprint,
@@ -584,7 +579,7 @@ def _standing(standing: StationStanding) -> dict[str, Any]:
     }
 
 
-def _shown(station: Station, found: PlantStatus) -> str:
+def _shown(station: Station, found: plant.status.PlantStatus) -> str:
     held, digits = found.roster, found.heads[0]
     heads = " ".join(digits[at : at + 4] for at in range(0, 16, 4))
     lines = [
