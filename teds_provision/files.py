@@ -165,8 +165,10 @@ def read_limited(
     ``follow`` False refuses a symbolic link. Raises NotFoundError (no such file), ``failure`` (it cannot be read), and
     BadDataError (larger than any ``what``).
     """
-    with _failing_as(path, failure):
+    try:
         octets = _read(_opened(path, 0 if follow else NOFOLLOW), max_octets + 1)
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, error, failure) from error
     if len(octets) > max_octets:
         raise BadDataError(f"{path} is larger than {max_octets} octets, which is too large for a {what}.")
     return octets
@@ -187,8 +189,10 @@ def read_text(path: Path, max_octets: int, what: str, *, failure: type[TedsProvi
 
 def open_to_read(path: Path) -> BinaryIO:
     """Open a file to read from; raises NotFoundError if it does not exist or cannot be read."""
-    with _failing_as(path, NotFoundError):
+    try:
         return open(_opened(path), "rb")
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, error, NotFoundError) from error
 
 
 def _opened(path: Path, flags: int = 0) -> int:
@@ -220,19 +224,15 @@ def _is_named(path: Path) -> bool:
     return not str(path).startswith(("/dev/fd/", "/dev/std", "/proc/"))
 
 
-@contextmanager
-def _failing_as(path: Path, failure: type[TedsProvisionError]) -> Iterator[None]:
-    """Report why a file cannot be read."""
-    try:
-        yield
-    except FileNotFoundError:
-        raise NotFoundError(f"There is no file {path}.") from None
-    except IsADirectoryError:
-        raise NotFoundError(f"{path} is a folder, not a file.") from None
-    except ValueError as error:  # a zero octet in the name
-        raise NotFoundError(f"{str(path)!r} is not a valid file name.") from error
-    except OSError as error:
-        raise failure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
+def _unreadable(path: Path, error: OSError | ValueError, failure: type[TedsProvisionError]) -> TedsProvisionError:
+    """Return why a file cannot be read."""
+    if isinstance(error, FileNotFoundError):
+        return NotFoundError(f"There is no file {path}.")
+    if isinstance(error, IsADirectoryError):
+        return NotFoundError(f"{path} is a folder, not a file.")
+    if isinstance(error, OSError):
+        return failure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.")
+    return NotFoundError(f"{str(path)!r} is not a valid file name.")  # a zero octet in it
 
 
 def _read(descriptor: int, most: int) -> bytes:

@@ -162,7 +162,11 @@ class EvidenceTotals:
 
     def add(self, judged: JudgedEvidence) -> None:
         """Count one in."""
-        self.join(EvidenceTotals(1, {judged.word: 1}, judged.exit_code))
+        self.files += 1
+        word = judged.word
+        self.words[word] = self.words.get(word, 0) + 1
+        if judged.exit_code:
+            self.exit_code = max(self.exit_code, judged.exit_code, key=_WORST.index)
 
     def join(self, others: EvidenceTotals) -> None:
         """Count in what was counted elsewhere."""

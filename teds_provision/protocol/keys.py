@@ -146,6 +146,15 @@ def verify(point: bytes, message: bytes, signature: bytes) -> bool:
     return True
 
 
+def verify_der(point: bytes, message: bytes, signature: bytes) -> bool:
+    """Return True if ``signature`` (DER, as others than nodes write it) is that of ``point`` over ``message``."""
+    try:
+        public_key(point).verify(signature, hashlib.sha256(message).digest(), _of_digest())
+    except (exceptions.InvalidSignature, BadDataError):
+        return False
+    return True
+
+
 def fingerprint(point: bytes) -> str:
     """Return SHA-256(P(x)), 64 hex digits; people see the first 16."""
     return hashlib.sha256(point).hexdigest()

@@ -11,7 +11,6 @@ import codecs
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from io import BytesIO
 from typing import Any
@@ -132,8 +131,10 @@ def load_object(octets: bytes, what: str) -> dict[str, Any]:
 
     The caller has bounded the size. Raises BadDataError that names ``what``.
     """
-    with _failing_as(what):
+    try:
         value = _DECODER.decode(_decoded(octets))
+    except (RecursionError, ValueError) as error:
+        raise _damaged(error, what) from error
     if not isinstance(value, dict):
         raise BadDataError(f"{what} is JSON, but not an object.")
     return value
@@ -141,8 +142,10 @@ def load_object(octets: bytes, what: str) -> dict[str, Any]:
 
 def load_exact(octets: bytes, what: str) -> dict[str, Any]:
     """Load as :func:`load_object` does, without fractions and exponents, which readers round differently."""
-    with _failing_as(what):
+    try:
         value = _EXACT.decode(_decoded(octets))
+    except (RecursionError, ValueError) as error:
+        raise _damaged(error, what) from error
     if not isinstance(value, dict):
         raise BadDataError(f"{what} is JSON, but not an object.")
     return value
@@ -154,24 +157,22 @@ def load_long(octets: bytearray, what: str, name: str, make: Callable[[object], 
     So neither the text nor the elements are ever all there beside what is made of them. ``octets`` is emptied as it is
     read. Whatever ``make`` raises comes out as it is.
     """
-    with _failing_as(what):
+    try:
         walk = _Walk(octets)
         if walk.next() == "{":
             return walk.members(name, make)
         _DECODER.decode(walk.rest())
+    except (RecursionError, ValueError) as error:
+        raise _damaged(error, what) from error
     raise BadDataError(f"{what} is JSON, but not an object.")
 
 
-@contextmanager
-def _failing_as(what: str) -> Iterator[None]:
-    """Report what is wrong with a JSON text."""
-    try:
-        yield
-    except RecursionError as error:
-        raise BadDataError(f"{what} is nested too deeply.") from error
-    except ValueError as error:
-        detail = _TWICE if isinstance(error, DuplicateNameError) else "it is damaged or something else"
-        raise BadDataError(f"{what} is not the JSON that it should be: {detail}.") from error
+def _damaged(error: RecursionError | ValueError, what: str) -> BadDataError:
+    """Return what is wrong with a JSON text."""
+    if isinstance(error, RecursionError):
+        return BadDataError(f"{what} is nested too deeply.")
+    detail = _TWICE if isinstance(error, DuplicateNameError) else "it is damaged or something else"
+    return BadDataError(f"{what} is not the JSON that it should be: {detail}.")
 
 
 def _decoded(octets: bytes | bytearray) -> str:

@@ -15,9 +15,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.utils import encode_dss_signature
 
 from teds_provision.errors import BadDataError
@@ -32,8 +29,8 @@ from teds_provision.protocol.keys import (
     is_point,
     node_key_message,
     prove_message,
-    public_key,
     verify,
+    verify_der,
 )
 from teds_provision.protocol.messages.firmware import FirmwareReport, is_stated
 from teds_provision.teds.codec import security
@@ -315,7 +312,7 @@ def ready(evidence: Evidence) -> CheckedEvidence:
 def check_signatures(checked: CheckedEvidence) -> Signatures:
     """Check the signatures alone: of many documents in a row each costs half of what it costs between other work."""
     evidence, shown = checked.evidence, checked.shown
-    envelope = _signed_by(evidence.station, pae(evidence.payload), evidence.signature)
+    envelope = verify_der(evidence.station, pae(evidence.payload), evidence.signature)
     if shown is None:
         return Signatures(envelope, False, None, None)
     node_key = verify(shown.node_key, node_key_message(evidence.uuid, shown.node_key), shown.node_key_signature)
@@ -396,14 +393,6 @@ def _wrong_signatures(evidence: Evidence, signatures: Signatures, ca: bytes) -> 
 def blocks_of(shown: SecurityTeds) -> tuple[tuple[int, int, str], ...]:
     """Return fields 108 as ``facts`` list them: channel, access code, SHA-256 as 64 hex digits."""
     return tuple((channel, code, digest.hex()) for (channel, code), digest in shown.signed_blocks.items())
-
-
-def _signed_by(point: bytes, message: bytes, der: bytes) -> bool:
-    try:
-        public_key(point).verify(der, message, ec.ECDSA(hashes.SHA256()))
-    except (InvalidSignature, BadDataError):
-        return False
-    return True
 
 
 def _subject(subject: object) -> tuple[bytes, str]:
@@ -488,9 +477,10 @@ def _require_plain(value: object, depth: int = _DEPTH) -> None:
         return
     if not depth or kind not in (dict, list):
         raise BadDataError("The facts hold something else than texts, whole numbers, lists and null.")
-    for member in value.values() if isinstance(value, dict) else value:  # type: ignore[attr-defined]
-        if type(member) is not str:  # the most of them, without a call
-            _require_plain(member, depth - 1)
+    for member in value.values() if kind is dict else value:  # type: ignore[attr-defined, union-attr]
+        own = type(member)
+        if own is not str and member is not None and (own is not int or not 0 <= member <= LAST_U32):
+            _require_plain(member, depth - 1)  # for few of them: each call costs more than the look
 
 
 def _short(steps: list[Any]) -> list[Any]:
