@@ -24,7 +24,7 @@ SLICE = 0.004  # seconds between looks at what waits
 REST = 0.003  # seconds that frames gather on one link: to be woken for each of them costs more than to read it
 GATHER = 0.012  # seconds that messages wait to be opened and calibrated together: of a tick's 20 ms to its sink
 HEARD_OUT = 0.25  # seconds for the last message that is wanted to come
-LOOKED_AT = 10.0  # seconds for the hearing thread to look at what has come: it lacks a processor, or hangs
+LOOKED_AT = 2.0  # seconds for the hearing thread to look at what has come: a node is let go within 4 s
 MOST_EARLY = 512  # messages of a stream that came before the reply to its Subscribe was looked at
 
 
