@@ -144,11 +144,12 @@ def test_a_recovery_key_that_openssl_made(home: Path, tmp_path: Path) -> None:
 
 
 OTHER_MOMENTS = pytest.mark.nightly(
-    "tests/cli/test_backup.py::test_killed_at_any_moment_the_home_is_empty_or_the_station"
+    "tests/cli/test_backup.py::test_killed_at_any_moment_the_home_is_empty_or_the_station[0]; "
+    "tests/faults/test_bench.py cuts a restore at its writes"
 )
 
 
-@pytest.mark.parametrize("seed", [pytest.param(seed, marks=OTHER_MOMENTS if seed % 2 else ()) for seed in range(6)])
+@pytest.mark.parametrize("seed", [pytest.param(seed, marks=OTHER_MOMENTS if seed else ()) for seed in range(6)])
 def test_killed_at_any_moment_the_home_is_empty_or_the_station(
     home: Path, sealed: Path, tmp_path: Path, seed: int
 ) -> None:

@@ -149,7 +149,21 @@ def test_a_bug_is_told_as_one_without_a_traceback(home: Path, monkeypatch: pytes
     assert "secret detail" not in told.out + told.err
 
 
-@pytest.mark.parametrize("words", [["whitelist", "list"], ["nodes"], ["log"], ["doctor"], ["--help"]])
+OTHER_TABLES = pytest.mark.nightly(
+    "tests/cli/test_globals.py::test_a_pipe_and_no_color_have_no_escape_codes: one table of those that are made alike"
+)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        pytest.param(["whitelist", "list"], marks=OTHER_TABLES),
+        ["nodes"],
+        pytest.param(["log"], marks=OTHER_TABLES),
+        ["doctor"],
+        ["--help"],
+    ],
+)
 def test_a_pipe_and_no_color_have_no_escape_codes(home: Path, words: list[str]) -> None:
     call(home, "whitelist", "add", ONE)
     for more in ({}, {"NO_COLOR": "1"}, {"TERM": "xterm-256color", "COLORTERM": "truecolor"}):

@@ -109,6 +109,7 @@ def test_the_ca_key_away_and_back(home: Path, tmp_path: Path) -> None:
     assert unlocked(home, "trust", "ca", "create").code == 0
 
 
+@pytest.mark.nightly("tests/cli/test_help.py::test_the_help_of_no_command_loads_anything_heavy, of every command")
 @pytest.mark.parametrize("words", [["trust"], ["export-keys"], ["import-keys"], ["handover"], ["revoke"], ["init"]])
 def test_help_loads_no_cryptography(words: list[str]) -> None:
     script = (

@@ -328,6 +328,11 @@ def test_by_topics_consumer_node_and_station_may_die(
     assert all(value == pytest.approx(0.0, abs=1e-4) or value == pytest.approx(0.05, abs=1e-4) for value in values)
 
 
+@pytest.mark.nightly(
+    "tests/measure/test_actuator_safety.py::test_a_daemon_whose_bus_is_cut_leaves_it_safe_and_holds_again_when_asked, "
+    "tests/measure/test_actuator_safety.py::test_a_link_that_is_cut_leaves_it_safe_and_the_command_says_so: a cut; "
+    "tests/measure/test_actuator_safety.py::test_by_topics_consumer_node_and_station_may_die[ros1]: by topics"
+)
 def test_by_topics_the_bus_may_be_cut(
     cut_hall: Hall, wire: Hub, ros: Ros1 | Ros2, publishers: list[subprocess.Popen[bytes]]
 ) -> None:

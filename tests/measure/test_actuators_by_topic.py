@@ -44,13 +44,12 @@ def stopped_within(process: Running, seconds: float) -> int:
     return process.out.count('"safe": true') - before + ('"safe": true' in last)
 
 
-SLOWLY = pytest.mark.nightly(
-    "tests/measure/test_actuators_by_topic.py::test_a_topic_drives_an_actuator_until_it_falls_silent[100]: what a "
-    "topic's rate is, no code asks"
+@pytest.mark.nightly(
+    "tests/measure/test_actuator_safety.py::test_by_topics_consumer_node_and_station_may_die[ros1]: silence; "
+    "beyond the limits: tests/ncap/test_by_topics.py::test_beyond_the_limits_nothing_moves_and_the_node_says_why; "
+    "what a topic's rate is, no code asks"
 )
-
-
-@pytest.mark.parametrize("rate", [pytest.param(10, marks=SLOWLY), 100])
+@pytest.mark.parametrize("rate", [10, 100])
 def test_a_topic_drives_an_actuator_until_it_falls_silent(bench: Bench, master: Master, rate: float) -> None:  # noqa: F811
     master.start()
     process = bench.gripper.process

@@ -83,6 +83,11 @@ def test_a_restless_sensor_and_one_at_the_wrap_of_its_raw_values_give_no_point(
     assert not file.exists()
 
 
+@pytest.mark.nightly(
+    "tests/measure/test_capture.py::test_a_calibration_is_captured_fitted_and_written; beside other measurements "
+    "values come by tests/measure/test_carried_on.py::test_what_was_asked_beside_is_carried_on_too, "
+    "tests/measure/test_carried_on.py::test_two_stations_on_one_bus_measure_one_node_side_by_side"
+)
 def test_points_are_captured_while_this_and_another_station_measure(hall: Hall, angle: Shaft, tmp_path: Path) -> None:
     angle.turn("angle", 30_000)
     other = hall.copy("other")

@@ -230,6 +230,11 @@ def test_a_node_that_starts_anew_is_carried_on_with(bench: Bench) -> None:
     assert times == sorted(times), "also over a restart"
 
 
+@pytest.mark.nightly(
+    "tests/measure/test_carried_on.py::test_a_group_that_was_killed_is_carried_on_by_the_same_command, "
+    "tests/measure/recordings/test_record_command.py::"
+    "test_a_recorder_that_is_killed_in_the_middle_leaves_what_info_and_convert_read"
+)
 def test_a_killed_measurement_leaves_a_recording_and_a_node_that_can_be_measured_again(bench: Bench) -> None:
     file = bench.desk.folder / "killed.mcap"
     running = bench.station.start("--json", "measure", bench.gripper.uuid, "--rate", 100, "--to", file, *bench.can)

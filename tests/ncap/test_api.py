@@ -426,6 +426,10 @@ def test_names_are_given_kept_and_taken_back(asked: Client, hand: str) -> None:
     assert asked.node(hand)["channels"][1]["topic"] == "/bench/hand/opening"
 
 
+@pytest.mark.nightly(
+    "tests/ncap/test_api.py::test_a_namesake_that_comes_changes_no_name_that_is_being_published asks for the topics of "
+    "a node that came later, too"
+)
 def test_a_node_that_comes_later_is_published_under_its_own_name(service: Service, asked: Client, hand: str) -> None:
     asked.request("GET", "/names")  # made while the node is unknown
     late = virtual(service, "accelerometer", "late comer")
@@ -514,7 +518,7 @@ def test_a_virtual_transducer_is_either_measured_or_removed(service: Service, as
     with ThreadPoolExecutor(2) as pool:
         for _ in range(3):
             uuid = virtual(service, "load-cell", "short")
-            begun = pool.submit(ask, callers[0], "POST", "/measurements", {"uuids": [uuid]})
+            begun = pool.submit(ask, callers[0], "POST", "/measurements", {"uuids": [uuid], "rate": 20})
             ended = pool.submit(ask, callers[1], "DELETE", f"/virtual/{uuid}", None)
             there = [measurement["uuids"] for measurement in (begun.result(), asked.measurements())[1]]
             assert (begun.result(), ended.result(), there) in ((200, 409, [[uuid]]), (422, 200, []))

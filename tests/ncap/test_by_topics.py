@@ -30,7 +30,14 @@ def hall(tmp_path: Path) -> Iterator[Hall]:
         yield made
 
 
-@pytest.fixture(params=["ros1", "ros2"])
+OTHER_ROS = pytest.mark.nightly(
+    "tests/ncap/test_by_topics.py::test_set_points_move_it_and_whatever_dies_it_is_safe[ros2]; by ROS 1 "
+    "tests/measure/test_actuator_safety.py::test_by_topics_consumer_node_and_station_may_die[ros1]"
+)
+OFF_THE_LIST = pytest.mark.nightly("tests/ncap/test_by_topics.py::test_off_the_whitelist_it_is_let_go_and_measured_on")
+
+
+@pytest.fixture(params=[pytest.param("ros1", marks=OTHER_ROS), "ros2"])
 def ros(request: pytest.FixtureRequest, master: Master) -> Iterator[Ros1 | Ros2]:  # noqa: F811
     with ros_of(request.param, master) as made:
         yield made
@@ -157,7 +164,7 @@ def test_off_the_whitelist_it_is_let_go_and_measured_on(
         service.end()
 
 
-@pytest.mark.parametrize("how", ["daemon", "measurement", "whitelist"])
+@pytest.mark.parametrize("how", ["daemon", "measurement", pytest.param("whitelist", marks=OFF_THE_LIST)])
 def test_without_leave_nobody_listens(hall: Hall, master: Master, publishers: Publishers, how: str) -> None:  # noqa: F811
     master.start()
     ros = Ros1(master)
@@ -174,6 +181,11 @@ def test_without_leave_nobody_listens(hall: Hall, master: Master, publishers: Pu
         service.end()
 
 
+@pytest.mark.nightly(
+    "tests/measure/test_actuator_safety.py::test_the_dead_man_of_a_daemon_is_the_one_that_it_was_started_with; that a "
+    "measurement has it: "
+    "tests/page/test_flows.py::test_who_measures_says_whether_topics_may_move_actuators_and_when_these_are_safe"
+)
 def test_a_measurement_without_a_dead_man_has_the_daemons(hall: Hall, master: Master) -> None:  # noqa: F811
     master.start()
     with listening(hall, Ros1(master), "--dead-man", 700, dead_man=None) as service, service.client() as asked:

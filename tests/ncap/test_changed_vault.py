@@ -97,8 +97,8 @@ def test_nodes_of_a_locked_ncap_wait_quietly_and_are_measured_again_when_it_is_u
     home, asked = running.station.home, running.client()
     nodes = [virtual(running), virtual(running, name="other")]
     lock_out(running)
-    asked.request("POST", "/measurements", {"uuids": nodes[:1]})
-    asked.request("POST", "/measurements", {"match": "name:other"})
+    asked.request("POST", "/measurements", {"uuids": nodes[:1], "rate": 20})
+    asked.request("POST", "/measurements", {"match": "name:other", "rate": 20})
 
     def in_state(state: str, why: str) -> bool:
         reports = [asked.node(uuid)["measuring"] or {"state": "none", "why": ""} for uuid in nodes]

@@ -127,8 +127,21 @@ def test_measure_ends_with_the_reason_and_marks_its_recording(hall: Hall, decisi
     assert decision.why in file.read_text()
 
 
-@pytest.mark.parametrize("selected", ["uuids", "match"])
-@pytest.mark.parametrize("decision", DECISIONS.values(), ids=DECISIONS)
+OTHER_SELECTION = pytest.mark.nightly(
+    "tests/ncap/test_decided_today.py::test_ncap_releases_the_node_moves_it_no_more_and_marks_its_recording: each "
+    "decision, and each selection"
+)
+IN_THE_GATE = {("trust removed", "uuids"), ("revoked", "match"), ("unlisted", "uuids")}
+
+
+@pytest.mark.parametrize(
+    ("decision", "selected"),
+    [
+        pytest.param(decision, how, marks=() if (name, how) in IN_THE_GATE else OTHER_SELECTION, id=f"{name}-{how}")
+        for name, decision in DECISIONS.items()
+        for how in ("uuids", "match")
+    ],
+)
 def test_ncap_releases_the_node_moves_it_no_more_and_marks_its_recording(
     hall: Hall, decision: Decision, selected: str
 ) -> None:

@@ -319,6 +319,7 @@ def test_the_measurement_of_a_board_pauses_and_that_of_another_one_does_not(benc
         assert "let go for update" not in told(bench, two)[before[two.uuid] :]
 
 
+@pytest.mark.nightly("tests/e2e/test_update.py::test_a_measurement_beside_an_update_loses_nothing")
 @pytest.mark.realtime
 def test_no_value_of_a_measured_board_is_lost_beside_an_update(bench: Bench) -> None:
     one, two = bench.boards

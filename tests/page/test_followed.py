@@ -133,7 +133,12 @@ def test_a_service_without_a_link_says_how_to_add_one_until_it_has_one(browser: 
             assert after.locator("p:visible", has_text=told).count() == 0
 
 
-@pytest.mark.parametrize("width", [360, 1600])
+WIDE = pytest.mark.nightly(
+    "tests/page/test_followed.py::test_long_names_fit_the_window[360]: what fits the narrow window fits the wide one"
+)
+
+
+@pytest.mark.parametrize("width", [360, pytest.param(1600, marks=WIDE)])
 def test_long_names_fit_the_window(browser: Browser, lab: Lab, width: int) -> None:
     """A file of 75 letters pushed the buttons out of the window."""
     uuid, name = lab.nodes["hand"].uuid, "run" * 25

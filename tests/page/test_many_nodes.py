@@ -117,7 +117,13 @@ def test_an_act_on_many_nodes_names_who_was_refused_and_does_the_rest(browser: B
         page.get_by_text("2 nodes selected, 2 of them not listed").wait_for()
 
 
-@pytest.mark.parametrize("width", [360, 1600])
+WIDE = pytest.mark.nightly(
+    "tests/page/test_many_nodes.py::test_a_group_of_a_hundred_nodes_has_a_card_of_a_windows_size_in_order[360]: "
+    "the narrow window is the harder one"
+)
+
+
+@pytest.mark.parametrize("width", [360, pytest.param(1600, marks=WIDE)])
 def test_a_group_of_a_hundred_nodes_has_a_card_of_a_windows_size_in_order(
     browser: Browser, crowd: Lab, width: int
 ) -> None:

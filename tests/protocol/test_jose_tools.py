@@ -117,6 +117,12 @@ OF_A_THOUSAND = pytest.mark.nightly(
 )
 
 
+OF_BOTH = pytest.mark.nightly(
+    "tests/protocol/test_jose_tools.py::test_we_open_the_others_bundle, for two receivers with 1 node, for "
+    "one with 10,000"
+)
+
+
 @pytest.mark.parametrize(
     "count", [1, pytest.param(1_000, marks=OF_A_THOUSAND), pytest.param(10_000, marks=pytest.mark.slow)]
 )
@@ -129,9 +135,16 @@ def test_the_other_opens_our_bundle(other, count):
 
 
 @pytest.mark.parametrize(
-    "count", [1, pytest.param(1_000, marks=OF_A_THOUSAND), pytest.param(10_000, marks=pytest.mark.slow)]
+    ("receivers", "count"),
+    [
+        pytest.param(RECEIVERS[:1], 1, id="one receiver-1"),
+        pytest.param(RECEIVERS, 1, id="two receivers-1"),
+        pytest.param(RECEIVERS[:1], 1_000, id="one receiver-1000", marks=OF_A_THOUSAND),
+        pytest.param(RECEIVERS, 1_000, id="two receivers-1000", marks=OF_A_THOUSAND),
+        pytest.param(RECEIVERS[:1], 10_000, id="one receiver-10000", marks=pytest.mark.slow),
+        pytest.param(RECEIVERS, 10_000, id="two receivers-10000", marks=[pytest.mark.slow, OF_BOTH]),
+    ],
 )
-@pytest.mark.parametrize("receivers", [RECEIVERS[:1], RECEIVERS], ids=["one receiver", "two receivers"])
 def test_we_open_the_others_bundle(other, count, receivers):
     made = bundle(count, to=receivers)
     octets = other.encrypt(other.sign(payload_of(made), SENDER, HEADER), receivers, PROTECTED)
