@@ -358,7 +358,7 @@ def repetition_request(probe: Probe) -> str:
     """Check that a repeated Request gets the stored reply and does not run again: nonceN, En and the agreement stay."""
     line, command = probe.resending, request(StrangerStation.make().request())
     first = _stranger_asks(probe, command)
-    again = decode_reply(line.again(command.encode()))
+    again = decode_reply(line.resend(command.encode()))
     text = "the stored reply is due, another one came. It was run again." if again.ok else describe_reply(again)
     holds(again == first, f"Request (128.1) repeated: {text}")
     return f"the stored {len(first.payload)} octets"
@@ -375,7 +375,7 @@ def reset_ends_request(probe: Probe) -> str:
 @rule("confirm-other-link", "Key agreement", Stage.FACTORY)
 def confirm_other_link(probe: Probe) -> str:
     """Check that a Confirm from another link than its Request gets 2 and keeps the pending agreement."""
-    other = probe.beside(1)
+    other = probe.from_station(1)
     stranger_asks(probe)
     seen = other.refused(_WRONG_CONFIRM, Reason.WRONG_STATE, "from another station's address")
     probe.refused(_WRONG_CONFIRM, Reason.BAD_TAG, "then from the one of the Request, tagS wrong")
@@ -517,7 +517,7 @@ def confirm_other_session(probe: Probe) -> str:
 @rule("confirm-beside", "Key agreement", Stage.KEYED)
 def confirm_beside(probe: Probe) -> str:
     """Check that a Confirm in another station's session gets 2 and keeps the pending agreement."""
-    other = probe.beside(1)
+    other = probe.from_station(1)
     probe.sealed_good(StationAgreement(probe.station, probe.uuid).request())
     seen = other.sealed_refused(_WRONG_CONFIRM, Reason.WRONG_STATE, "of a Request in another session")
     probe.sealed_refused(_WRONG_CONFIRM, Reason.BAD_TAG, "then in the session of the Request, tagS wrong")
@@ -556,7 +556,7 @@ def confirm_ends_sessions(probe: Probe) -> str:
     own, others = probe.open(), []
     probe.sealed_good(IDENTIFY)
     if isinstance(probe.contact.link, MultiStationLink):
-        others = [probe.beside(1), probe.beside(2)]
+        others = [probe.from_station(1), probe.from_station(2)]
         others[0].open()
         others[0].sealed_good(IDENTIFY)
         others[1].open()  # half-open: nothing is sealed in it

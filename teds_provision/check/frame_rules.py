@@ -73,7 +73,7 @@ class _Stranger:
         """Send one frame to the node, or to another address."""
         self._frames.send(physical_id(node or self.node, self.own), padded(data, fd=self.fd), fd=self.fd)
 
-    def everyone(self, data: bytes) -> None:
+    def send_functional(self, data: bytes) -> None:
         """Send one functional frame."""
         self._frames.send(FUNCTIONAL | self.own, data, fd=self.fd)
 
@@ -200,7 +200,7 @@ def can_functional(probe: Probe) -> str:
     asked = (security_command(Function.LIST), ABOUT, security_command(Function.OPEN), security_command(Function.CLOSE))
     with _stranger(probe) as stranger:
         for command in asked:
-            stranger.everyone(single(_body(stranger.transaction(), command), fd=stranger.fd))
+            stranger.send_functional(single(_body(stranger.transaction(), command), fd=stranger.fd))
         frame = stranger.next(_QUIET)
         if frame is not None:
             stranger.end()

@@ -221,10 +221,10 @@ class Probe:
             raise NotApplicableError(f"Needs single CAN frames. {OVER_CAN}")
         return link
 
-    def beside(self, number: int) -> Probe:
+    def from_station(self, number: int) -> Probe:
         """Return the same node for another base station, ``number`` 1 or 2: with a separate line and session."""
         other = Probe(self.contact, self.heard)
-        other.line, other.key, other.okm = self.bus.beside(self.free_source(number)), self.key, self.okm
+        other.line, other.key, other.okm = self.bus.from_station(self.free_source(number)), self.key, self.okm
         other.credentials = self.credentials
         return other
 

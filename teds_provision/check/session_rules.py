@@ -241,7 +241,7 @@ def sealed_only_sealed(probe: Probe) -> str:
 @rule("two-sessions", "Sessions", Stage.SESSION)
 def two_sessions(probe: Probe) -> str:
     """Check that a node has room for two sessions, one for each link, with separate counters."""
-    other = probe.beside(1)
+    other = probe.from_station(1)
     for _ in range(2):
         probe.sealed_good(IDENTIFY)
         other.sealed_good(IDENTIFY)
@@ -254,7 +254,7 @@ def two_sessions(probe: Probe) -> str:
 @rule("stranger-ends-nothing", "Repetition", Stage.SESSION)
 def stranger_ends_nothing(probe: Probe) -> str:
     """Check that plain requests of a third station end no session of the two others: it has a separate stored reply."""
-    other, stranger = probe.beside(1), probe.beside(2)
+    other, stranger = probe.from_station(1), probe.from_station(2)
     probe.sealed_good(IDENTIFY)
     other.sealed_good(IDENTIFY)
     asked = (IDENTIFY, security_command(Function.LIST), security_command(Function.PROVE, os.urandom(CHALLENGE_OCTETS)))
@@ -277,7 +277,7 @@ def stranger_ends_nothing(probe: Probe) -> str:
 @rule("session-bound", "Sessions", Stage.SESSION)
 def session_bound(probe: Probe) -> str:
     """Check that a session, and a half-open Open, belong to one pair of addresses: from another one Sealed gets 2."""
-    other = probe.beside(1)
+    other = probe.from_station(1)
     for what in ("of a half-open Open", "of a session"):
         if what == "of a half-open Open":
             probe.open()
@@ -310,7 +310,7 @@ class _RepeatedIdentify:
 
     def again(self, after: str = "") -> None:
         """Raise RuleBrokenError unless the stored reply comes."""
-        second = self._noted(self._line.again, ", again")
+        second = self._noted(self._line.resend, ", again")
         came = describe_reply(decode_reply(second))
         text = f"Sealed (128.4) repeated{after}: the stored reply is due, {came} came."
         holds(second == self.first, text)
@@ -333,7 +333,7 @@ def repetition_open(probe: Probe) -> str:
     session = StationSession(probe.link_key, probe.uuid)
     frame = session.open(counter).encode()
     first = probe.octets(frame, "Open (128.3), for repeating")
-    again = decode_reply(line.again(frame))
+    again = decode_reply(line.resend(frame))
     holds(again == first, f"Open (128.3) repeated: the stored reply is due, {describe_reply(again)} came.")
     session.accept(first.payload)
     probe.session = session
@@ -346,7 +346,7 @@ def repetition_open(probe: Probe) -> str:
 def repetition_everyone(probe: Probe) -> str:
     """Check that a functional Identify neither uses nor replaces the stored reply, and ends no session."""
     bus, sent = probe.bus, _RepeatedIdentify(probe)
-    holds(bool(bus.everyone()), "Identify (128.7), functional: no reply.")
+    holds(bool(bus.identify_functional()), "Identify (128.7), functional: no reply.")
     sent.again(" after a functional Identify")
     probe.sealed_good(IDENTIFY)
     return "the stored reply, after a functional Identify"
@@ -355,7 +355,7 @@ def repetition_everyone(probe: Probe) -> str:
 @rule("repetition-two", "Repetition", Stage.SESSION)
 def repetition_two(probe: Probe) -> str:
     """There is room for the stored replies of two links."""
-    other = probe.beside(1)
+    other = probe.from_station(1)
     first, second = _RepeatedIdentify(probe), _RepeatedIdentify(other)
     first.again(" after another station's request")
     second.again()
@@ -399,7 +399,7 @@ def address_moves(probe: Probe) -> str:
     probe.sealed_refused(_set_address(0), Reason.BAD_FORM, "address 0 within 10 s")
     probe.sealed_good(_set_address(target))
     if isinstance(probe.contact.link, MultiStationLink):
-        there = probe.contact.link.there(home)
+        there = probe.contact.link.identify_at(home)
         holds(there is None, f"After Set CAN address a node still answers at {home}.")
     return f"from {home} to {target}; 17 for another one within 10 s"
 
@@ -408,7 +408,7 @@ def _free_address(probe: Probe, home: int) -> int:
     link = probe.contact.link
     for step in range(1, LAST_ADDRESS):
         address = (home - 1 + 53 * step) % LAST_ADDRESS + 1
-        if not isinstance(link, MultiStationLink) or link.there(address) is None:
+        if not isinstance(link, MultiStationLink) or link.identify_at(address) is None:
             return address
     raise NotApplicableError("Every CAN address is in use here: disconnect other boards.")
 
@@ -424,7 +424,7 @@ def _moved(probe: Probe, home: int, target: int) -> StationSession:
     except (RuleBrokenError, LinkError):
         if not isinstance(probe.contact.link, MultiStationLink):
             raise
-        there = probe.contact.link.there(target)
+        there = probe.contact.link.identify_at(target)
         if there is None or there.uuid != probe.uuid:
             raise
         probe.session = None

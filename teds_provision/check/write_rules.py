@@ -184,7 +184,7 @@ def staging_shared(probe: Probe) -> str:
 
     17 comes after 4 and 18, and what is staged stays; it goes when its session ends.
     """
-    other, block = probe.beside(1), absent(probe)
+    other, block = probe.from_station(1), absent(probe)
     good = _example(block)
     probe.sealed_good(write_teds(*block, 0, good))
     other.sealed_refused(write_teds(*block, 1, b"\0"), Reason.BAD_FORM, "another session, offset 1 with nothing staged")

@@ -115,7 +115,7 @@ class App:
         except BrokenPipeError:
             raise
         except OSError as error:  # the work is done and safe; a script that gets no answer must hear of it
-            nowhere(sys.stdout)
+            discard_output(sys.stdout)
             text = f"Cannot write the result to stdout: {error.strerror}."
             if self.json:
                 raise StoreError(text, hint="The work itself is done. Free some space before the next run.") from error
@@ -334,7 +334,7 @@ def _as_question(question: str) -> str:
     return folded(sanitize(question), sys.stderr, spare=len(_BEHIND))
 
 
-def nowhere(stream: TextIO) -> None:
+def discard_output(stream: TextIO) -> None:
     """Send what is still buffered nowhere: the interpreter would fail on it once more at its end."""
     with suppress(OSError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)

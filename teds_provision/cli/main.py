@@ -14,7 +14,7 @@ import click
 
 from teds_provision import __version__
 from teds_provision.cli.config_file import Defaults, anchored, config_path, read_config
-from teds_provision.cli.context import App, nowhere, print_message
+from teds_provision.cli.context import App, discard_output, print_message
 from teds_provision.cli.option_names import PARAMETERS
 from teds_provision.cli.table import COMMANDS, SECTIONS
 from teds_provision.errors import (
@@ -275,7 +275,7 @@ def _misused(arguments: list[str], error: click.ClickException) -> int:
 def _bad_file_name(arguments: list[str], error: OSError) -> int:
     """Handle lost output: the reader has gone, or the disk is full; the work was done before."""
     if isinstance(error, BrokenPipeError):
-        nowhere(sys.stdout)
+        discard_output(sys.stdout)
         return BROKEN_PIPE
     if error.errno in _NO_NAMES and error.filename is not None:
         name = str(error.filename)
@@ -284,7 +284,7 @@ def _bad_file_name(arguments: list[str], error: OSError) -> int:
         return _fail(arguments, NotFoundError.exit_code, NotFoundError.code, text, "")
     if error.errno not in _FULL:
         return _bug(arguments, error)
-    nowhere(sys.stdout)  # a table that was being printed; what reads a store or a file has errors of its own
+    discard_output(sys.stdout)  # a table that was being printed; what reads a store or a file has errors of its own
     text = f"Cannot write the result to stdout: {error.strerror}."
     if _wants(arguments, "--json"):
         return _fail(arguments, StoreError.exit_code, StoreError.code, text, "")

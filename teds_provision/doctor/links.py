@@ -285,13 +285,13 @@ def can(system: System) -> Iterator[Finding]:
         while (left := until - time.monotonic()) > 0:
             frame = bus.receive(left)
             if frame is not None:
-                rivals.heard(frame)
+                rivals.check_frame(frame)
     except LinkError as failure:
         yield Finding("can", "failed", failure.message, failure.hint)
         return
     finally:
         bus.close()
-    if rivals.seen():
+    if rivals.seen_within():
         yield Finding("can", "warning", rivals.text, rivals.hint)
     else:
         yield Finding("can", "ok", f"{bus.spec.text} opens.")

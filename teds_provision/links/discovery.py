@@ -73,7 +73,7 @@ class SightingSink(Protocol):
     def announced(self, place: str, announce: Announce) -> None:
         """Take an Announce; a hint that any device can send."""
 
-    def awaits(self, announce: Announce) -> bool:
+    def is_awaited(self, announce: Announce) -> bool:
         """Return True if a thread waits for the node that this claims to be."""
 
     def is_welcome(self, announce: Announce) -> bool:
@@ -188,7 +188,7 @@ class PolledDiscovery(Discovery):
         self._round_begins()
         self.failure = None
         try:
-            for contact in self._port.everyone(seconds=2 * LEAST, notice=_ignore):
+            for contact in self._port.find_all(seconds=2 * LEAST, notice=_ignore):
                 sighting = Sighting(contact.identity, contact.line, self._port, time.monotonic())
                 self._presence.add_sighting(sighting)
         except NoNodeError:

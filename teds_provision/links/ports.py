@@ -139,7 +139,7 @@ class Link(Protocol):
 class ResendLink(Protocol):
     """A link on which a request can be sent again on purpose, to see what the node makes of it."""
 
-    def again(self, frame: bytes) -> bytes:
+    def resend(self, frame: bytes) -> bytes:
         """Send the last frame of ``exchange`` once more, under its transaction, as after a lost reply.
 
         Returns and raises as ``exchange`` does (profile.md, "Repetition").
@@ -155,16 +155,16 @@ class MultiStationLink(Protocol):
 
     address: int
 
-    def beside(self, source: int) -> Link:
+    def from_station(self, source: int) -> Link:
         """Return a link to the same node from another station's address (0xF1 to 0xF7), over the same adapter."""
 
-    def everyone(self) -> bytes:
+    def identify_functional(self) -> bytes:
         """Send a functional Identify from this link's own station.
 
         Return this node's reply frame, empty if none came.
         """
 
-    def there(self, address: int) -> Identity | None:
+    def identify_at(self, address: int) -> Identity | None:
         """Return the Identify at this address within a second; None if there is no answer."""
 
     def begin(self, octets: int) -> bytes:
@@ -332,7 +332,7 @@ class Port(Protocol):
         Foreign tags and unwanted nodes are reported through ``notice`` and waited past.
         """
 
-    def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
+    def find_all(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
         """Wait until any node is tapped, or answers on the bus; return all that answer. Raises NoNodeError.
 
         A link that carries many listens for at least ``listen`` seconds, however soon the first ones answered; a node

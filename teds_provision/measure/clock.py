@@ -400,7 +400,7 @@ class MonotonicStamps:
             self._last = float(held[-1])
         return held
 
-    def straight(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+    def stamp_line(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the same for at least one time, all on a straight line: mostly there is nothing to do."""
         if times[-1] >= times[0] >= self._last:
             self._last = float(times[-1])

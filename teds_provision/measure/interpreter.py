@@ -116,7 +116,7 @@ class StreamInterpreter:
         host, rate, bound = self._clock.line(first.tick, first.tick + span)
         times = seconds * rate
         times += host / 1e9
-        times = self._monotone.straight(times)
+        times = self._monotone.stamp_line(times)
         setting, offset = self._host.present
         return Block(
             uuid=self._uuid,

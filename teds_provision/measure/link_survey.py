@@ -48,7 +48,7 @@ def look(station: Station, places: Sequence[str]) -> Iterator[LinkSurvey]:
             with beside(station, LinkSettings().at(place), "looking") as links:
                 port = open_place(links.places[0])
                 try:
-                    contacts = port.everyone(seconds=_LISTEN_SECONDS, notice=notices.append)
+                    contacts = port.find_all(seconds=_LISTEN_SECONDS, notice=notices.append)
                 finally:
                     port.close()
         except NoNodeError:

@@ -205,7 +205,7 @@ class NodeSupervisor:
             self.ready.set()
 
     def _is_elsewhere(self) -> bool:
-        return self._buses.presence.elsewhere(self.uuid)
+        return self._buses.presence.has_other_place(self.uuid)
 
     def _is_shared(self, error: TedsProvisionError) -> PolicyError | None:
         """Return the error of a node that lacks room for this stream, because another process has one there too.

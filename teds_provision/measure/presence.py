@@ -107,12 +107,12 @@ class Presence:
         for notify in uuids:
             notify()
 
-    def awaits(self, announce: Announce) -> bool:
+    def is_awaited(self, announce: Announce) -> bool:
         """Return True if a thread waits for the node that this claims to be."""
         with self._turn:
             return any(uuid_crc(uuid) == announce.crc for uuid in self._missing)
 
-    def welcome(self, uuids: Iterable[bytes]) -> None:
+    def expect(self, uuids: Iterable[bytes]) -> None:
         """Name nodes to be asked at once when they announce themselves, although no thread waits for one."""
         self._welcome = frozenset(map(uuid_crc, uuids))
 
@@ -168,7 +168,7 @@ class Presence:
             self._seen.get(sighting.uuid, {}).pop(place, None)
             self._wrong.setdefault(sighting.uuid, {})[place] = time.monotonic()
 
-    def elsewhere(self, uuid: bytes) -> bool:
+    def has_other_place(self, uuid: bytes) -> bool:
         """Return True if it answers, or ever answered, at more than one place, or beside another board at its own.
 
         Waits for the answer of a twin, or until discovery is sure of two boards at one address. A place that was wrong

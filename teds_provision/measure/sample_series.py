@@ -96,7 +96,7 @@ def require_still(settled: SampleSeries) -> SampleStatistics:
     reading = reading_of(settled.calibrated(), turn_of(own, full_turn=channel.full_turn))
     span = abs(channel.high - channel.low)
     least = channel.stated_uncertainty if channel.stated_uncertainty > 0 else _UNSTATED * span
-    if not least > 0 or not reading.restless(own.unit.difference_from_si(least)):
+    if not least > 0 or not reading.is_unstable(own.unit.difference_from_si(least)):
         return reading
     moves = abs(reading.drift) > reading.spread
     amount = own.unit.difference_to_si(abs(reading.drift) if moves else reading.spread)

@@ -914,7 +914,7 @@ class MeasurementSupervisor:
         version, membership = self._station.version(), running.membership
         if now - self._welcomed >= self._waits.keys:
             self._welcomed = now
-            self._buses.presence.welcome({uuid for uuid, *_ in self._station.keys.all_key_names()})
+            self._buses.presence.expect({uuid for uuid, *_ in self._station.keys.all_key_names()})
         changed = version != running.version or running.asked_anew
         if not changed or now - running.followed < self._waits.selection:
             return

@@ -68,7 +68,7 @@ def take_in(station: Station, transport: Transport, views: Views, now: datetime)
         return ParcelCounts(0, 0)
     _drop_outlived(station, now)
     reader = _Reader(station, roster, views, now)
-    taken = sum(reader.again(row) for row in station.plant.parcels.all("in", "later"))
+    taken = sum(reader.judge_again(row) for row in station.plant.parcels.all("in", "later"))
     for parcel in transport.parcels(station.fingerprint):
         done = reader.process_parcel(parcel)
         if done is not None:
@@ -102,7 +102,7 @@ class _Reader:
         self.station, self.roster, self.views, self.now = station, roster, views, now
         self.quiet = silent_stations(station, roster, now)
 
-    def again(self, row: ParcelRow) -> bool:
+    def judge_again(self, row: ParcelRow) -> bool:
         """Judge once more what came before its sender's pages did.
 
         A sender that is still unknown is for an operator.

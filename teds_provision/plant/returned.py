@@ -55,7 +55,7 @@ def _digest(station: Station, database: Returned, roster: Roster) -> str:
     return digest.hexdigest()
 
 
-def own(
+def own_pages(
     station: Station, database: Returned | None, roster: Roster, known: Collection[str], *, always: bool = False
 ) -> list[Page]:
     """Return pages under this station's own key that others handed in while it was no member, but for ``known`` (H).

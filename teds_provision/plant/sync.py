@@ -67,7 +67,7 @@ class SyncResult:
 
 
 @contextmanager
-def alone(station: Station) -> Iterator[None]:
+def sync_lock(station: Station) -> Iterator[None]:
     """Hold the lock of one sync per home for the block: a second one waits 10 s, then StoreLockedError."""
     lock = StoreLock(station.home, command="registry sync", notice=station.notice, file=LOCK_FILE)
     with lock:
@@ -81,7 +81,7 @@ def sync(station: Station, transport: Transport, *, connected: bool = True) -> S
     NotMemberError, ForkError, PolicyError.
     """
     station.unlock()
-    with alone(station):
+    with sync_lock(station):
         done = SyncResult()
         done.rosters = [
             roster.version for roster, how, _ in _rosters(station, transport, done) if how.startswith("taken")
@@ -175,7 +175,7 @@ def _own_head(station: Station, transport: Transport, roster: Roster, done: Sync
     known = {(n, hash) for n, hash, _ in station.plant.pages.links(chain.id)}
     above = max(0, joined.acknowledged - 1) if connected and not restored else 0
     appended = _own_pages(station, transport, roster, done, above)
-    found = appended + returned.own(station, transport.returned, roster, {page.hash for page in appended})
+    found = appended + returned.own_pages(station, transport.returned, roster, {page.hash for page in appended})
     new = [page for page in found if (page.number, page.hash) not in known]
     if new and restored and _follows(chain, new):
         take_back(station, roster, new)
@@ -360,7 +360,7 @@ def resume(station: Station, transport: Transport) -> int:
     adopted.
     """
     station.unlock()
-    with alone(station):
+    with sync_lock(station):
         roster = require_roster(station)
         chain = own_chain(station)
         found = _under_our_key(station, transport, roster)
@@ -384,7 +384,7 @@ def resume(station: Station, transport: Transport) -> int:
     return len(new)
 
 
-def strange(station: Station, transport: Transport) -> list[Page]:
+def unknown_pages(station: Station, transport: Transport) -> list[Page]:
     """Return the unknown pages under this station's key: what :func:`resume` adopts."""
     return _strange(station, _under_our_key(station, transport, require_roster(station)))
 
@@ -392,7 +392,7 @@ def strange(station: Station, transport: Transport) -> list[Page]:
 def _under_our_key(station: Station, transport: Transport, roster: Roster) -> list[Page]:
     transport.registry()  # a database is checked again
     found, _ = fetching.read_pages(transport.pages(station.fingerprint, 0), roster, station.fingerprint)
-    return found + returned.own(station, transport.returned, roster, {page.hash for page in found}, always=True)
+    return found + returned.own_pages(station, transport.returned, roster, {page.hash for page in found}, always=True)
 
 
 def _strange(station: Station, found: Sequence[Page]) -> list[Page]:

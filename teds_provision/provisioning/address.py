@@ -68,5 +68,5 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
 def _is_at(node: Conversation, address: int) -> bool:
     """Return True if this node answers at the new address; its answer is a hint, as every address is."""
     link = node.contact.link
-    there = link.there(address) if isinstance(link, MultiStationLink) else None
+    there = link.identify_at(address) if isinstance(link, MultiStationLink) else None
     return there is not None and there.uuid == node.uuid

@@ -288,7 +288,7 @@ def agree(
             return _agree(station, node, who, rotate=rotate, newcomer=newcomer, word=word, again=again > 0)
         except (NodeSilentError, GarbledError):
             again += 1
-            if again == _BEGINNINGS or not node.lives():
+            if again == _BEGINNINGS or not node.is_alive():
                 raise
             node.forget()
 

@@ -337,7 +337,7 @@ class BatchRun:
                 "--all needs a bus: a reader sees one node at a time.",
                 hint="Use --watch to provision boards one tap after the other.",
             )
-        everyone = port.everyone(seconds=self._links.timeout, notice=self._reporter.notice, listen=self._links.listen)
+        everyone = port.find_all(seconds=self._links.timeout, notice=self._reporter.notice, listen=self._links.listen)
         found = drop_duplicate_uuids(everyone, self._reporter.notice)
         contacts = [contact for contact in found if self._is_meant(contact)]
         if not contacts:

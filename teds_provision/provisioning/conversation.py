@@ -305,7 +305,7 @@ class Conversation:
             except (NodeSilentError, GarbledError) as failure:
                 torn += isinstance(failure, GarbledError)
                 repeats += isinstance(failure, NodeSilentError)
-                if repeats > _REPEATS or torn > _TORN_REPEATS or time.monotonic() > until or not self.lives():
+                if repeats > _REPEATS or torn > _TORN_REPEATS or time.monotonic() > until or not self.is_alive():
                     raise
 
     @property
@@ -317,7 +317,7 @@ class Conversation:
         """True if only the checksums of single frames protect commands and replies: a bus."""
         return self.contact.link.capabilities.many
 
-    def lives(self) -> bool:
+    def is_alive(self) -> bool:
         """Return True if a node that a message did not reach still answers.
 
         On a bus single frames are lost, nodes are not. Never True at a reader: a node that does not answer there has

@@ -123,7 +123,7 @@ class ImageManager:
             except (NodeSilentError, GarbledError) as lost:
                 failure = lost
             losses += 1
-            if losses > _LOSSES or not self._node.lives():
+            if losses > _LOSSES or not self._node.is_alive():
                 raise failure.cause if isinstance(failure, SessionLostError) else failure
             self._largest = max(_SMALLEST_PACKET, self._largest // 2)
             self._node.reopen()

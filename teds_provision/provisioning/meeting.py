@@ -56,7 +56,7 @@ def meet(
         port = open_port(links)
         try:
             before()
-            contact = pick_single_node(station, port.everyone(seconds=links.timeout, notice=reporter.notice))
+            contact = pick_single_node(station, port.find_all(seconds=links.timeout, notice=reporter.notice))
             with Conversation(contact, notice=reporter.notice) as node:
                 yield node
         finally:
@@ -196,7 +196,7 @@ def meet_everyone(links: LinkSettings, reporter: Reporter) -> Iterator[list[Conv
     """Wait for any node and give a conversation with each that is there: the tapped one, or all on the bus."""
     port = open_port(links)
     try:
-        everyone = port.everyone(seconds=links.timeout, notice=reporter.notice, listen=links.listen)
+        everyone = port.find_all(seconds=links.timeout, notice=reporter.notice, listen=links.listen)
         contacts = drop_duplicate_uuids(everyone, reporter.notice)
         with ExitStack() as stack:
             yield [stack.enter_context(Conversation(contact, notice=reporter.notice)) for contact in contacts]

@@ -225,7 +225,7 @@ def _commit(station: Station, node: Conversation, image: Image, has: Image | Non
             skip = set()  # the node does not hold what it was last read to hold: send everything
             continue
         except (NodeSilentError, GarbledError):
-            if not node.lives():
+            if not node.is_alive():
                 raise
         except SessionLostError:
             pass  # the new session below shows whether only the reply was lost
@@ -281,7 +281,7 @@ def _stage(station: Station, node: Conversation, image: Image, skip: set[BlockId
                 node.request(write_teds(channel, access_code, offset, part), f"TEDS {access_code} of channel {channel}")
             except (NodeSilentError, GarbledError):
                 losses += 1
-                if losses > _LOSSES or not node.lives():
+                if losses > _LOSSES or not node.is_alive():
                     raise
                 piece = max(_SMALLEST_PIECE, min(piece, len(part)) // 2)
                 continue

@@ -130,7 +130,7 @@ class Datasheets:
         """
         row = datasheet_row(image, profile, utc_now())
         with self._store.together():
-            last = self._store.one(
+            last = self._store.first_row(
                 "SELECT digest FROM datasheets WHERE uuid = ? ORDER BY row DESC LIMIT 1", (image.uuid,)
             )
             if last == (row[-2],):

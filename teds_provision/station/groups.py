@@ -70,7 +70,7 @@ class Groups:
 
     def find(self, name: str) -> Group | None:
         """Return one group, None if there is none of exactly this name."""
-        row = self._store.one("SELECT created FROM groups WHERE name = ?", (name,))
+        row = self._store.first_row("SELECT created FROM groups WHERE name = ?", (name,))
         if row is None:
             return None
         members = self._store.execute("SELECT uuid FROM group_members WHERE name = ? ORDER BY uuid", (name,))

@@ -210,7 +210,7 @@ class StationIdentity:
     def _certificate(self, facts: StationRecord, ca: bytes, point: bytes) -> bytes | None:
         if (ca, point) == (facts.ca, facts.point):
             return self._required(facts.signature)
-        row = self._store.one(
+        row = self._store.first_row(
             "SELECT signature FROM certificates WHERE ca = ? AND station = ?",
             (keys.fingerprint(ca), keys.fingerprint(point)),
         )

@@ -284,7 +284,7 @@ class Measurements:
     @property
     def detection(self) -> DetectionMode:
         """How nodes are detected; ``whitelist`` by default."""
-        row = self._store.one("SELECT mode FROM detection")
+        row = self._store.first_row("SELECT mode FROM detection")
         return "whitelist" if row is None else cast(DetectionMode, row[0])
 
     @detection.setter

@@ -283,7 +283,7 @@ class NodeKeys:
     def activate(self, uuid: bytes, key_id: str) -> None:
         """Make this key the active one; another active one goes, pending ones stay. Raises NotFoundError."""
         with self._store.together():
-            if not self._store.one("SELECT 1 FROM keys WHERE uuid = ? AND key_id = ?", (uuid, key_id)):
+            if not self._store.first_row("SELECT 1 FROM keys WHERE uuid = ? AND key_id = ?", (uuid, key_id)):
                 raise NotFoundError(f"The store has no key {key_id} of node {uuid.hex()}.")
             self._store.execute("DELETE FROM keys WHERE uuid = ? AND key_id <> ? AND state = 'active'", (uuid, key_id))
             self._store.execute(

@@ -123,7 +123,7 @@ class Overview:
 
     def is_known(self, uuid: bytes) -> bool:
         """Return True if anything is known of a node."""
-        row = self._store.one(f"SELECT {_IS_KNOWN}", (uuid,))
+        row = self._store.first_row(f"SELECT {_IS_KNOWN}", (uuid,))
         return row is not None and bool(row[0])
 
     def _page(self, uuids: Sequence[bytes]) -> Iterator[NodeOverview]:
@@ -162,7 +162,9 @@ class Overview:
         )
         found: dict[bytes, Origin] = {}
         for (uuid,) in listed:
-            row = self._store.one("SELECT blocks FROM datasheets WHERE uuid = ? ORDER BY row DESC LIMIT 1", (uuid,))
+            row = self._store.first_row(
+                "SELECT blocks FROM datasheets WHERE uuid = ? ORDER BY row DESC LIMIT 1", (uuid,)
+            )
             try:
                 origin = origin_of(unpacked(uuid, row[0]).blocks) if row is not None else None
             except ValueError:  # whoever reads the datasheet itself reports the damage

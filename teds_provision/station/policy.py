@@ -129,7 +129,7 @@ class Policy:
         Raises PolicyError if another key or role has the name: it must be removed first.
         """
         with self._store.together():
-            row = self._store.one("SELECT fingerprint, role FROM trust WHERE name = ?", (record.name,))
+            row = self._store.first_row("SELECT fingerprint, role FROM trust WHERE name = ?", (record.name,))
             if row and row != (record.fingerprint, record.role):
                 raise PolicyError(
                     f"The name {record.name!r} is already taken by the {row[1]} {row[0][:16]}.",

@@ -49,7 +49,7 @@ def place(copy: Station, home: Path) -> None:
 
 def totals(station: Station) -> dict[str, int]:
     """Count whitelist, nodes, keys and trusted keys of a station's store."""
-    count = station._store.one
+    count = station._store.first_row
     return {table: int((count(f"SELECT count(*) FROM {table}") or (0,))[0]) for table in _COUNTED}
 
 

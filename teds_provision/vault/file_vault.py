@@ -12,7 +12,7 @@ from teds_provision.files import read_limited, write_new, write_whole
 from teds_provision.vault.base import Ask
 from teds_provision.vault.master import Material
 from teds_provision.vault.passphrase import PRODUCT, Costs, SealingKey, check_new, unseal, unseal_with
-from teds_provision.vault.software import SoftwareVault, settle
+from teds_provision.vault.software import SoftwareVault, merge_keys
 
 FILE_NAME = "vault.json"
 _FORMAT = "teds-provision-vault/1"
@@ -50,7 +50,7 @@ class FileVault(SoftwareVault):
             return vault
         passphrase = ask("New passphrase for this station's keys", True)
         check_new(passphrase)
-        material = settle(None, restored)
+        material = merge_keys(None, restored)
         key = SealingKey.derive(passphrase, costs=costs)
         content = _sealed(store_id, material, key)
         write_new(path, _octets_of(content), failure=VaultError)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NoReturn, TypeVar
 from teds_provision.errors import KeyringUnavailableError, VaultError
 from teds_provision.vault.base import SERVICE, Ask
 from teds_provision.vault.master import Material
-from teds_provision.vault.software import SoftwareVault, settle
+from teds_provision.vault.software import SoftwareVault, merge_keys
 
 if TYPE_CHECKING:
     from keyring.backend import KeyringBackend
@@ -62,7 +62,7 @@ class KeyringVault(SoftwareVault):
         existing = None if line is None else Material.decode(line)
         if existing is None:
             _probe(name, backend)
-        material = settle(existing, restored)
+        material = merge_keys(existing, restored)
         if material != existing:
             _set(name, backend, entry, material.encode())
         return cls(backend, name, store_id, material)

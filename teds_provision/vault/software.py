@@ -128,7 +128,7 @@ class SoftwareVault(ABC):
     def join(self, restored: str) -> None:
         """Take in what a backup brings (:meth:`secret_material`); raises VaultError if it is of another station."""
         self.refresh()
-        joined = settle(self._material, restored)
+        joined = merge_keys(self._material, restored)
         if joined != self._material:
             self._replace(joined)
 
@@ -144,7 +144,7 @@ class SoftwareVault(ABC):
         """Write ``material`` durably in place of the old one, or raise VaultError and keep the old."""
 
 
-def settle(existing: Material | None, restored: str | None) -> Material:
+def merge_keys(existing: Material | None, restored: str | None) -> Material:
     """Return the keys a vault shall hold: what is there, joined with what a backup brings, or new ones.
 
     Raises VaultError if the backup is of another station than what is there.

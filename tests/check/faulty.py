@@ -62,7 +62,7 @@ class FaultyLink(MemoryLink):
         self.count += 1
         return self.answer(frame)
 
-    def again(self, frame: bytes) -> bytes:
+    def resend(self, frame: bytes) -> bytes:
         self.count += self.runs_again(frame)
         return self.answer(frame)
 
@@ -116,12 +116,12 @@ class FaultyBus(FaultyLink):
             raise NodeSilentError("The reply begins and does not end.")
         return reply
 
-    def beside(self, source: int) -> FaultyBus:
+    def from_station(self, source: int) -> FaultyBus:
         if source not in self.lines:
             replace(self, source=source, repetition=Repetition(), frames=[], lines=self.lines)
         return self.lines[source]
 
-    def everyone(self) -> bytes:
+    def identify_functional(self) -> bytes:
         if self.everyone_counts:
             self.count += 1
             return self.answer(IDENTIFY.encode())
@@ -134,7 +134,7 @@ class FaultyBus(FaultyLink):
             own.end = getattr(self.board, "frames_of", MemoryServer)(own)
         yield own.end
 
-    def there(self, address: int) -> Identity | None:
+    def identify_at(self, address: int) -> Identity | None:
         here = address == self.board.tim.can_address or (self.stays_at_the_old and address == self._first)
         return self.board.tim.identity() if here else None
 

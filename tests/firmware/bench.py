@@ -44,7 +44,7 @@ class Hooks:
                 reading = own.read(channel, argument)
                 return reading.octets, reading.valid
             case "b":
-                return own.bears(channel, octets)
+                return own.accepts(channel, octets)
             case "a":
                 own.points[channel] = octets
                 self._note(channel, int.from_bytes(octets, "big"))

@@ -69,7 +69,7 @@ class Hardware:
         width = self.channels[channel].octets
         return RawReading(((tick // MS + channel) % (1 << 8 * width)).to_bytes(width, "big"))
 
-    def bears(self, channel: int, data_set: bytes) -> bool:
+    def accepts(self, channel: int, data_set: bytes) -> bool:
         return data_set[0] < 0xF0
 
     def apply(self, values: Mapping[int, bytes]) -> None:

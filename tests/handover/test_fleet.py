@@ -156,10 +156,10 @@ def test_who_is_asked_once_is_not_asked_again_when_the_link_fails(pair: tuple[St
     other.pins.put(WhitelistEntry(board.uuid))
     with talk(board, Forgetful(board)) as node:
         who = identify(other, node)
-        monkey = node.lives
-        node.lives = lambda: True  # type: ignore[method-assign]
+        monkey = node.is_alive
+        node.is_alive = lambda: True  # type: ignore[method-assign]
         assert agree(other, node, who, take_over=lambda question, _refusal: asked.append(question)).epoch == 2
-        node.lives = monkey  # type: ignore[method-assign]
+        node.is_alive = monkey  # type: ignore[method-assign]
     assert len(asked) == 1
 
 

@@ -62,8 +62,8 @@ def test_a_node_that_was_seen_is_found_and_one_that_was_not_is_missing_meanwhile
     waiting = threading.Thread(target=lambda: found.append(find(sightings, TWO, seconds=PATIENCE)))
     waiting.start()
     until(sightings.missing)
-    assert sightings.awaits(Announce(9, 2, uuid_crc(TWO)))
-    assert not sightings.awaits(Announce(9, 2, uuid_crc(ONE)))
+    assert sightings.is_awaited(Announce(9, 2, uuid_crc(TWO)))
+    assert not sightings.is_awaited(Announce(9, 2, uuid_crc(ONE)))
     sightings.add_sighting(seen(TWO, 9))
     waiting.join(60)
     assert [sighting.address for sighting in found] == [9]
@@ -75,7 +75,7 @@ class EmptyAir:
     place = "ble:x"
     rounds = 0
 
-    def everyone(self, **_more: object) -> Iterator[Contact]:
+    def find_all(self, **_more: object) -> Iterator[Contact]:
         self.rounds += 1
         raise NoNodeError("Nobody advertises.")
 
@@ -131,7 +131,7 @@ def test_a_copy_that_refuses_is_no_reason_to_give_a_node_up_that_answers_elsewhe
     copy = seen(ONE, 7)
     sightings.add_sighting(copy)
     sightings.wrong(copy)
-    look = functools.partial(sightings.elsewhere, ONE)
+    look = functools.partial(sightings.has_other_place, ONE)
     assert RetryPolicy(60.0).gives_up(unknown, proven=False, elsewhere=look), "nobody else answers"
     threading.Timer(TWIN / 5, sightings.add_sighting, [seen(ONE, 8)]).start()
     assert not RetryPolicy(60.0).gives_up(unknown, proven=False, elsewhere=look)
@@ -146,7 +146,7 @@ def test_a_copy_that_refuses_while_the_node_is_silent_for_a_moment_is_no_reason_
     for silent_then_copy in (8, 7):
         sightings.add_sighting(seen(ONE, silent_then_copy))
         sightings.wrong(seen(ONE, silent_then_copy))
-    look = functools.partial(sightings.elsewhere, ONE)
+    look = functools.partial(sightings.has_other_place, ONE)
     assert not RetryPolicy(60.0).gives_up(unknown, proven=False, elsewhere=look)
 
 

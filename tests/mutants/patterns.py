@@ -276,7 +276,7 @@ PATTERNS = (
     ),
     Pattern(
         "a node on a bus that answers is asked again",
-        "Conversation.lives",
+        "Conversation.is_alive",
         "not self._is_noisy",
         "True",
         "tests/provisioning/test_opening.py",

@@ -34,7 +34,7 @@ def test_an_actuator_begins_and_ends_at_its_low_limit_and_bears_its_range() -> N
     shown: list[ActuatorReading] = []
     board = Board(sheet("gripper"), shown=shown.append)
     assert board.set_point(1) == b"\0\0"
-    assert [board.bears(1, octets) for octets in (b"\0\0", b"\x0f\xff", b"\x10\x00")] == [True, True, False]
+    assert [board.accepts(1, octets) for octets in (b"\0\0", b"\x0f\xff", b"\x10\x00")] == [True, True, False]
     board.apply({1: b"\x08\x00"})
     assert board.set_point(1) == b"\x08\x00"
     board.stop()

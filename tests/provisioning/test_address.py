@@ -41,13 +41,13 @@ def test_over_the_bus_without_a_key_it_is_refused(station: Station, board: Board
 class OneBus(MemoryLink):
     """A line on a bus, where somebody else may be asked as well."""
 
-    def beside(self, source: int) -> MemoryLink:
+    def from_station(self, source: int) -> MemoryLink:
         return self
 
-    def everyone(self) -> bytes:
+    def identify_functional(self) -> bytes:
         return b""
 
-    def there(self, address: int) -> Identity | None:
+    def identify_at(self, address: int) -> Identity | None:
         identity = self.board.tim.identity()
         return identity if identity.can_address == address else None
 

@@ -158,5 +158,5 @@ def test_after_a_lost_message_a_node_on_a_bus_is_asked_whether_it_lives(
 
     link = Silent(board, via=via, tapped=via == "nfc")
     with talk(board, link) as node:
-        assert node.lives() is lives
+        assert node.is_alive() is lives
     assert link.count == int(via == "can" and answers)

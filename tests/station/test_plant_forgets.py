@@ -31,5 +31,5 @@ def test_everything_of_a_registry_goes(station: Station, store: Store) -> None:
         for statement in ROWS.values():
             store.execute(statement)
     station.plant.forget()
-    left = {table: store.one(f"SELECT count(*) FROM {table}") for table in ROWS}
+    left = {table: store.first_row(f"SELECT count(*) FROM {table}") for table in ROWS}
     assert {table for table, row in left.items() if row is None or row[0]} == set()

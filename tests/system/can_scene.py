@@ -76,7 +76,7 @@ def candump(node: dict[str, Any]) -> dict[str, Any]:
         try:
             found = port.find(lambda _: True, seconds=20, notice=quiet, address=node["can_address"])
             found.link.exchange(IDENTIFY)
-            everyone = port.everyone(seconds=20, notice=quiet)
+            everyone = port.find_all(seconds=20, notice=quiet)
         finally:
             port.close()
         time.sleep(2)

@@ -38,15 +38,15 @@ def test_the_mean_of_readings_on_both_sides_of_the_wrap_is_between_them() -> Non
     reading = reading_of(np.array([359.0, 1.0, 358.0, 2.0]), 360.0)
     assert reading.mean % 360 == pytest.approx(0, abs=1e-9)
     assert reading.spread == pytest.approx(math.sqrt(2.5))
-    assert not reading.restless(2.0)
-    assert reading_of(np.array([359.0, 1.0, 358.0, 2.0])).restless(100), "without a turn it is no angle"
+    assert not reading.is_unstable(2.0)
+    assert reading_of(np.array([359.0, 1.0, 358.0, 2.0])).is_unstable(100), "without a turn it is no angle"
 
 
 def test_a_drift_shows_that_hides_in_the_spread() -> None:
     reading = reading_of(np.linspace(0, 1, 32))
     assert reading.drift == pytest.approx(0.516, abs=1e-3)
     assert reading.spread == pytest.approx(0.298, abs=1e-3)
-    assert reading.restless(0.4)
+    assert reading.is_unstable(0.4)
 
 
 @given(st.floats(0, 360), st.floats(0, 3), st.integers(16, 64))

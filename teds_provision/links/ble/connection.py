@@ -75,7 +75,7 @@ class BleConnection:
         async with self._turn:
             self.asking = True
             try:
-                await self.up()
+                await self.connect()
                 return await self._exchange(transaction, message, seconds)
             finally:
                 self.asking = False
@@ -85,7 +85,7 @@ class BleConnection:
         to = self._characteristic(ble.DATA)
         await self._doing(lambda client: client.write_gatt_char(to, b"\0" + message, response=False))
 
-    async def up(self) -> None:
+    async def connect(self) -> None:
         """Connect and subscribe, unless that is done."""
         if self.is_up:
             return
@@ -96,7 +96,7 @@ class BleConnection:
                 except ConnectionLostError as lost:
                     raise NotConnectedError(str(lost)) from lost
 
-    async def down(self) -> None:
+    async def disconnect(self) -> None:
         """Disconnect; never raises."""
         client, self._client = self._client, None
         self._adapter.held.discard(self)
@@ -107,7 +107,7 @@ class BleConnection:
     # -- connecting ------------------------------------------------------------------------------------------------
 
     async def _connect(self) -> None:
-        await self.down()
+        await self.disconnect()
         if not await self._client_with_service():
             # a stale GATT cache, as after a firmware update: have BlueZ forget the node, once
             client, self._client = self._client, None
@@ -118,7 +118,7 @@ class BleConnection:
                     await client.unpair()  # RemoveDevice
             self._adapter.forget(self.address)
             if not await self._client_with_service():
-                await self.down()
+                await self.disconnect()
                 raise LinkError(
                     f"The device at {self.address} advertises the service of a node but does not offer it.",
                     hint="Its firmware is wrong, or a cache: sudo rm -r /var/lib/bluetooth/*/cache, restart bluetooth.",

@@ -104,8 +104,8 @@ class BleLink:
                 self.connection.address, lost if isinstance(lost, ConnectionLostError) else None
             ) from lost
 
-    def again(self, frame: bytes) -> bytes:
-        """Send the last frame once more under its transaction; see ``ResendLink.again``."""
+    def resend(self, frame: bytes) -> bytes:
+        """Send the last frame once more under its transaction; see ``ResendLink.resend``."""
         return self._ask(frame, self._last)
 
     def drive(self, message: bytes) -> None:
@@ -117,7 +117,7 @@ class BleLink:
 
     def close(self) -> None:
         """Disconnect; never raises."""
-        self._loop.run(self.connection.down())
+        self._loop.run(self.connection.disconnect())
 
     def _ask(self, frame: bytes, transaction: int) -> bytes:
         began, last = time.monotonic(), None

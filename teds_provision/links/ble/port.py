@@ -232,7 +232,7 @@ class BlePort(MeasuringLink):
             hint="A node advertises for 60 s after a tap, and as long as it has a key. Bring it closer, or tap it.",
         )
 
-    def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
+    def find_all(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
         """Return every advertising node, asked one after the other; raises NoNodeError after ``seconds``.
 
         Listens until no new one came for 1.5 s, and for at least ``listen`` seconds. Nodes are asked as soon as they
@@ -411,7 +411,7 @@ class BlePort(MeasuringLink):
             ]
         if not idle:
             return False
-        self._loop.run(idle[0].down())
+        self._loop.run(idle[0].disconnect())
         return True
 
     def _take_data(self, connection: int, octets: bytes) -> None:
@@ -425,7 +425,7 @@ class BlePort(MeasuringLink):
 
     async def _all_down(self) -> None:
         for connection in self._connections.values():
-            await connection.down()
+            await connection.disconnect()
 
 
 def _silently(_notice: Notice) -> None:

@@ -169,21 +169,21 @@ class AddressConflicts:
         self._replies: list[float] = []
         self._lock = threading.Lock()
 
-    def heard(self, frame: Frame) -> None:
+    def check_frame(self, frame: Frame) -> None:
         """Look at a frame of the bus that we did not send."""
         if frame.identifier & 0xFF == self._own and _of_a_station(frame.identifier):
             with self._lock:
                 self._frames.append(time.monotonic())
                 del self._frames[:-_KEPT]
 
-    def unasked(self, node: int) -> None:
+    def record_unsolicited(self, node: int) -> None:
         """Record an unsolicited reply."""
         del node
         with self._lock:
             self._replies.append(time.monotonic())
             del self._replies[:-_KEPT]
 
-    def seen(self, *, within: float = 10.0) -> bool:
+    def seen_within(self, *, within: float = 10.0) -> bool:
         """Return True if another station used our address within these seconds."""
         since = time.monotonic() - within
         with self._lock:
@@ -540,7 +540,7 @@ class BusMultiplexer:
         """Collect the answers of all nodes to the functional Identify of this transaction.
 
         The loop continues for a moment afterwards: a caller that leaves with the first answer may later learn that a
-        second node answered under the same address (:meth:`clash`).
+        second node answered under the same address (:meth:`has_conflict`).
         """
         now = time.monotonic()
         asked = PendingBroadcast(BroadcastReplies(self.own, transaction), now, now)
@@ -551,7 +551,7 @@ class BusMultiplexer:
         finally:
             asked.until = time.monotonic() + _STRAGGLERS_SECONDS
 
-    def clash(self, node: int) -> bool:
+    def has_conflict(self, node: int) -> bool:
         """Return True if two nodes were heard under this address a short while ago, and no single one since then."""
         return time.monotonic() - self._clashes.get(node, -math.inf) < _CLASH_SECONDS
 
@@ -570,7 +570,7 @@ class BusMultiplexer:
             line.flows.put(b"")
 
     def _route(self, frame: Frame) -> None:
-        self.conflicts.heard(frame)
+        self.conflicts.check_frame(frame)
         self.transfer_pace.count(frame)
         if is_announce(frame.identifier):
             self._hear_announce(frame)
@@ -618,7 +618,7 @@ class BusMultiplexer:
             line.events.put(ReplyEvent("whole", body, frame.at))
             line.flows.put(b"")  # the waiter for a flow control has its answer
         elif not self._gathered(line, frame, body[0]) and body[0] not in line.asked:
-            self.conflicts.unasked(line.node)
+            self.conflicts.record_unsolicited(line.node)
 
     def _first(self, line: AddressPair, frame: Frame) -> None:
         partial = Reassembly.begin(line.node, frame)
@@ -642,7 +642,7 @@ class BusMultiplexer:
         elif transaction in line.asked:  # a late reply: end it, so that the node is free for the next
             self._reply(flow(line.node, line.own, OVERFLOW, fd=frame.fd))
         else:
-            self.conflicts.unasked(line.node)
+            self.conflicts.record_unsolicited(line.node)
 
     def _gathered(self, line: AddressPair, frame: Frame, transaction: int) -> bool:
         for asked in self._asked:

@@ -91,7 +91,7 @@ def rival_measures(bus: BusMultiplexer) -> bool:
             return False
     until = time.monotonic() + SIGN_OF_LIFE
     while time.monotonic() < until:
-        if bus.conflicts.seen():
+        if bus.conflicts.seen_within():
             return True
         time.sleep(0.05)
     return False

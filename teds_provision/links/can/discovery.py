@@ -104,7 +104,7 @@ class CanDiscovery(Discovery):
         if announce is None or announce.pressed:
             return math.inf
         self._presence.announced(self.port.place, announce)
-        if self._presence.awaits(announce):
+        if self._presence.is_awaited(announce):
             return SOON if self._believes(announce) else math.inf
         if self._presence.is_welcome(announce) and self._believes(announce):
             self._ask_one(announce.address, PATIENCE)  # it alone: the answers of all would cost the others' data
@@ -159,7 +159,7 @@ class CanDiscovery(Discovery):
         for address, identity in sorted(settled.identities.items()):
             if address in found.conflicts | found.unfinished:
                 self._saw(address, identity)
-        for uuid, addresses in settled.twice.items():
+        for uuid, addresses in settled.duplicates.items():
             self._presence.report(twice_text(uuid, addresses))
 
     def identify_at(self, address: int, seconds: float) -> None:

@@ -36,7 +36,7 @@ class FunctionalAnswers:
     repeated: set[int] = field(default_factory=set)
     sure: set[int] = field(default_factory=set)
 
-    def together(self, other: FunctionalAnswers) -> FunctionalAnswers:
+    def combined_with(self, other: FunctionalAnswers) -> FunctionalAnswers:
         """Return the combined result of two questions; an address that one of them settled is settled."""
         identities = self.identities | other.identities
         unfinished = (self.unfinished | other.unfinished) - identities.keys()
@@ -52,7 +52,7 @@ class FunctionalAnswers:
         return FunctionalAnswers(identities, later.conflicts, left, later.repeated, self.repeated & later.repeated)
 
     @property
-    def twice(self) -> dict[bytes, list[int]]:
+    def duplicates(self) -> dict[bytes, list[int]]:
         """UUIDs that answer under more than one address, with these addresses: one of them is an impostor."""
         places: dict[bytes, list[int]] = {}
         for address, identity in sorted(self.identities.items()):

@@ -141,8 +141,8 @@ class CanLink:
         self._last = self._number()
         return self._ask(frame, self._last, tries=TRIES, seconds=seconds, prompt=True)
 
-    def again(self, frame: bytes) -> bytes:
-        """Send the last frame once more under its transaction; see ``ResendLink.again``."""
+    def resend(self, frame: bytes) -> bytes:
+        """Send the last frame once more under its transaction; see ``ResendLink.resend``."""
         return self._ask(frame, self._last, tries=TRIES, seconds=self._reply_seconds)
 
     def wait_for_air(self) -> bool:
@@ -155,11 +155,11 @@ class CanLink:
     # -- to try a node out, see links.ports.MultiStationLink
     # ------------------------------------------------------------------
 
-    def beside(self, source: int) -> CanLink:
+    def from_station(self, source: int) -> CanLink:
         """Return a link to the same node from another station's address."""
         return CanLink(self._bus, self._number, self.address, reply_seconds=self._reply_seconds, source=source)
 
-    def everyone(self) -> bytes:
+    def identify_functional(self) -> bytes:
         """Send a functional Identify; return the reply frame of this node, empty if none came."""
         bus, transaction = self._bus(), self._number()
         with bus.gather(transaction) as asked:
@@ -170,7 +170,7 @@ class CanLink:
                 bus.check()
             return asked.replies.answers.get(self.address, b"")
 
-    def there(self, address: int) -> Identity | None:
+    def identify_at(self, address: int) -> Identity | None:
         """Return the identity of the node that answers Identify at this address, None for none."""
         link = CanLink(self._bus, self._number, address, source=self._source)
         try:
@@ -217,10 +217,10 @@ class CanLink:
                 self.left = self.left or time.monotonic()
                 reply, self.came = exchange.run()
         except LinkError as failure:
-            if bus.conflicts.seen() and not bus.failed:
+            if bus.conflicts.seen_within() and not bus.failed:
                 raise type(failure)(f"{failure.message} {bus.conflicts.text}", hint=bus.conflicts.hint) from failure
             raise
-        if bus.clash(self.address):
+        if bus.has_conflict(self.address):
             raise conflict(self.address)
         return reply[1:]
 
@@ -390,7 +390,7 @@ class _Exchange:
 
     def _failed(self) -> LinkError:
         where = f"The node at 0x{self._line.node:02X} on {self._bus.spec.text}"
-        if self._clash or self._bus.clash(self._line.node):
+        if self._clash or self._bus.has_conflict(self._line.node):
             return conflict(self._line.node)
         if self._torn:
             return GarbledError(

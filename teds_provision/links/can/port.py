@@ -238,7 +238,7 @@ class CanPort(MeasuringLink):
             " nodes that answer.",
         )
 
-    def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
+    def find_all(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
         """Return every node that answers: what identify shows, and provision chooses from.
 
         Listens until 300 ms of silence, 3 s at most, and asks each address separately whose answer was torn; unclear
@@ -258,7 +258,7 @@ class CanPort(MeasuringLink):
 
         while self.spec.node is None and (left := until - time.monotonic()) > 0:
             silence = max(SILENCE_SECONDS, min(_BUSY_SECONDS, enough - time.monotonic()))
-            found = found.together(self._everyone(min(LONGEST_SECONDS, left), once, silence))
+            found = found.combined_with(self._everyone(min(LONGEST_SECONDS, left), once, silence))
             if found.conflicts:
                 raise conflict(min(found.conflicts))
             if found.identities and time.monotonic() >= enough:
@@ -281,13 +281,13 @@ class CanPort(MeasuringLink):
                 break
             more = self._asked_once(longest)
             known = len(found.identities)
-            found = found.together(more)
+            found = found.combined_with(more)
             if len(found.identities) == known:
                 break
         found = self.settled(found, began + LONGEST_SECONDS + _HELLO_SECONDS)
         if found.unfinished:
             notice(Notice("unfinished", unfinished_text(found.unfinished)))
-        for uuid, addresses in found.twice.items():
+        for uuid, addresses in found.duplicates.items():
             notice(Notice("conflict", twice_text(uuid, addresses)))
         self.report_rivals(notice)
         return found
@@ -343,7 +343,7 @@ class CanPort(MeasuringLink):
     def report_rivals(self, notice: NoticeSink) -> None:
         """Report another station under our source address, once."""
         rivals = self.bus().conflicts
-        if not self._rival_reported and rivals.seen():
+        if not self._rival_reported and rivals.seen_within():
             self._rival_reported = True
             notice(Notice("conflict", f"{rivals.text} {rivals.hint}"))
 

@@ -155,8 +155,8 @@ class NfcPort:
             hint="Place the node's NFC antenna flat on the reader, or allow more time with --timeout.",
         )
 
-    def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
-        """Return the tapped node: a reader sees one at a time; see ``Port.everyone``."""
+    def find_all(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
+        """Return the tapped node: a reader sees one at a time; see ``Port.find_all``."""
         return [self.find(lambda _: True, seconds=seconds, notice=notice)]
 
     def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
@@ -329,8 +329,8 @@ class NfcLink:
             self._last = self._port.next_transaction()
             return self._exchange(frame, self._last)
 
-    def again(self, frame: bytes) -> bytes:
-        """Send the last frame once more under its transaction; see ``ResendLink.again``."""
+    def resend(self, frame: bytes) -> bytes:
+        """Send the last frame once more under its transaction; see ``ResendLink.resend``."""
         with self._port.turn:
             return self._exchange(frame, self._last)
 

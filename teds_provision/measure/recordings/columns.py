@@ -140,9 +140,9 @@ class BlockJoiner:
         else:
             runs.append([block])
         self._rows += len(block.time)
-        return self.rest() if self._rows >= ROWS else []
+        return self.flush() if self._rows >= ROWS else []
 
-    def rest(self) -> list[Entry]:
+    def flush(self) -> list[Entry]:
         """Return all entries that wait, and the end of a chunk."""
         runs = [run for all_of in self._waiting.values() for run in all_of]
         self._waiting, self._rows = {}, 0

@@ -94,11 +94,11 @@ class JsonLines(Recording):
             if event.get("event") == "data":
                 together.append(event)
             elif (entry := self._other(event)) is not None:
-                yield from joined.rest()
+                yield from joined.flush()
                 yield entry
         if together:
             yield from joined.add_block(self._block(together, numbers))
-        yield from joined.rest()
+        yield from joined.flush()
 
     def _other(self, event: dict[str, Any]) -> Entry | None:
         kind = event.get("event")

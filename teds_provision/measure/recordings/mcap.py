@@ -152,13 +152,13 @@ class McapRecording(Recording):
                     if entry is not None:
                         yield from self._blocks(waiting, topics, joined)
                         waiting, count = {}, 0
-                        yield from joined.rest()
+                        yield from joined.flush()
                         yield entry
                 continue
             if code in (SCHEMA, CHANNEL, METADATA):
                 yield from self._blocks(waiting, topics, joined)
                 waiting, count = {}, 0
-                yield from joined.rest()
+                yield from joined.flush()
             if code == METADATA:
                 name, words = self._metadata(content)
                 if name == "note":
@@ -174,7 +174,7 @@ class McapRecording(Recording):
                 if topic.facts:
                     yield topic.facts
         yield from self._blocks(waiting, topics, joined)
-        yield from joined.rest()
+        yield from joined.flush()
 
     def _schema(self, content: bytes) -> tuple[int, str]:
         try:

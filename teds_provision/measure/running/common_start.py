@@ -99,7 +99,7 @@ class CommonStart:
         late = self._first is not None and time.monotonic() - self._first > TOGETHER
         return ready == all_of or late
 
-    def tells(self) -> bool:
+    def notice_due(self) -> bool:
         """Return True once, when the "waiting for" notice is due."""
         long = self._first is not None and time.monotonic() - self._first > NOTICE_AFTER
         tells = self._trigger and not self._triggered and long and not self._told
@@ -110,6 +110,6 @@ class CommonStart:
         """Record that the trigger goes out: later nodes begin by themselves."""
         self._triggered = True
 
-    def begun(self, uuid: bytes, clock: ClockMap, tick: int) -> None:
+    def record_start(self, uuid: bytes, clock: ClockMap, tick: int) -> None:
         """Record that the node saw the trigger at this tick of its clock."""
         self._begun[uuid] = (clock, tick)

@@ -156,7 +156,7 @@ class Measurement:
         late = [supervisor for supervisor in self.supervisors if not supervisor.ready.is_set()]
         if self._common_start.due(len(self.supervisors) - len(late), len(self.supervisors)):
             trigger.pull(self._common_start, self.supervisors, self.watcher.note)
-        elif late and len(late) < len(self.supervisors) and self._common_start.tells():
+        elif late and len(late) < len(self.supervisors) and self._common_start.notice_due():
             names = ", ".join(supervisor.uuid.hex() for supervisor in late[:3]) + (" …" if len(late) > 3 else "")
             self.watcher.note(f"Waiting for {names} before the trigger, up to {TOGETHER:.0f} s.")
 

@@ -37,7 +37,7 @@ def pull(common_start: CommonStart, supervisors: Sequence[NodeSupervisor], note:
         mark = _mark(supervisor, trusted, *between, note)
         if mark is None:
             continue
-        common_start.begun(supervisor.uuid, supervisor.streams.clock, mark)
+        common_start.record_start(supervisor.uuid, supervisor.streams.clock, mark)
         for heard in list(supervisor.streams.running.values()):
             heard.begin(mark + START_AFTER_MARK)
 

@@ -197,7 +197,7 @@ class Board:
 
     # -- actuators -------------------------------------------------------------------------------------------------
 
-    def bears(self, channel: int, data_set: bytes) -> bool:
+    def accepts(self, channel: int, data_set: bytes) -> bool:
         """Return True if a raw value is between those of LowLimit and HiLimit."""
         low, high = self._bounds[channel]
         return low <= self.converters[channel].raw_of(data_set) <= high

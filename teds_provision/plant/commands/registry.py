@@ -731,7 +731,7 @@ def accept(app: App, name: str, page: str | None, files: Path | None, yes: bool,
         return
     app.confirm(f"Accept this history of {member.name}?", yes=yes, named="--page")
     station.unlock()
-    with plant.sync.alone(station):
+    with plant.sync.sync_lock(station):
         n, hash = plant.membership.accept(station, member.fingerprint, page, transport)
         plant.apply_pages.apply_claims(station)
     app.emit({"done": 1, "n": n, "hash": hash}, f"Page {n} ({hash[:16]}) and its successors count here.")
@@ -752,7 +752,7 @@ def resume(app: App, files: Path | None, yes: bool, dry_run: bool) -> None:
     station = app.station()
     transport, _ = _transport(station, files)
     if dry_run:
-        there = len(plant.sync.strange(station, transport))
+        there = len(plant.sync.unknown_pages(station, transport))
         app.emit({"done": 0, "adopts": there, "plan": True}, f"Plan: {_count(there, 'page')} would be adopted.")
         return
     app.note("If a copy of this home is in use elsewhere, stop it first. If in doubt, have this station removed.")

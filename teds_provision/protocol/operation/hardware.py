@@ -72,7 +72,7 @@ class Hardware(Protocol):
     def read(self, channel: int, tick: int) -> RawReading:
         """Return the value of a sensor at ``tick``, which is now or a little before."""
 
-    def bears(self, channel: int, data_set: bytes) -> bool:
+    def accepts(self, channel: int, data_set: bytes) -> bool:
         """Return True if the hardware of an actuator accepts this raw value."""
 
     def apply(self, values: Mapping[int, bytes]) -> None:

@@ -276,7 +276,7 @@ class OperationRole:
         return values
 
     def _apply(self, values: dict[int, bytes]) -> None:
-        demand(all(self._hardware.bears(channel, octets) for channel, octets in values.items()), Reason.OUT_OF_RANGE)
+        demand(all(self._hardware.accepts(channel, octets) for channel, octets in values.items()), Reason.OUT_OF_RANGE)
         self._demand_sound(*values)
         self._hardware.apply(values)
         self.claims.fed(values, self._real())

@@ -253,7 +253,7 @@ class StreamRole:
         return ahead <= min(self._claims.actuators[channel].dead_man for channel in channels) // MICRO
 
     def _can_apply(self, data: dict[int, bytes]) -> bool:
-        if not all(self._hardware.bears(channel, octets) for channel, octets in data.items()):
+        if not all(self._hardware.accepts(channel, octets) for channel, octets in data.items()):
             return False
         return not any(map(self._hardware.fault, data))
 

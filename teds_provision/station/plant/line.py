@@ -98,7 +98,7 @@ class Line:
 
     def end_seen(self, id: str) -> bool:
         """Return True if this station's clock was once past the end of the job."""
-        return self._store.one("SELECT 1 FROM meta WHERE name = ?", (f"job-over-{id}",)) is not None
+        return self._store.first_row("SELECT 1 FROM meta WHERE name = ?", (f"job-over-{id}",)) is not None
 
     def put_end_seen(self, id: str) -> None:
         """Record that this station's clock was past the end of the job."""

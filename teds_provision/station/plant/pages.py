@@ -143,7 +143,7 @@ class Pages:
 
     def seen_heads(self) -> set[tuple[str, str, int, str]]:
         """Return the heads (see :meth:`heads`) that a person has acknowledged."""
-        row = self._store.one("SELECT value FROM meta WHERE name = 'plant-seen-heads'")
+        row = self._store.first_row("SELECT value FROM meta WHERE name = 'plant-seen-heads'")
         return {(who, about, n, hash) for who, about, n, hash in json.loads(row[0])} if row is not None else set()
 
     def see_heads(self, heads: Iterable[tuple[str, str, int, str]]) -> None:

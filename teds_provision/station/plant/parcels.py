@@ -134,7 +134,7 @@ class Parcels:
 
     def review(self) -> str | None:
         """Return what was found when the keys were looked through last, JSON."""
-        row = self._store.one("SELECT value FROM meta WHERE name = 'plant-review'")
+        row = self._store.first_row("SELECT value FROM meta WHERE name = 'plant-review'")
         return None if row is None else str(row[0])
 
     def put_review(self, text: str) -> None:

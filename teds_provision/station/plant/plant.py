@@ -364,7 +364,7 @@ class Plant:
 
     def folded_acts(self) -> frozenset[str]:
         """Return the acts that were known when the pages here were folded; a version before them noted none."""
-        row = self._store.one("SELECT value FROM meta WHERE name = 'plant-acts'")
+        row = self._store.first_row("SELECT value FROM meta WHERE name = 'plant-acts'")
         return frozenset(json.loads(row[0])) if row is not None else frozenset()
 
     def put_folded_acts(self, acts: Iterable[str]) -> None:
@@ -373,7 +373,7 @@ class Plant:
 
     def doors(self) -> list[str]:
         """Return what the database allowed and should not, at the last sync that looked."""
-        row = self._store.one("SELECT value FROM meta WHERE name = 'plant-doors'")
+        row = self._store.first_row("SELECT value FROM meta WHERE name = 'plant-doors'")
         return list(json.loads(row[0])) if row is not None else []
 
     def put_doors(self, doors: Sequence[str]) -> None:

@@ -127,7 +127,7 @@ class AuditLog:
         """Add one entry; ``detail`` holds JSON values only and never a secret. Raises StoreError."""
         text = _encode(dict(detail or {}))
         with self._database.together():
-            last = self._database.one(_END)
+            last = self._database.first_row(_END)
             count, previous, noted = last or (0, self._root, self._noted())
             if self._read(noted) != (count, previous):  # goes on, but the loss is never forgotten
                 self._database.execute("INSERT OR IGNORE INTO meta VALUES('audit-lost', ?)", (str(count + 1),))
@@ -151,12 +151,12 @@ class AuditLog:
 
         A clock that once was ahead and has been corrected since leaves later times in the middle of the chain.
         """
-        row = self._database.one("SELECT at FROM audit ORDER BY seq DESC LIMIT 1")
+        row = self._database.first_row("SELECT at FROM audit ORDER BY seq DESC LIMIT 1")
         return str(row[0]) if row is not None else None
 
     def newest(self) -> tuple[int, str]:
         """Return number and hash (64 digits) of the newest entry; (0, the root) for an empty log."""
-        row = self._database.one("SELECT seq, hash FROM audit ORDER BY seq DESC LIMIT 1")
+        row = self._database.first_row("SELECT seq, hash FROM audit ORDER BY seq DESC LIMIT 1")
         return (int(row[0]), bytes(row[1]).hex()) if row is not None else (0, self._root.hex())
 
     def before(self, choice: AuditFilter, *, last: int | None = None) -> int:
@@ -170,12 +170,14 @@ class AuditLog:
             rows = self._database.execute(statement, (last,))
             first = rows[-1] if rows else None
         elif choice.since is not None:
-            first = self._database.one("SELECT seq FROM audit WHERE at >= ? ORDER BY seq LIMIT 1", (choice.since,))
+            first = self._database.first_row(
+                "SELECT seq FROM audit WHERE at >= ? ORDER BY seq LIMIT 1", (choice.since,)
+            )
         else:
             return 0
         if first is not None:
             return int(first[0]) - 1
-        end = self._database.one("SELECT coalesce(max(seq), 0) FROM audit")
+        end = self._database.first_row("SELECT coalesce(max(seq), 0) FROM audit")
         return int(end[0]) if end is not None else 0
 
     def check(self, after: int = 0) -> AuditVerdict:
@@ -185,7 +187,7 @@ class AuditLog:
         """
         expected, previous = after, self._root
         if after:
-            row = self._database.one("SELECT hash FROM audit WHERE seq = ?", (after,))
+            row = self._database.first_row("SELECT hash FROM audit WHERE seq = ?", (after,))
             if row is None:
                 return self._broken(after, after - 1, self._root, f"entry {after} is missing")
             previous = bytes(row[0])
@@ -196,7 +198,7 @@ class AuditLog:
             if good(previous) != digest:
                 return self._broken(expected, expected, previous, f"entry {expected} was changed, or the one before")
             previous = digest
-        lost = self._database.one("SELECT value FROM meta WHERE name = 'audit-lost'")
+        lost = self._database.first_row("SELECT value FROM meta WHERE name = 'audit-lost'")
         if lost is not None:
             first = int(lost[0]) if str(lost[0]).isdecimal() else 1
             return self._broken(first, expected, previous, f"the log once ended before entry {first} and was cut there")
@@ -210,10 +212,10 @@ class AuditLog:
         The whole log is checked if anything is wrong, so the verdict on a broken chain is that of :meth:`check`.
         """
         count, head = self.newest()
-        counted = self._database.one("SELECT count(*) FROM audit")
+        counted = self._database.first_row("SELECT count(*) FROM audit")
         whole = counted == (count,) and self._remembered() == (count, bytes.fromhex(head))
         if whole and all(self._run_holds(*run) for run in sample.runs(count)):
-            lost = self._database.one("SELECT value FROM meta WHERE name = 'audit-lost'")
+            lost = self._database.first_row("SELECT value FROM meta WHERE name = 'audit-lost'")
             if lost is None:
                 return AuditVerdict(True, None, count, head)
         return self.check()
@@ -221,7 +223,7 @@ class AuditLog:
     def _run_holds(self, first: int, last: int) -> bool:
         """Return True if the entries of these numbers are there and each hash follows from the one before."""
         rows = self._database.read(_linked, _RUN_OF_ENTRIES, (first, last))
-        before = self._database.one("SELECT hash FROM audit WHERE seq = ?", (first - 1,))
+        before = self._database.first_row("SELECT hash FROM audit WHERE seq = ?", (first - 1,))
         previous = self._root if before is None else before[0]
         for seq, (number, good, digest) in zip(range(first, last + 1), rows, strict=False):
             if number != seq or good(previous) != digest:
@@ -234,7 +236,7 @@ class AuditLog:
         return self._read(self._noted())
 
     def _noted(self) -> object:
-        row = self._database.one(f"SELECT {_NOTED}")
+        row = self._database.first_row(f"SELECT {_NOTED}")
         return None if row is None else row[0]
 
     def _read(self, noted: object) -> tuple[int, bytes] | None:

@@ -169,7 +169,7 @@ class Database(Connection):
         with self._lock, suppress(sqlite3.Error):
             self._connection.close()
 
-    def one(self, statement: str, values: Sequence[Any] = ()) -> tuple[Any, ...] | None:
+    def first_row(self, statement: str, values: Sequence[Any] = ()) -> tuple[Any, ...] | None:
         """Return the first row, None if there is none; raises StoreError."""
         rows = self.execute(statement, values)
         return rows[0] if rows else None

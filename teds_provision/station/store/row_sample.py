@@ -69,7 +69,7 @@ class RowSample:
         """Return True if a table has more rows than are read; counts no further."""
         if self.full:
             return False
-        counted = store.one(f"SELECT count(*) FROM (SELECT 1 FROM {table} LIMIT {SAMPLED + 1})")
+        counted = store.first_row(f"SELECT count(*) FROM (SELECT 1 FROM {table} LIMIT {SAMPLED + 1})")
         return counted is not None and counted[0] > SAMPLED
 
     def numbered_rows(self, store: Database, table: str) -> str:
@@ -79,7 +79,7 @@ class RowSample:
         return numbers
 
     def _numbers(self, store: Database, table: str, count: int) -> str:
-        last = None if self.full else store.one(f"SELECT max(rowid) FROM {table}")
+        last = None if self.full else store.first_row(f"SELECT max(rowid) FROM {table}")
         if last is None or (last[0] or 0) <= SAMPLED:
             return ALL_ROWS
         numbers = [*random.sample(range(1, last[0] + 1), count), *range(last[0] - _NEWEST, last[0] + 1)]
@@ -116,11 +116,11 @@ def _drawn(store: Database, table: str, key: Sequence[str]) -> list[Any]:
     for column in key:
         fixed = "".join(f"{name} = ? AND " for name in key[: len(values)])
         ends = [
-            store.one(f"SELECT {column} FROM {table} WHERE {fixed}1 ORDER BY {column} {way} LIMIT 1", values)
+            store.first_row(f"SELECT {column} FROM {table} WHERE {fixed}1 ORDER BY {column} {way} LIMIT 1", values)
             for way in ("ASC", "DESC")
         ]
         first, last = (end[0] if end is not None else None for end in ends)
-        found = store.one(
+        found = store.first_row(
             f"SELECT {column} FROM {table} WHERE {fixed}{column} >= ? ORDER BY {column} LIMIT 1",
             [*values, _between(first, last)],
         )

@@ -69,7 +69,7 @@ class Store(Database):
 
     def count(self, table: Literal["nodes", "whitelist", "keys", "trust"]) -> int:
         """Return how many rows a table has."""
-        row = self.one(f"SELECT count(*) FROM {table}")
+        row = self.first_row(f"SELECT count(*) FROM {table}")
         return int(row[0]) if row is not None else 0
 
     def damage(self, sample: RowSample | None = None) -> str | None:
@@ -107,12 +107,12 @@ class Store(Database):
 
     def _identify(self, *, create: bool) -> None:
         """Read the identifier, which wrapped keys and the audit log are bound to; make it in a new store."""
-        row = self.one("SELECT value FROM meta WHERE name = 'id'")
+        row = self.first_row("SELECT value FROM meta WHERE name = 'id'")
         if row is None and create:
             with self.transaction():  # OR IGNORE: another process may have been first
                 fresh = secrets.token_hex(_ID_OCTETS)
                 self.execute("INSERT OR IGNORE INTO meta VALUES('id', ?)", (fresh,))
-                row = self.one("SELECT value FROM meta WHERE name = 'id'")
+                row = self.first_row("SELECT value FROM meta WHERE name = 'id'")
         if row is None:
             raise StoreError(f"The store {self.path} has no identifier.", hint="Run teds-provision init.")
         self.id = str(row[0])

@@ -41,7 +41,7 @@ class SampleStatistics:
         """By how much another mean of as many samples may differ, for their spread and for Float32."""
         return _SIGMAS * self.spread / math.sqrt(self.count) + 4 * _STEP * abs(self.mean)
 
-    def restless(self, most: float) -> bool:
+    def is_unstable(self, most: float) -> bool:
         """Return True if it spreads, or drifts, by more than ``most``."""
         return max(self.spread, abs(self.drift)) > most
 
@@ -91,7 +91,7 @@ def with_zero_offset(teds: bytes, offset: float, at: datetime) -> bytes:
     fields = table(AccessCode.CALIBRATION)
     composer = Composer(fields, decoded.edition or 2007, width)
     given = {"ZeroOffset": offset, "ZeroDate": instant(at)}
-    new = [RawTuple(*composer.one(name, value, fields.by_name)[:2], 0) for name, value in given.items()]
+    new = [RawTuple(*composer.encode_field(name, value, fields.by_name)[:2], 0) for name, value in given.items()]
     head, *kept = tuples(unframe(teds), width=width)
     rest = [raw for raw in kept if raw.type not in {entry.type for entry in new}]
     for entry in new:  # before the first of a higher type: a TEDS of ours stays in ascending order

@@ -96,7 +96,7 @@ class Composer:
         done: list[tuple[int, bytes]] = []
         seen: set[int] = set()
         for name, value in _spread(pairs, known):
-            number, octets, repeats = self.one(name, value, known)
+            number, octets, repeats = self.encode_field(name, value, known)
             if number in seen and not repeats:
                 raise BadDataError(f"{name} is given twice.")
             seen.add(number)
@@ -104,7 +104,7 @@ class Composer:
         done.sort(key=lambda entry: entry[0])
         return b"".join(self.tuple(number, octets) for number, octets in done)
 
-    def one(self, name: str, value: object, known: Mapping[str, FieldSpec]) -> tuple[int, bytes, bool]:
+    def encode_field(self, name: str, value: object, known: Mapping[str, FieldSpec]) -> tuple[int, bytes, bool]:
         """Return type, value octets and whether the type may repeat."""
         spec = known.get(name)
         if spec is not None:

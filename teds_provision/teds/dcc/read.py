@@ -134,16 +134,16 @@ def certificate_of(element: XmlElement, octets: bytes, file: str) -> DigitalCert
     version = (element.get("schemaVersion") or "").strip()
     if not _VERSION.fullmatch(version):
         raise BadDataError(f"{file}: schemaVersion {version[:20]!r} is not known; DCC 3.x is read.")
-    data = root.one("dcc:administrativeData")
-    core = data.one("dcc:coreData")
-    results = root.one("dcc:measurementResults").every("dcc:measurementResult")
+    data = root.child("dcc:administrativeData")
+    core = data.child("dcc:coreData")
+    results = root.child("dcc:measurementResults").children_named("dcc:measurementResult")
     if not results:
         raise root.wrong("it holds no measurement results.")
-    language = next((node.text for node in core.every("dcc:usedLangCodeISO639_1") if node.text == "en"), None)
-    reader = _Reader(language or core.one("dcc:mandatoryLangCodeISO639_1").text)
-    contact = data.one("dcc:calibrationLaboratory").one("dcc:contact")
-    issued = core.maybe("dcc:issueDate")
-    begun, ended = _day(core.one("dcc:beginPerformanceDate")), _day(core.one("dcc:endPerformanceDate"))
+    language = next((node.text for node in core.children_named("dcc:usedLangCodeISO639_1") if node.text == "en"), None)
+    reader = _Reader(language or core.child("dcc:mandatoryLangCodeISO639_1").text)
+    contact = data.child("dcc:calibrationLaboratory").child("dcc:contact")
+    issued = core.optional_child("dcc:issueDate")
+    begun, ended = _day(core.child("dcc:beginPerformanceDate")), _day(core.child("dcc:endPerformanceDate"))
     if ended < begun:
         raise core.wrong("the calibration ends before it begins.")
     tables = [table for result in results for table in reader.tables(result)]
@@ -152,18 +152,18 @@ def certificate_of(element: XmlElement, octets: bytes, file: str) -> DigitalCert
         file=file,
         sha256=hashlib.sha256(octets).hexdigest(),
         schema_version=version,
-        number=_bounded(core.one("dcc:uniqueIdentifier")),
+        number=_bounded(core.child("dcc:uniqueIdentifier")),
         calibrated=ended,
         issued=_day(issued) if issued is not None else None,
-        country=core.one("dcc:countryCodeISO3166_1").required_text()[:2],
+        country=core.child("dcc:countryCodeISO3166_1").required_text()[:2],
         laboratory=reader.name(contact, required=True),
-        devices=tuple(reader.device(item) for item in data.one("dcc:items").every("dcc:item")),
+        devices=tuple(reader.device(item) for item in data.child("dcc:items").children_named("dcc:item")),
         conditions=tuple(condition for result in results for condition in reader.conditions(result)),
         methods=tuple(
             reader.name(used) for result in results for used in result.all_of("dcc:usedMethods/dcc:usedMethod")
         ),
         tables=_numbered(tables),
-        signed=bool(root.every("ds:Signature")),
+        signed=bool(root.children_named("ds:Signature")),
         warnings=reader.warnings + (() if version.startswith(TRIED) else (_untried(version),)),
     )
 
@@ -209,8 +209,8 @@ class _Reader:
 
     def name(self, node: Node, *, required: bool = False) -> str:
         """Return the text of ``dcc:name``: in the language, else without one, else the first."""
-        holder = node.one("dcc:name") if required else node.maybe("dcc:name")
-        contents = holder.every("dcc:content") if holder is not None else []
+        holder = node.child("dcc:name") if required else node.optional_child("dcc:name")
+        contents = holder.children_named("dcc:content") if holder is not None else []
         by_language = {content.element.get("lang"): content.text for content in reversed(contents)}
         text = by_language.get(self.language) or by_language.get(None) or next(iter(reversed(by_language.values())), "")
         if required and not text:
@@ -219,13 +219,13 @@ class _Reader:
 
     def device(self, item: Node) -> Device:
         """Read one calibrated item."""
-        maker, model = item.maybe("dcc:manufacturer"), item.maybe("dcc:model")
+        maker, model = item.optional_child("dcc:manufacturer"), item.optional_child("dcc:model")
         return Device(
             self.name(item),
             self.name(maker) if maker is not None else "",
             model.text[:_TEXT] if model is not None else "",
             tuple(
-                (known.one("dcc:issuer").text[:_TEXT], known.one("dcc:value").text[:_TEXT])
+                (known.child("dcc:issuer").text[:_TEXT], known.child("dcc:value").text[:_TEXT])
                 for known in item.all_of("dcc:identifications/dcc:identification")
             ),
         )
@@ -256,14 +256,14 @@ class _Reader:
         found: list[ResultTable] = []
         for holder in (
             *result.all_of("dcc:influenceConditions/dcc:influenceCondition"),
-            *result.one("dcc:results").every("dcc:result"),
+            *result.child("dcc:results").children_named("dcc:result"),
         ):
-            status = holder.maybe("dcc:status")
+            status = holder.optional_child("dcc:status")
             state = _STATES.get(status.text, "") if status is not None else ""
             name = self.name(holder)
-            data = holder.one("dcc:data")
+            data = holder.child("dcc:data")
             state = state or _state_of(holder)
-            lists = data.every("dcc:list")
+            lists = data.children_named("dcc:list")
             for table in lists:
                 found += self._table(table, name, state or _state_of(table))
             if holder.name == "result" and not lists:
@@ -272,15 +272,17 @@ class _Reader:
         return found
 
     def _quantities(self, node: Node) -> tuple[Quantity, ...]:
-        return tuple(known for part in node.every("dcc:quantity") if (known := self.quantity(part)) is not None)
+        return tuple(
+            known for part in node.children_named("dcc:quantity") if (known := self.quantity(part)) is not None
+        )
 
     def _table(self, node: Node, above: str, state: str) -> list[ResultTable]:
-        rows = node.every("dcc:list")
+        rows = node.children_named("dcc:list")
         name = self.name(node) or above
         line = node.line
         own = self._quantities(node) or (self._rows(rows) if rows else None)
         table = [ResultTable(node.id, name, state, own, line)] if own else []
-        if own and not node.every("dcc:quantity"):
+        if own and not node.children_named("dcc:quantity"):
             return table
         return table + [inner for row in rows for inner in self._table(row, name, state or _state_of(row))]
 
@@ -288,7 +290,7 @@ class _Reader:
         """Return the columns of a list of points, each of which is a list of single values in the same order."""
         points = []
         for row in rows:
-            if row.every("dcc:list"):
+            if row.children_named("dcc:list"):
                 return None
             cells = self._quantities(row)
             if not cells or any(len(cell.values) != 1 for cell in cells):
@@ -307,7 +309,7 @@ class _Reader:
         number = _numeric(node)
         if number is None:
             return None
-        if node.maybe("dcc:relativeUncertainty") is not None:
+        if node.optional_child("dcc:relativeUncertainty") is not None:
             text = "A relative uncertainty of the certificate is not read; state it with the calibrated values."
             self.warnings += () if text in self.warnings else (text,)
         values, unit = _values(number)
@@ -349,12 +351,12 @@ def _numeric(node: Node) -> Node | None:
 
     One that states an uncertainty goes before others.
     """
-    found = node.every(*_NUMERIC, "si:hybrid")
+    found = node.children_named(*_NUMERIC, "si:hybrid")
     if len(found) > 1:
         raise node.wrong("it holds two values.")
     if not found or found[0].name != "hybrid":
         return found[0] if found else None
-    choices = found[0].every(*_NUMERIC)
+    choices = found[0].children_named(*_NUMERIC)
     known = [choice for choice in choices if _is_readable(choice)]
     if choices and not known:
         _values(choices[0])  # raises
@@ -372,10 +374,10 @@ def _is_readable(number: Node) -> bool:
 
 def _values(number: Node) -> tuple[tuple[float, ...], WrittenUnit]:
     listed = number.name == "realListXMLList"
-    values = _numbers(number.one("si:valueXMLList" if listed else "si:value"))
+    values = _numbers(number.child("si:valueXMLList" if listed else "si:value"))
     if not listed and len(values) != 1:
         raise number.wrong(f"one value is expected, not {len(values)}.")
-    node = number.one("si:unitXMLList" if listed else "si:unit")
+    node = number.child("si:unitXMLList" if listed else "si:unit")
     names = set(node.required_text().split(" "))
     if len(names) != 1:
         raise node.wrong("the values have different units, which is not read.")
@@ -414,7 +416,7 @@ def _uncertainties(number: Node, count: int) -> tuple[tuple[float, ...] | None, 
     for path, value, expanded in _STATED:
         whole = "/".join(f"{step}{many}" for step in path.split("/"))
         found += [(node, value, expanded) for node in number.all_of(whole)]
-    single = number.maybe("si:valueStandardMU")  # of a constant
+    single = number.optional_child("si:valueStandardMU")  # of a constant
     if single is not None:
         return _checked(single, _numbers(single), count), None
     if len(found) > 1:
@@ -422,10 +424,10 @@ def _uncertainties(number: Node, count: int) -> tuple[tuple[float, ...] | None, 
     if not found:
         return None, None
     node, value, expanded = found[0]
-    stated = _checked(node, _numbers(node.one(f"{value}{many}")), count)
+    stated = _checked(node, _numbers(node.child(f"{value}{many}")), count)
     if not expanded:
         return stated, None
-    factors = _checked(node, _numbers(node.one(f"si:coverageFactor{many}")), count)
+    factors = _checked(node, _numbers(node.child(f"si:coverageFactor{many}")), count)
     if min(factors) < 1:
         raise node.wrong("a coverage factor is at least 1.")
     length = max(len(stated), len(factors))

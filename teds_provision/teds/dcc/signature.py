@@ -42,7 +42,7 @@ def read_checked(octets: bytes, file: str, trusted: Sequence[bytes], now: dateti
     """
     anchors = [certificate for pem in trusted for certificate in _anchors(pem)]
     root = parse_xml(octets, file)
-    signatures = Node(root, file).every("ds:Signature") if root.tag == ROOT else []
+    signatures = Node(root, file).children_named("ds:Signature") if root.tag == ROOT else []
     if not signatures:
         if anchors:
             raise NotAuthenticError(
@@ -140,7 +140,7 @@ def _results(octets: bytes, file: str, signature: Node, signer: x509.Certificate
 
 
 def _objects(signature: Node) -> Iterable[Node]:
-    for holder in signature.every("ds:Object"):
+    for holder in signature.children_named("ds:Object"):
         yield from (Node(child, signature.file) for child in holder.element)
 
 

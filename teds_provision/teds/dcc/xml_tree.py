@@ -124,21 +124,21 @@ class Node:
         """Words of the attribute ``refType``."""
         return tuple((self.element.get("refType") or "").split())
 
-    def every(self, *names: str) -> list[Node]:
+    def children_named(self, *names: str) -> list[Node]:
         """Return the children of these names, in the order of the document."""
         wanted = {qualified(name) for name in names}
         return [Node(child, self.file) for child in self.element if child.tag in wanted]
 
-    def maybe(self, name: str) -> Node | None:
+    def optional_child(self, name: str) -> Node | None:
         """Return the one child of this name, None without one; raises BadDataError if there are several."""
-        found = self.every(name)
+        found = self.children_named(name)
         if len(found) > 1:
             raise found[1].wrong("it appears twice.")
         return found[0] if found else None
 
-    def one(self, name: str) -> Node:
+    def child(self, name: str) -> Node:
         """Return the one child of this name; raises BadDataError without it, or if there are several."""
-        found = self.maybe(name)
+        found = self.optional_child(name)
         if found is None:
             raise self.wrong(f"{name.partition(':')[2]} is missing.")
         return found
@@ -147,7 +147,7 @@ class Node:
         """Return the elements at the end of a path of names; every step may have many."""
         level = [self]
         for name in path.split("/"):
-            level = [child for node in level for child in node.every(name)]
+            level = [child for node in level for child in node.children_named(name)]
         return level
 
     @property

@@ -107,7 +107,7 @@ def test_a_session_does_not_outlive_its_connection(air: Air, port: Ports) -> Non
 
 def test_twenty_nodes_are_asked_one_after_the_other(air: Air, port: Ports) -> None:
     radio = air(20)
-    contacts = port().everyone(seconds=60, notice=quiet)
+    contacts = port().find_all(seconds=60, notice=quiet)
     assert len({contact.identity.uuid for contact in contacts}) == 20
     counts = radio.do("counts")
     assert counts["most_held"] == 1
@@ -123,7 +123,7 @@ def test_who_collects_listens_for_as_long_as_it_was_told(air: Air, port: Ports, 
     late = threading.Timer(5, lambda: radio.do("tap", 1))
     late.start()
     began = time.monotonic()
-    contacts = port().everyone(seconds=60, notice=quiet, listen=12)
+    contacts = port().find_all(seconds=60, notice=quiet, listen=12)
     assert len(contacts) == 2
     assert time.monotonic() - began >= 12
     late.join()
@@ -132,7 +132,7 @@ def test_who_collects_listens_for_as_long_as_it_was_told(air: Air, port: Ports, 
 def test_who_says_no_time_listens_for_three_seconds_at_least(air: Air, port: Ports) -> None:
     air()
     began = time.monotonic()
-    assert len(port().everyone(seconds=60, notice=quiet, listen=LISTEN_SECONDS)) == 1
+    assert len(port().find_all(seconds=60, notice=quiet, listen=LISTEN_SECONDS)) == 1
     assert time.monotonic() - began >= LISTEN_SECONDS
 
 
@@ -148,7 +148,7 @@ def test_what_a_characteristic_does_not_offer_is_refused_at_once(air: Air, kind:
 def test_one_connect_at_a_time(air: Air, port: Ports) -> None:
     radio = air(3, manners={"in_progress": True})
     bluetooth = port()
-    contacts = bluetooth.everyone(seconds=30, notice=quiet)
+    contacts = bluetooth.find_all(seconds=30, notice=quiet)
     replies: list[bytes] = []
     threads = [
         threading.Thread(target=lambda item=contact: replies.append(item.link.exchange(IDENTIFY)))
@@ -195,7 +195,7 @@ def test_bluez_may_have_forgotten_the_node(air: Air, port: Ports) -> None:
 
 def test_where_the_adapter_is_full_an_idle_connection_makes_room(air: Air, port: Ports) -> None:
     radio = air(3, manners={"limit": 2})
-    contacts = port().everyone(seconds=30, notice=quiet)
+    contacts = port().find_all(seconds=30, notice=quiet)
     for contact in contacts:
         contact.link.exchange(IDENTIFY)
     assert radio.do("counts")["most_held"] == 2
@@ -203,7 +203,7 @@ def test_where_the_adapter_is_full_an_idle_connection_makes_room(air: Air, port:
 
 def test_a_full_adapter_is_named_where_every_connection_is_needed(air: Air, port: Ports) -> None:
     air(3, manners={"limit": 2})
-    contacts = port().everyone(seconds=30, notice=quiet)
+    contacts = port().find_all(seconds=30, notice=quiet)
     for contact in contacts[:2]:
         contact.link.exchange(IDENTIFY)
         contact.link.connection.streaming = True  # type: ignore[attr-defined]
@@ -224,7 +224,7 @@ def test_a_node_that_was_met_before_is_asked_alone(air: Air, port: Ports) -> Non
     """Its address is kept from command to command, so that twenty others are left in peace."""
     radio = air(6)
     first = port()
-    contacts = first.everyone(seconds=30, notice=quiet)
+    contacts = first.find_all(seconds=30, notice=quiet)
     first.close()
     before = radio.do("counts")["connects"]
     wanted = contacts[4].identity.uuid

@@ -300,7 +300,7 @@ def test_two_nodes_under_one_address_are_a_conflict(hub: Hub) -> None:
             time.sleep(0.1)
             link.exchange(COUNT)  # either may notice, by the first answer
 
-        until(lambda: refused(lambda: port.everyone(seconds=3, notice=quiet)))
+        until(lambda: refused(lambda: port.find_all(seconds=3, notice=quiet)))
         until(lambda: refused(asked))
         kinds: list[str] = []
         stop = threading.Event()
@@ -325,9 +325,9 @@ def test_an_address_is_good_again_as_soon_as_one_node_alone_answers_there(hub: H
     first.pinned = second.pinned = True
     with serving(hub.spec, first), opened(hub.spec) as port:
         with serving(hub.spec, second), pytest.raises(AddressConflictError, match="0x21"):
-            port.everyone(seconds=3, notice=quiet)
-        assert port.bus().clash(0x21)
-        [contact] = port.everyone(seconds=3, notice=quiet)
+            port.find_all(seconds=3, notice=quiet)
+        assert port.bus().has_conflict(0x21)
+        [contact] = port.find_all(seconds=3, notice=quiet)
         assert contact.identity.uuid == first.uuid
         assert contact.link.exchange(COUNT)
 
@@ -345,7 +345,7 @@ def test_a_late_reply_to_a_station_that_died_makes_no_second_node(hub: Hub) -> N
 
     with serving(hub.spec, EchoNode(0x21)), opened(hub.spec) as port:
         hub.lose = reply_late
-        [contact] = port.everyone(seconds=PATIENCE, notice=quiet)
+        [contact] = port.find_all(seconds=PATIENCE, notice=quiet)
         assert late
         assert contact.link.exchange(COUNT)
 

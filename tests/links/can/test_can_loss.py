@@ -179,7 +179,7 @@ def assert_all_found(
     missed = []
     for _ in range(8):
         begin()
-        found = sorted(contact.address or 0 for contact in port.everyone(seconds=10, notice=notice))
+        found = sorted(contact.address or 0 for contact in port.find_all(seconds=10, notice=notice))
         if found == addresses:
             return
         missed.append(sorted(set(addresses) - set(found)))

@@ -175,10 +175,10 @@ def test_two_stations_of_one_address_are_noticed_and_named(hub: Hub, nodes: Star
     ours, theirs, other = CanPort(hub.spec), CanPort(hub.spec), CanPort(hub.spec + "&source=0xF2")
     other.link(0x22).exchange(write(b"abc"))
     ours.link(0x21).exchange(write(b"abc"))
-    assert not ours.bus().conflicts.seen()  # a station of another address is nobody's rival
+    assert not ours.bus().conflicts.seen_within()  # a station of another address is nobody's rival
     theirs.link(0x22).exchange(write(b"abcdefgh"))
     told: list[Notice] = []
-    ours.everyone(seconds=2, notice=told.append)
+    ours.find_all(seconds=2, notice=told.append)
     assert any(notice.kind == "conflict" and "0xF1" in notice.text and "source=0xF2" in notice.text for notice in told)
     with pytest.raises(LinkError, match="Another base station") as failure:
         ours.link(0x55).exchange_limited(write(b"nobody"), tries=1, seconds=0.2)
@@ -192,12 +192,12 @@ def test_an_interface_that_gives_back_our_own_frames_makes_no_rival(group: str, 
     port = CanPort(group)
     for _ in range(5):
         port.link(0x21).exchange(write(bytes(200)))
-    assert not port.bus().conflicts.seen()
+    assert not port.bus().conflicts.seen_within()
     bus = Bus(parse_spec(group))
     for _ in range(3):
         bus.send(Frame(0x18DA21F1, b"\x02\x01\x02"))
     bus.close()
-    until(port.bus().conflicts.seen)
+    until(port.bus().conflicts.seen_within)
     port.close()
 
 

@@ -80,7 +80,7 @@ class FakeHardware:
     def read(self, channel: int, tick: int) -> RawReading:
         return RawReading(self.value(channel, tick), channel not in self.invalid)
 
-    def bears(self, channel: int, data_set: bytes) -> bool:
+    def accepts(self, channel: int, data_set: bytes) -> bool:
         return LOW <= int.from_bytes(data_set, "big") <= HIGH
 
     def apply(self, values: Mapping[int, bytes]) -> None:
