@@ -47,7 +47,7 @@ int teds_hash_transcript(teds_node *node, const uint8_t *request, const uint8_t 
     if (!teds_find(node, TEDS_SECURITY_ID, &source) || teds_source_hash(node, &source, teds) != 0) {
         return -TEDS_FAILURE;
     }
-    /* reply_head: nonceN, epoch, En as they stand in the reply */
+    /* reply_head: nonceN, epoch, En as in the reply */
     const teds_part parts[] = {LABEL("TEDS1 transcript"), {request, REQUEST_OCTETS}, {reply_head, 85},
                                {node->identity.uuid, 10},          {node->identity.point, 65},         {teds, 32}};
     teds_sha256_parts(node, parts, sizeof parts / sizeof parts[0], out);

@@ -72,7 +72,7 @@ static void run_request(teds_node *node, uint8_t connection, teds_ble_line *line
     line->sent_transaction = line->transaction;
 }
 
-/* Offset 0 begins anew; a frame that does not continue what is held drops it. Nothing is answered to either. */
+/* Offset 0 starts a new message; a frame that does not continue the held one drops it. Neither gets an answer. */
 void teds_ble_written(teds_node *node, uint8_t connection, const uint8_t *value, size_t length)
 {
     teds_ble_line *line = find_connection(node, connection);

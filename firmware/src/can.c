@@ -385,7 +385,7 @@ static void answer_everyone(teds_node *node, teds_line *line)
     teds_isotp_begin(line, octets, sizeof node->can.everyone, TEDS_CAN_FD && line->asked_fd);
 }
 
-/* What Identify says has changed since: answers to everyone that are under way end. */
+/* The reply to Identify has changed since: broadcast replies that are under way end. */
 static void end_old_answers(teds_node *node)
 {
     if (!node->identity_changed) {

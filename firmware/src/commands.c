@@ -315,7 +315,7 @@ static int run_command(teds_node *node, const teds_command *command, teds_origin
     return command->known->run(node, command, origin, out);
 }
 
-/* The reply frame around a handler's outcome, whose payload stands at reply + 3. */
+/* The reply frame around a handler's outcome, whose payload is at reply + 3. */
 static size_t close_reply(uint8_t *reply, int outcome)
 {
     reply[0] = outcome >= 0;

@@ -9,7 +9,7 @@
 /* Check what is staged, and store it in one transaction. A refused commit changes nothing. */
 int teds_commit(teds_node *node);
 
-/* Its last step. A function of its own, so that the new state is not on the stack beside a verification. */
+/* Its last step. A separate function, so that the new state is not on the stack beside a verification. */
 int teds_commit_state(teds_node *node, const teds_signed *teds);
 
 /* Forget key, station and CA, and the signed datasheet. Epoch, sequence, address and other TEDS stay. */

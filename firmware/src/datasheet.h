@@ -15,7 +15,7 @@ bool teds_find_fixed(const teds_node *node, uint16_t id, teds_source *out);
 /* Find a TEDS: fixed, stored, or the initial Security TEDS. */
 bool teds_find(const teds_node *node, uint16_t id, teds_source *out);
 
-/* Find what stands there after a commit: the staged image, or else what teds_find finds. */
+/* Find the TEDS as it is after a commit: the staged image, or else what teds_find finds. */
 bool teds_find_new(const teds_node *node, uint16_t id, teds_source *out);
 
 /* Of these, the lowest id above `after` (-1: the first); TEDS_NO_ID at the end, TEDS_UNREADABLE if flash failed. */

@@ -15,7 +15,7 @@ void teds_link_forget(teds_node *node, teds_link link);
 /* Lose every link of the bus, and what its lines were about to send or receive. */
 void teds_can_links_forget(teds_node *node);
 
-/* Take this CAN address now. Every link is a pair of addresses: with a new own one all begin anew. */
+/* Take this CAN address now. Every link is a pair of addresses: with a new own one all start over. */
 void teds_address_move(teds_node *node, uint8_t address);
 
 #endif

@@ -80,14 +80,14 @@ static bool read_item(reading *in, item *out)
 }
 
 /* Members of an upload's packet, or of the answer to one. */
-typedef struct said {
+typedef struct packet_map {
     bool off_there, length_there, sha_there, refuses, complete;
     uint32_t off, length;
     const uint8_t *sha;
     uint8_t sha_length;
-} said;
+} packet_map;
 
-enum { OF_NO_CONCERN, OFF, LENGTH, SHA, REFUSAL, MATCH };
+enum { IGNORED_MEMBER, OFF, LENGTH, SHA, REFUSAL, MATCH };
 
 static unsigned find_key(const item *key)
 {
@@ -101,11 +101,11 @@ static unsigned find_key(const item *key)
             return known[i].key;
         }
     }
-    return OF_NO_CONCERN;
+    return IGNORED_MEMBER;
 }
 
 /* Note a value; false if it has another type, or is there twice: the manager could take the other one. */
-static bool note_value(said *out, unsigned key, const item *value)
+static bool note_value(packet_map *out, unsigned key, const item *value)
 {
     bool good = true;
     switch (key) {
@@ -139,13 +139,13 @@ typedef struct level {
 } level;
 
 /* True if the octets are one map and nothing else. `plain`: of a known length, with text as keys and without maps or arrays in
- * it. `out` takes what stands in the map itself; NULL: that is of no concern. */
-static bool read_map(const uint8_t *octets, size_t length, bool plain, said *out)
+ * it. `out` receives the members of the map itself; NULL: they are skipped. */
+static bool read_map(const uint8_t *octets, size_t length, bool plain, packet_map *out)
 {
     reading in = {octets, octets + length};
     level levels[DEPTH];
     size_t depth = 0;
-    unsigned key = OF_NO_CONCERN;
+    unsigned key = IGNORED_MEMBER;
     memset(levels, 0, sizeof levels);
     do {
         level *in_it = depth > 0 ? &levels[depth - 1] : NULL;
@@ -167,7 +167,7 @@ static bool read_map(const uint8_t *octets, size_t length, bool plain, said *out
                 if (out != NULL && in_it->odd && !note_value(out, key, &it)) {
                     return false;
                 }
-                key = !in_it->odd && it.major == TEXT ? find_key(&it) : OF_NO_CONCERN;
+                key = !in_it->odd && it.major == TEXT ? find_key(&it) : IGNORED_MEMBER;
             }
             if (in_it != NULL) {
                 in_it->odd = in_it->map && !in_it->odd;
@@ -240,7 +240,7 @@ static request classify_packet(const uint8_t *packet)
 }
 
 /* Which request a packet is. `out`: the members of an upload. */
-static request classify_request(const uint8_t *packet, size_t length, said *out)
+static request classify_request(const uint8_t *packet, size_t length, packet_map *out)
 {
     const uint8_t *body = packet + HEADER_OCTETS;
     const size_t octets = length - HEADER_OCTETS;
@@ -280,14 +280,14 @@ static bool has_any_claim(const teds_node *node)
 }
 
 /* Another image is to be uploaded right after the last one began. */
-static bool is_too_soon(const teds_node *node, const said *upload)
+static bool is_too_soon(const teds_node *node, const packet_map *upload)
 {
     const teds_managed *own = &node->managed;
     return upload->off == 0 && own->begun && teds_now(node) < own->sha_until &&
            (upload->sha_length != own->sha_length || (own->sha_length > 0 && memcmp(upload->sha, own->sha, own->sha_length) != 0));
 }
 
-static int check_moment(teds_node *node, request asked, const said *upload, const teds_session *session)
+static int check_moment(teds_node *node, request asked, const packet_map *upload, const teds_session *session)
 {
     if (asked == CONFIRM) {
         return teds_on_trial(node) ? 0 : -TEDS_WRONG_STATE;
@@ -335,7 +335,7 @@ static int plan_restart(teds_node *node, const uint8_t *packet, teds_link link, 
     return (int)SHORTEST;
 }
 
-static void begin_upload(teds_managed *own, const said *upload, uint64_t now)
+static void begin_upload(teds_managed *own, const packet_map *upload, uint64_t now)
 {
     own->begun = true;
     own->sha_until = now + ANOTHER_NS;
@@ -346,7 +346,7 @@ static void begin_upload(teds_managed *own, const said *upload, uint64_t now)
     }
 }
 
-static void continue_upload(teds_node *node, teds_session *session, const said *answer)
+static void continue_upload(teds_node *node, teds_session *session, const packet_map *answer)
 {
     teds_managed *own = &node->managed;
     if (answer->refuses) {
@@ -381,7 +381,7 @@ int teds_manage(teds_node *node, const teds_command *command, teds_origin *origi
     size_t length = command->length;
     const size_t most = port->manage_octets != 0 && port->manage_octets < LONGEST ? port->manage_octets : LONGEST;
     uint8_t head[HEADER_OCTETS];
-    said upload = {0}, answer = {0};
+    packet_map upload = {0}, answer = {0};
     request asked;
     int failed;
     if ((node->firmware & TEDS_FIRMWARE_MANAGES) == 0) {

@@ -111,7 +111,7 @@ static teds_stored_reply *find_place(teds_node *node, teds_link link)
     return found;
 }
 
-/* Identify, Prove, About, List, Query and Read outside Sealed are always run anew. */
+/* Identify, Prove, About, List, Query and Read outside Sealed are always run again. */
 static bool runs_anew(const uint8_t *frame, size_t length)
 {
     if (length < 4) {

@@ -3,7 +3,7 @@
 #include "security_teds.h"
 #include "inside.h"
 
-/* Checksum of a TEDS whose `length` octets stand before it. */
+/* Checksum of a TEDS whose `length` octets precede it. */
 uint16_t teds_checksum(const uint8_t *octets, size_t length)
 {
     uint32_t sum = 0;
@@ -119,7 +119,7 @@ static bool is_utf8(const uint8_t *text, size_t length)
 }
 
 /* Fields that a signed one holds, each once and ascending: type, length, the value of one octet that the profile wants.
- * 108 stands between 107 and 109, as often as there are blocks. */
+ * 108 comes between 107 and 109, once for each block. */
 static const uint8_t FIELDS[][3] = {
     {1, 1, 4},          {2, 1, 2},          {3, 1, 0},          {4, 1, 1},          {5, 64, 0},         {6, 8, 0},
     {100, TEXT_OCTETS}, {101, TEXT_OCTETS}, {102, TEXT_OCTETS}, {103, TEXT_OCTETS}, {104, TEXT_OCTETS}, {105, 1, 1},

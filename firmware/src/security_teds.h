@@ -29,7 +29,7 @@ bool teds_is_listed(const teds_signed *teds, uint16_t id);
 /* The Security TEDS of a node that no station has signed for. */
 void teds_put_initial(const teds_node *node, uint8_t out[TEDS_INITIAL_OCTETS]);
 
-/* Checksum of a TEDS whose `length` octets stand before it. */
+/* Checksum of a TEDS whose `length` octets precede it. */
 uint16_t teds_checksum(const uint8_t *octets, size_t length);
 
 /* True if an image is a TEDS by itself: length, checksum, the access code in its header. */

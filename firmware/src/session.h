@@ -31,7 +31,7 @@ typedef struct teds_taken {
 int teds_unseal(teds_node *node, teds_link link, const uint8_t *payload, size_t length, uint8_t *plain,
                 teds_taken *taken);
 
-/* Seal the inner reply of `inner` octets that stands at payload + 4, in place: `payload` has room for counter, padding and
+/* Seal the inner reply of `inner` octets at payload + 4, in place: `payload` has room for counter, padding and
  * tag around it. */
 int teds_seal_reply(const teds_node *node, const uint8_t key[16], uint32_t counter, uint8_t *payload, size_t inner,
                     size_t *length);

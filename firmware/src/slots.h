@@ -17,7 +17,7 @@ bool teds_find_stored(const teds_node *node, uint16_t id, teds_source *out);
 /* Lower `found` to the lowest stored id above `after`, if there is one below it; false: flash cannot be read. */
 bool teds_next_stored(const teds_node *node, int32_t after, int32_t *found);
 
-/* Write a whole new state, with the TEDS that stay. A commit says which it lists, and what is staged comes to them;
+/* Write a whole new state, with the TEDS that stay. A commit lists them, and the staged TEDS are added;
  * without one (NULL) all stay, but for the Security TEDS if the new state is not provisioned. 0, or a reason negated: then
  * the state is what it was. */
 int teds_slots_write(teds_node *node, const teds_state *state, const teds_signed *commit);

@@ -158,12 +158,12 @@ static int check_channels(const teds_node *node, const teds_command *command, co
 
 static int check_period(const teds_node *node, const asked *in)
 {
-    uint64_t shortest = 1, said;
+    uint64_t shortest = 1, stated;
     for (size_t i = 0; i < in->count; i++) {
         uint64_t own = node->port->channels[in->places[i]].shortest;
-        (void)teds_channel_fits(node, in->places[i], &said);
+        (void)teds_channel_fits(node, in->places[i], &stated);
         shortest = own > shortest ? own : shortest;
-        shortest = said > shortest ? said : shortest;
+        shortest = stated > shortest ? stated : shortest;
     }
     return in->period < shortest || in->period > LONGEST_PERIOD ? -TEDS_OUT_OF_RANGE : 0;
 }
@@ -502,11 +502,11 @@ static void take_all_events(teds_node *node, uint64_t now)
         lost = events->lost;
         for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
             if (each->used && each->kind == EVENT && each->pattern == 0 && !each->waits && each->channels[0] == place) {
-                take_events(events, each, in, (uint16_t)(lost - events->told), now);
+                take_events(events, each, in, (uint16_t)(lost - events->reported), now);
             }
         }
         events->out = in;
-        events->told = lost;
+        events->reported = lost;
         events++;
     }
 }

@@ -17,8 +17,8 @@ static const uint8_t OK[2] = {0x90, 0x00}, WRONG_LENGTH[2] = {0x67, 0x00}, NO_FI
 
 static size_t file_octets(const teds_node *node)
 {
-    const uint16_t told = node->config->nfc.max_ndef;
-    return 2u + (told != 0 && told < TEDS_MAX_NDEF ? told : TEDS_MAX_NDEF);
+    const uint16_t configured = node->config->nfc.max_ndef;
+    return 2u + (configured != 0 && configured < TEDS_MAX_NDEF ? configured : TEDS_MAX_NDEF);
 }
 
 static size_t put_status_word(uint8_t *out, size_t at, const uint8_t status[2])

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Reading one TEDS, wherever it lies: in flash, in RAM, or not yet anywhere (the initial Security TEDS); and the tuples
+/* Reading one TEDS from flash, from RAM, or made on the fly (the initial Security TEDS); and the tuples
  * in it. */
 #include "teds_source.h"
 #include "area.h"

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* One TEDS, wherever it lies, and the tuples in it. A TEDS is named by its id: channel << 8 | access code. */
+/* One TEDS in flash or RAM, and the tuples in it. A TEDS is named by its id: channel << 8 | access code. */
 #ifndef TEDS_SRC_TEDS_SOURCE_H
 #define TEDS_SRC_TEDS_SOURCE_H
 

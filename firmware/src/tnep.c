@@ -2,7 +2,7 @@
 /* NFC (wire.md): the node's half of TNEP 1.0 over an NDEF message, and the pieces of a request and its reply.
  *
  * One buffer is the NDEF file: the reader's message is read from it, the answer is put there. While a command runs it is
- * empty, which says "need more time". */
+ * empty, which means "need more time". */
 #include "tnep.h"
 #include "ble.h"
 #include "clock.h"
@@ -32,8 +32,8 @@ typedef struct piece {
 
 static size_t most_ndef(const teds_node *node)
 {
-    const uint16_t told = node->config->nfc.max_ndef;
-    return told != 0 && told < TEDS_MAX_NDEF ? told : TEDS_MAX_NDEF;
+    const uint16_t configured = node->config->nfc.max_ndef;
+    return configured != 0 && configured < TEDS_MAX_NDEF ? configured : TEDS_MAX_NDEF;
 }
 
 static void show_message(teds_node *node, size_t length)
@@ -239,7 +239,7 @@ static void collect_piece(teds_node *node, const piece *came)
 bool teds_nfc_services_good(const teds_config *config)
 {
     /* beside WLC 26, our Tp 41, id 45 and out-of-band 47: the initial message is one that fits the tag */
-    const uint16_t told = config->nfc.max_ndef;
+    const uint16_t configured = config->nfc.max_ndef;
     size_t octets = 160;
     for (size_t i = 0; i < config->nfc.service_count; i++) {
         const teds_nfc_service *each = &config->nfc.services[i];
@@ -249,7 +249,7 @@ bool teds_nfc_services_good(const teds_config *config)
         }
         octets += 12 + length;
     }
-    return octets <= (told != 0 && told < TEDS_MAX_NDEF ? told : TEDS_MAX_NDEF);
+    return octets <= (configured != 0 && configured < TEDS_MAX_NDEF ? configured : TEDS_MAX_NDEF);
 }
 
 /* The place of a service of this name, from 1 on; 0: none. */
@@ -363,7 +363,7 @@ void teds_nfc_field(teds_node *node, bool present)
     }
 }
 
-/* The message that stands in the file is whole: it is empty from here on, until the answer is there. */
+/* The message in the file is whole: it is empty from here on, until the answer is there. */
 void teds_nfc_came(teds_node *node, size_t length)
 {
     node->nfc.stage = TEDS_NFC_WRITTEN;

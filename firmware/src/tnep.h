@@ -17,7 +17,7 @@ void teds_nfc_start(teds_node *node);
 /* A reader has written a message of this length into the file. */
 void teds_nfc_came(teds_node *node, size_t length);
 
-/* Answer the message that was written; show the initial message anew if what it reports has changed. */
+/* Answer the message that was written; show the initial message again if what it reports has changed. */
 void teds_nfc_poll(teds_node *node);
 #endif
 

@@ -98,7 +98,7 @@ void teds_go_safe(teds_node *node, int place)
     node->safe |= UINT32_C(1) << place;
 }
 
-/* -- what the stored TransducerChannel TEDS says ------------------------------------------------------------------- */
+/* -- facts of the stored TransducerChannel TEDS -------------------------------------------------------------------- */
 
 /* Float32 seconds as ns, less 1 ppm; 0 if it is not positive or no number. */
 static uint64_t decode_period(uint32_t bits)
@@ -108,7 +108,7 @@ static uint64_t decode_period(uint32_t bits)
     if (bits >> 31 != 0 || exponent == 0 || (exponent == 255 && (bits & 0x7FFFFF) != 0)) {
         return 0;
     }
-    if (exponent >= 127 + 20) { /* a million seconds stands for every longer one */
+    if (exponent >= 127 + 20) { /* a million seconds replaces every longer one */
         return 1000000 * TEDS_SECOND;
     }
     ns = exponent >= 150 ? ns << (exponent - 150) : 150 - exponent < 64 ? ns >> (150 - exponent) : 0;

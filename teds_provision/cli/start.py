@@ -51,12 +51,12 @@ def start(app: App, ctx: click.Context) -> None:
 def _named(ctx: click.Context) -> LinkSettings:
     """Return the links that config.toml or the environment names for every command."""
 
-    def of(name: str) -> tuple[str, ...]:
-        setting = os.environ.get(f"TEDS_PROVISION_{name.upper()}") or (ctx.default_map or {}).get(name) or ()
-        return tuple(setting.split()) if isinstance(setting, str) else tuple(map(str, setting))
+    def setting(name: str) -> tuple[str, ...]:
+        value = os.environ.get(f"TEDS_PROVISION_{name.upper()}") or (ctx.default_map or {}).get(name) or ()
+        return tuple(value.split()) if isinstance(value, str) else tuple(map(str, value))
 
-    ble = of("ble")
-    return LinkSettings(nfc=of("nfc") or None, can=of("can") or None, ble=ble[0] if ble else None)
+    ble = setting("ble")
+    return LinkSettings(nfc=setting("nfc") or None, can=setting("can") or None, ble=ble[0] if ble else None)
 
 
 def _station(station: Station) -> dict[str, Any]:

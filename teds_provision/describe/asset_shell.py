@@ -69,7 +69,7 @@ def asset_shell(node: DescribedNode) -> str:
         model.AssetInformation(model.AssetKind.INSTANCE, global_asset_id=f"urn:teds:{uuid}"),
         f"urn:teds:{uuid}:shell",
         id_short=f"Node_{uuid}",
-        submodel={model.ModelReference.from_referable(each) for each in (nameplate, technical)},
+        submodel={model.ModelReference.from_referable(submodel) for submodel in (nameplate, technical)},
     )
     written = io.StringIO()
     write_aas_json_file(written, model.DictIdentifiableStore([shell, nameplate, technical]))

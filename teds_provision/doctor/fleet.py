@@ -101,7 +101,7 @@ def _firmware(station: Station, sample: RowSample) -> tuple[list[bytes], list[by
         nodes = station.nodes.get_many([record.uuid for record in page])
         for record in page:
             node = nodes.get(record.uuid)
-            known = known_firmware(record, partial(demands.of, node.profile if node is not None else None))
+            known = known_firmware(record, partial(demands.demand_of, node.profile if node is not None else None))
             if known is not None and known.state not in ("good", "unjudged", "on-trial", "pending"):
                 odd.append(record.uuid)
             if known is not None and known.changed:

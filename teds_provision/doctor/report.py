@@ -123,7 +123,7 @@ def _last_errors(system: System, mask: Mask) -> list[dict[str, str]]:
     try:
         with Station.inspect(system.home) as station:
             choice, log = AuditFilter(failed=True), station.audit_log
-            entries = list(log.chosen(choice, log.before(choice, last=_LAST_ERRORS)))
+            entries = list(log.chosen(choice, log.entry_before(choice, last=_LAST_ERRORS)))
     except TedsProvisionError:
         return []
     return [

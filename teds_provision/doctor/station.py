@@ -113,7 +113,7 @@ def _audit(log: AuditLog, sample: RowSample) -> Iterator[Finding]:
 
 def _backups(log: AuditLog, nodes: int) -> Iterator[Finding]:
     backups = AuditFilter(act="backup")
-    taken = [entry.at for entry in log.chosen(backups, log.before(backups, last=1))]
+    taken = [entry.at for entry in log.chosen(backups, log.entry_before(backups, last=1))]
     fix = "teds-provision backup FILE"
     if not taken:
         why = "There is no backup: without one, losing this machine means re-keying every node at the bench."

@@ -14,7 +14,7 @@ from teds_provision.files import SHARED, read_text, write_whole
 from teds_provision.limits import LIMITS
 from teds_provision.links import LinkSettings
 from teds_provision.measure.sample_series import SampleSeries, reference_for, require_still, take_samples_of
-from teds_provision.measure.sources import beside
+from teds_provision.measure.sources import own_source_address
 from teds_provision.measure.verified_session import open_trusted
 from teds_provision.provisioning.conversation import SessionLostError
 from teds_provision.provisioning.progress import Reporter, Steps
@@ -59,7 +59,7 @@ def capture_at(
         raise NotFoundError(f"There is no folder {file.parent}.")
     steps = Steps(reporter)
     with (
-        beside(station, links.after_agreeing(), f"{_NAME} {uuid.hex()}", shared=False) as own,
+        own_source_address(station, links.after_agreeing(), f"{_NAME} {uuid.hex()}", shared=False) as own,
         at_node(station, own, uuid, reporter) as visit,  # its turn is the file's too
     ):
         try:

@@ -166,10 +166,10 @@ class ClockMap:
 
     def ticks_at(self, host: int) -> TickBounds:
         """Return the bounds of the node's tick at a host time (monotonic ns), by all evidence."""
-        ahead = self.ahead(host)
+        ahead = self.lead_bounds(host)
         return TickBounds(max(0, host + ahead.low), host + ahead.high)
 
-    def ahead(self, host: int) -> TickBounds:
+    def lead_bounds(self, host: int) -> TickBounds:
         """Return the bounds by which the node's tick may be ahead of a host time (monotonic ns) at that time."""
         # The tick itself is the line's; what skew adds to its offset changes this doubt by some ns in a minute.
         doubt = self._rate * abs(host - self._offset - self._when) + 1.0

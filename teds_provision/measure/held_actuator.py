@@ -69,7 +69,7 @@ def _set_point_of(trusted: VerifiedSession, chosen: int | str) -> Channel | None
     """
     if isinstance(chosen, int):
         return None
-    actuators = {one.name.casefold(): one for one in trusted.sheet.channels if one.actuator}
+    actuators = {channel.name.casefold(): channel for channel in trusted.sheet.channels if channel.actuator}
     name = chosen.casefold()
     return None if name in actuators else actuators.get(f"{name} set point")
 

@@ -9,7 +9,7 @@ from typing import Literal
 from teds_provision.errors import NoNodeError, TedsProvisionError
 from teds_provision.links import LinkSettings, Notice, open_place
 from teds_provision.links.opening import capabilities_at, plugged_in
-from teds_provision.measure.sources import beside
+from teds_provision.measure.sources import own_source_address
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
 
@@ -45,7 +45,7 @@ def look(station: Station, places: Sequence[str]) -> Iterator[LinkSurvey]:
             continue
         notices: list[Notice] = []
         try:
-            with beside(station, LinkSettings().at(place), "looking") as links:
+            with own_source_address(station, LinkSettings().at(place), "looking") as links:
                 port = open_place(links.places[0])
                 try:
                     contacts = port.find_all(seconds=_LISTEN_SECONDS, notice=notices.append)

@@ -133,7 +133,7 @@ class NodeSupervisor:
         if self._comes_back:
             self._comes_back = False
             for bus in self._buses.all():
-                bus.share.leave(self.uuid)
+                bus.share.remove_node(self.uuid)
 
     @property
     def begun(self) -> bool:
@@ -190,7 +190,7 @@ class NodeSupervisor:
                 if time.monotonic() - began > LAST_PAUSE:
                     pause = FIRST_PAUSE
                 lost: State = "refused" if isinstance(error, BadDatasheetError) else "lost"
-                self._set_state(lost if self.ever_ran else "waiting", error, f"; again in {patience.again(pause)}")
+                self._set_state(lost if self.ever_ran else "waiting", error, f"; again in {patience.next_try(pause)}")
                 self._wait(min(pause, patience.seconds_left), began, decided=decided)
                 pause = min(2 * pause, LAST_PAUSE)
             self._set_state("ended", why=self._why)
@@ -200,7 +200,7 @@ class NodeSupervisor:
                 self._request.requirements.drop_node(self.uuid)
             if not self._comes_back:
                 for bus in self._buses.all():
-                    bus.share.leave(self.uuid)
+                    bus.share.remove_node(self.uuid)
             self.done.set()
             self.ready.set()
 
@@ -292,7 +292,7 @@ class NodeSupervisor:
         self.bus = self._buses.bus_of(sighting)
         for other in self._buses.all():
             if other is not self.bus:
-                other.share.leave(self.uuid)
+                other.share.remove_node(self.uuid)
         try:
             self._in_session(self.bus, sighting, standing)
         except NoRoomError:
@@ -303,7 +303,7 @@ class NodeSupervisor:
             self._buses.presence.let_announce(self.uuid)
             # Its refusal came under its key: it is there, and another measurement may want it now.
             if not (self._proven and isinstance(error, (NotAuthenticError, PolicyError, BadDataError))):
-                self._buses.presence.wrong(sighting)
+                self._buses.presence.search_again(sighting)
             if not self._proven and isinstance(error, (TedsProvisionError, SessionLostError)):
                 if not isinstance(error, LinkError):
                     self._ask_who_answers()
@@ -447,11 +447,11 @@ class NodeSupervisor:
     ) -> NodePlans:
         rate, share = self._request.rate, bus.share
         if rate is None:
-            share.want(self.uuid, self._plan(channels, bus.time_for(share.time, address), SOON).load)
+            share.announce_share(self.uuid, self._plan(channels, bus.time_for(share.time, address), SOON).load)
         start = self._common_start.start(self.uuid, self.streams.clock)
         while True:
             with share.lock:
-                time_left = bus.time_for(share.others(self.uuid, sharing=rate is None), address)
+                time_left = bus.time_for(share.for_node(self.uuid, sharing=rate is None), address)
                 plans = self._plan(channels, time_left, start)
                 share.taken[self.uuid] = plans.load
             try:

@@ -49,14 +49,14 @@ class BusShare:
     wanted: dict[bytes, float] = field(default_factory=dict)
     lock: threading.Condition = field(default_factory=threading.Condition)
 
-    def others(self, uuid: bytes, *, sharing: bool = False) -> BusTime:
+    def for_node(self, uuid: bytes, *, sharing: bool = False) -> BusTime:
         """Return the bus as one node sees it; ``sharing`` leaves the nodes that are still to come their fair part."""
         used = sum(load for key, load in self.taken.items() if key != uuid)
         if sharing:
             used += self._kept_for_others(uuid, MOST_LOAD - used)
         return replace(self.time, taken=used)
 
-    def want(self, uuid: bytes, load: float) -> None:
+    def announce_share(self, uuid: bytes, load: float) -> None:
         """Report a node's share of an empty bus, then wait (:data:`SAYING` at most) for the others to do so."""
         with self.lock:
             self.wanted[uuid] = load
@@ -90,7 +90,7 @@ class BusShare:
             self.wanted.pop(uuid, None)
             self.lock.notify_all()
 
-    def leave(self, uuid: bytes) -> None:
+    def remove_node(self, uuid: bytes) -> None:
         """Drop the node as :meth:`drop_node` does, and free its share."""
         with self.lock:
             self.taken.pop(uuid, None)

@@ -161,7 +161,7 @@ class Presence:
                 if not self._missing[uuid]:
                     del self._missing[uuid]
 
-    def wrong(self, sighting: Sighting) -> None:
+    def search_again(self, sighting: Sighting) -> None:
         """Record that it was not that node, or is gone from there, and search again."""
         place = (sighting.port.place, sighting.address)
         with self._turn:

@@ -118,7 +118,7 @@ def _rates(sensors: Sequence[Channel]) -> list[float]:
 def _limit(sensors: Mapping[bytes, Sequence[Channel]], rate: float, around: Surroundings) -> Limit | None:
     """Return what cannot carry this rate, None if all can; a slower channel keeps its rate."""
     own = {uuid: _rates(channels) for uuid, channels in sensors.items()}
-    if sum(min(rate, each) for rates in own.values() for each in rates) > around.values:
+    if sum(min(rate, own_rate) for rates in own.values() for own_rate in rates) > around.values:
         return "machine"
     if around.budget is not None:
         loads = [NodeLoad(None, len(rates), min(rate, max(rates))) for rates in own.values()]

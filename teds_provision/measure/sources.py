@@ -40,7 +40,9 @@ def sole_user(station: Station, ports: Iterable[MeasuringLink], command: str) ->
 
 
 @contextmanager
-def beside(station: Station, links: LinkSettings, command: str, *, shared: bool = True) -> Iterator[LinkSettings]:
+def own_source_address(
+    station: Station, links: LinkSettings, command: str, *, shared: bool = True
+) -> Iterator[LinkSettings]:
     """Have short sessions from the source address of ``links``, beside others who do; over a reader there is none.
 
     Yields the links with the address in them: the next free one if none was named and a measurement has it, or, not

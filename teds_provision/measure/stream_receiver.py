@@ -109,7 +109,7 @@ class ReceivedStream:
             if not came:
                 return
             with self.mapping:
-                messages = self.receiver.open_messages(came, self.clock.ahead(came[-1][1]))
+                messages = self.receiver.open_messages(came, self.clock.lead_bounds(came[-1][1]))
                 if messages:
                     self._note_arrival(came, messages)
                 blocks = self.interpreter.blocks(messages)

@@ -17,7 +17,7 @@ from teds_provision.errors import BadDataError, PolicyError
 from teds_provision.links import LinkSettings
 from teds_provision.measure.held_actuator import unit_for
 from teds_provision.measure.sample_series import SampleSeries, reference_for, require_still, take_samples_of
-from teds_provision.measure.sources import beside
+from teds_provision.measure.sources import own_source_address
 from teds_provision.measure.verified_session import VerifiedSession, operation, trusted_from
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.operation.commands import ChannelState
@@ -103,7 +103,7 @@ def zero_at(
     station.policy.require_whitelisted(uuid)
     writes = "" if dry_run else _NAME
     with (
-        beside(station, links.after_agreeing(), f"{_NAME} {uuid.hex()}", shared=False) as own,
+        own_source_address(station, links.after_agreeing(), f"{_NAME} {uuid.hex()}", shared=False) as own,
         at_node(station, own, uuid, reporter, unlock="always", writes=writes) as visit,
     ):
         try:

@@ -354,7 +354,7 @@ class Daemon:
             "strangers": self.directory.strangers(watch.place),
         }
 
-    def hello(self) -> dict[str, Any]:
+    def first_message(self) -> dict[str, Any]:
         """Return the first message of /live."""
         return {"type": "hello", "version": __version__, "station": self.station.name, "time": time.time()}
 
@@ -495,7 +495,7 @@ class Daemon:
             content=content,
             profile=profile,
             new_uuid=new_uuid,
-            on_bus=self.directory.heard(),
+            on_bus=self.directory.answering_on(),
         )
         self._start_virtuals()
         self.directory.refresh([made.uuid])

@@ -165,7 +165,9 @@ def raw_numbers(block: Block, column: int) -> NDArray[Any]:
     raw = block.raw[:, column]
     if raw.dtype != object:
         return np.asarray(raw, np.float64)
-    return np.array([float(each) if isinstance(each, int | float) else np.nan for each in raw.tolist()], np.float64)
+    return np.array(
+        [float(number) if isinstance(number, int | float) else np.nan for number in raw.tolist()], np.float64
+    )
 
 
 class _Channel:

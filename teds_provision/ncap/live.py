@@ -162,7 +162,7 @@ class Live:
         self._listeners.add(listener)
         return listener
 
-    def leave(self, listener: LiveClient) -> None:
+    def remove_client(self, listener: LiveClient) -> None:
         """Remove a client."""
         self._listeners.discard(listener)
 

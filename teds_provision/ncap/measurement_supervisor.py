@@ -260,7 +260,7 @@ class MeasurementSupervisor:
             if sighting is None:
                 return None
             found = self._buses.bus_of(sighting)
-            return found.place, found.time_for(found.share.others(uuid), sighting.address)
+            return found.place, found.time_for(found.share.for_node(uuid), sighting.address)
 
         around = Surroundings(
             bus,
@@ -290,7 +290,7 @@ class MeasurementSupervisor:
             return
         kind = None if kept.kind is None else StreamKind[kept.kind.upper()]
         channels = Sheet.from_image(image).channels
-        if self._sinks.moves(kept) and channels and all(channel.actuator for channel in channels):
+        if self._sinks.allows_set_points(kept) and channels and all(channel.actuator for channel in channels):
             return  # it has nothing to measure; set points come for it
         for channel in sensors_of(channels, kept.channels, kind):
             period_of(channel, kept.rate)
@@ -533,7 +533,7 @@ class MeasurementSupervisor:
         return kept.to_json() | {
             "id": kept.id,
             "uuids": list(uuids),
-            "actuators": self._sinks.moves(kept),
+            "actuators": self._sinks.allows_set_points(kept),
             "created": kept.created,
             "owner": kept.owner,
             "process": None if kept.pid is None else {"id": kept.pid, "started": kept.started},
@@ -703,8 +703,8 @@ class MeasurementSupervisor:
         return MeasurementJob(
             self._station,
             running.kept,
-            more=lambda take: self._sinks.more(running.kept, take),
-            admits=self._admits if self._sinks.moves(running.kept) else None,
+            more=lambda take: self._sinks.extra_sinks(running.kept, take),
+            admits=self._admits if self._sinks.allows_set_points(running.kept) else None,
             request=MeasurementRequest(
                 patient=True,
                 by="ncap",
@@ -1025,7 +1025,7 @@ class MeasurementSupervisor:
             return
         member.stack.close()
         for bus in self._buses.all():
-            bus.share.leave(bytes.fromhex(uuid))
+            bus.share.remove_node(bytes.fromhex(uuid))
         self._node_locks.release(uuid)
         with self._lock:
             membership.leaving.discard(uuid)

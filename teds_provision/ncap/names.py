@@ -105,7 +105,7 @@ class Names:
     def _learn_topics(self, station: StationFacts) -> Topics:
         topics = Topics(station)
         for uuid in self._directory.uuids():
-            called, unverified = self._directory.called(uuid)
+            called, unverified = self._directory.published_name(uuid)
             topics.learn(
                 ChannelFacts(uuid, called, number, name, unverified=unverified)
                 for number, name in self._directory.channel_names(uuid)

@@ -88,7 +88,7 @@ class DaemonSinks:
             )
         return self._open(self._brokers.get(spec, spec), take)
 
-    def more(self, kept: KeptMeasurement, take: CommandTaker | None) -> list[Sink]:
+    def extra_sinks(self, kept: KeptMeasurement, take: CommandTaker | None) -> list[Sink]:
         """Return the daemon's own sinks for one run of a measurement, without those that it names itself.
 
         ``take`` receives set points of topics.
@@ -108,7 +108,7 @@ class DaemonSinks:
         whole = in_units(spec, self._units)
         return open_sink(whole if self._scalars else without_scalars(whole), take)
 
-    def moves(self, kept: KeptMeasurement) -> bool:
+    def allows_set_points(self, kept: KeptMeasurement) -> bool:
         """Return True if set points may come for this measurement: it and the daemon allow it, with a ROS sink."""
         return self.actuators and kept.actuators and bool(_ROS & {*self._specs, *kept.sinks})
 

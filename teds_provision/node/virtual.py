@@ -176,7 +176,7 @@ class VirtualNode:
         self.manager: ImageManager | None = None
         self._restarted: list[Callable[[], None]] = []
         self._off = False
-        if ImageSlots.has(folder):
+        if ImageSlots.exist_in(folder):
             self._slots = ImageSlots(folder)
             self.manager = ImageManager(self._slots, self._restart_soon)
         self.tim = self._start()

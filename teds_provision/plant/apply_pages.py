@@ -284,7 +284,7 @@ class _LocalRows(NamedTuple):
         keys = {record.uuid: record for record in station.keys.get_many(uuids)}
         return cls(station.pins.get_many(uuids), station.nodes.get_many(uuids), keys)
 
-    def own(self, station: Station, uuid: bytes, hashes: Sequence[tuple[str, str]]) -> LocalState:
+    def local_state(self, station: Station, uuid: bytes, hashes: Sequence[tuple[str, str]]) -> LocalState:
         """Return this station's state of a node; ``hashes`` are H and text of the statements about it."""
         entry, node = self.entries.get(uuid), self.nodes.get(uuid)
         pin, assurance = (entry.fingerprint, entry.assurance) if entry is not None else (None, "")
@@ -332,7 +332,9 @@ def _judged(
     judged = {}
     for uuid in uuids:
         statements = said.get(uuid, [])
-        own = here.own(station, uuid, [(statement.hash, statement.revocation.statement) for statement in statements])
+        own = here.local_state(
+            station, uuid, [(statement.hash, statement.revocation.statement) for statement in statements]
+        )
         node = {station_id: Claim.from_json(claim) for station_id, claim in claims.get(uuid, {}).items()}
         judged[uuid] = merge_claims(roster, node, own, statements, lifted), statements
     return judged

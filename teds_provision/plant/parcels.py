@@ -118,7 +118,7 @@ class _Reader:
                 return True
             why = "" if isinstance(plan, incoming.ImportResult) else self._why_not(plan)
             if why:
-                self.station.plant.parcels.turn(row.id, "in", "waiting", why)
+                self.station.plant.parcels.set_state(row.id, "in", "waiting", why)
                 return False
             import_parcel(self.station, row, plan)
             return True
@@ -381,7 +381,7 @@ def _send(station: Station, roster: Roster, transport: Transport) -> int:
             break  # too much waits there: the rest goes with the next sync
         with station.durable(_COMMAND):
             if row.kind == "bundle":
-                parcels.turn(row.id, "out", "sent")
+                parcels.set_state(row.id, "out", "sent")
             else:
                 parcels.drop(row.id, "out")
         sent += 1

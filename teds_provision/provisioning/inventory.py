@@ -77,7 +77,7 @@ def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[Kn
         for overview in page:
             found, record = judged.get(overview.uuid), reported.get(overview.uuid)
             profile = (overview.node or {}).get("profile")
-            runs = firmware.known_firmware(record, partial(demands.of, profile)) if record is not None else None
+            runs = firmware.known_firmware(record, partial(demands.demand_of, profile)) if record is not None else None
             yield _described(overview, found, runs), found
 
 

@@ -307,7 +307,7 @@ class _Run:
         if prepared.profile is not None:
             return prepared.profile.firmware
         known = self.station.nodes.get(who.uuid)
-        return FirmwareDemands(self.station.home).of(known.profile if known is not None else None)
+        return FirmwareDemands(self.station.home).demand_of(known.profile if known is not None else None)
 
     def _require_its_board(self, who: IdentifiedNode, prepared: PreparedOrder, changes: tuple[str, ...]) -> None:
         """Ask, or refuse, if the board claims another type; only the first of the two checks asks."""

@@ -175,7 +175,7 @@ class _Element:
     entries: int = 0
 
     @property
-    def own(self) -> dict[str, str]:
+    def whitelist_fields(self) -> dict[str, str]:
         """Those of its fields that a whitelist has."""
         return {key: value for key, value in self.fields.items() if key in FIELDS}
 
@@ -263,7 +263,7 @@ def _close_element(element: _Element, parent: _Element | None, reading: _Whiteli
 
 def _entry_of(element: _Element, text: str, leaf: bool, root: bool, reading: _WhitelistReader) -> int:
     """Take in what the element holds by itself; returns how many entries that were."""
-    own = element.own
+    own = element.whitelist_fields
     if "uuid" in own:
         reading.add(element.line, own)
         return 1

@@ -108,7 +108,7 @@ class FirmwareDemands:
     home: Path
     _read: dict[str, FirmwareDemand | None] = field(default_factory=dict)
 
-    def of(self, profile: str | None) -> FirmwareDemand | None:
+    def demand_of(self, profile: str | None) -> FirmwareDemand | None:
         """Return the table of a profile, None if it has none, or cannot be read (which doctor reports)."""
         if profile is None:
             return None
@@ -176,4 +176,6 @@ def firmware_of(station: Station, uuid: bytes, now: FirmwareReading | None = Non
     """Return what is known of one node's firmware, judged by its type; ``now`` is an answer that just came."""
     known = station.nodes.get(uuid)
     profile = known.profile if known is not None else None
-    return known_firmware(station.firmware_reports.get(uuid), lambda: FirmwareDemands(station.home).of(profile), now)
+    return known_firmware(
+        station.firmware_reports.get(uuid), lambda: FirmwareDemands(station.home).demand_of(profile), now
+    )

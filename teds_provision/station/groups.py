@@ -118,7 +118,7 @@ class Groups:
             self._report_member(name, self.get(name).uuids, member=False)
             return self._store.change("DELETE FROM groups WHERE name = ?", (name,)) > 0
 
-    def of(self, uuid: bytes) -> list[str]:
+    def names_of_node(self, uuid: bytes) -> list[str]:
         """Return the names of the groups that a node is in."""
         rows = self._store.execute("SELECT name FROM group_members WHERE uuid = ? ORDER BY name", (uuid,))
         return [str(name) for (name,) in rows]
@@ -128,7 +128,7 @@ class Groups:
 
         A group that is measured changes too, because the node is out of service: `ncap` begins that measurement again.
         """
-        names = self.of(old)
+        names = self.names_of_node(old)
         with self._store.together():
             for name in names:
                 self._remove(name, [old])

@@ -209,7 +209,7 @@ class Measurements:
 
     def _commands_with(self, uuid: bytes) -> list[str]:
         """Return the `measure` commands that live and have a node, in words."""
-        groups = self._groups.of(uuid)
+        groups = self._groups.names_of_node(uuid)
         mine = [
             measurement
             for measurement in self.of_commands()

@@ -140,7 +140,7 @@ class Curve:
         inputs = tuple(float(axis[place]) for axis, place in zip(self.axes, places, strict=True))
         return inputs, float(self.steps[places])
 
-    def after(self, value: float) -> float:
+    def next_sample(self, value: float) -> float:
         """Return the sample of the channel's own input that follows one."""
         axis = self.axes[self.main]
         return float(axis[min(int(np.searchsorted(axis, value, side="right")), len(axis) - 1)])

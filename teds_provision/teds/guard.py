@@ -123,7 +123,7 @@ def _not_monotone(curve: Curve, before: Curve | None) -> Iterator[Raised]:
         return
     inputs, step = curve.worst_step(demand)
     way = "falls" if step < 0 else "rises"
-    after = curve.after(inputs[curve.main])
+    after = curve.next_sample(inputs[curve.main])
     amount = _show(curve, abs(step), difference=True)
     text = f"the result {way} by {amount} from {_at(curve, inputs)} to {after:.8g}; {why}."
     yield "not-monotone", "error" if severity == "error" else "warning", text

@@ -134,12 +134,14 @@ class Sheet:
         if isinstance(channel, int):
             found = self.channel(channel)
         else:
-            alike = [one for one in self.channels if one.name.casefold() == channel.casefold()]
+            alike = [known for known in self.channels if known.name.casefold() == channel.casefold()]
             found = self.named(channel) or (alike[0] if len(alike) == 1 else None)
         if found is None:
-            known = ", ".join(f"{one.number} ({one.name})" if one.name else str(one.number) for one in self.channels)
+            listed = ", ".join(
+                f"{known.number} ({known.name})" if known.name else str(known.number) for known in self.channels
+            )
             which = channel if isinstance(channel, int) else repr(channel)
-            raise BadDataError(f"Node {node} has no channel {which}; its datasheet has {known or 'none'}.")
+            raise BadDataError(f"Node {node} has no channel {which}; its datasheet has {listed or 'none'}.")
         return found
 
     @property

@@ -51,7 +51,7 @@ class Hooks:
             case "g":
                 return own.points[channel], 1
             case "f":
-                own.safe(channel)
+                own.make_safe(channel)
             case "m":
                 self.timers.append((channel, argument))
             case "k":

@@ -85,7 +85,7 @@ CHANGES: Final[dict[str, Change]] = {
     ),
     "FAULT_TRANSCRIPT_EPOCH_NOT_PLUS_1": Change(
         "agree.c",
-        "    /* reply_head: nonceN, epoch, En as they stand in the reply */\n",
+        "    /* reply_head: nonceN, epoch, En as in the reply */\n",
         "    uint8_t head[85];\n    memcpy(head, reply_head, 85);\n    teds_put32(head + 16, node->state.epoch);\n"
         "    reply_head = head;\n",
     ),
@@ -274,7 +274,7 @@ CHANGES: Final[dict[str, Change]] = {
     # -- the agreement, once more
     "FAULT_TRANSCRIPT_EPOCH_LITTLE_ENDIAN": Change(
         "agree.c",
-        "    /* reply_head: nonceN, epoch, En as they stand in the reply */\n",
+        "    /* reply_head: nonceN, epoch, En as in the reply */\n",
         "    uint8_t head[85];\n    const uint32_t next = node->state.epoch + 1;\n    memcpy(head, reply_head, 85);\n"
         "    memcpy(head + 16, &next, 4);\n    reply_head = head;\n",
     ),
@@ -283,7 +283,7 @@ CHANGES: Final[dict[str, Change]] = {
     ),
     "FAULT_TRANSCRIPT_DIGEST_OF_DATA_BLOCK": Change(
         "agree.c",
-        "    /* reply_head: nonceN, epoch, En as they stand in the reply */\n",
+        "    /* reply_head: nonceN, epoch, En as in the reply */\n",
         "    uint8_t image[2048];\n    teds_source_read(node, &source, 0, image, source.length);\n"
         "    const teds_part block = {image + 4, source.length - 6};\n    teds_sha256_parts(node, &block, 1, teds);\n",
     ),

@@ -78,7 +78,7 @@ class Hardware:
     def set_point(self, channel: int) -> bytes:
         return self.points[channel]
 
-    def safe(self, channel: int) -> None:
+    def make_safe(self, channel: int) -> None:
         self.points[channel] = bytes(self.channels[channel].octets)
 
     def self_test(self, channels: Sequence[int]) -> None:

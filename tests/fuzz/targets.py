@@ -642,7 +642,7 @@ def check_certificate(data: bytes) -> None:
 
     choice = CertificateChoice(choose=lambda _, items: items[0][0])
     with suppress(TedsProvisionError):
-        shown = ShownCertificate.of(read_checked(data, "c.xml", (), NOW))
+        shown = ShownCertificate.from_certificate(read_checked(data, "c.xml", (), NOW))
         json.dumps(shown.to_json(), allow_nan=False)
         list(shown.lines())
         made = read_certified(data, "c.xml", load_profile("magnetic-angular-position-sensor"), choice)[1]

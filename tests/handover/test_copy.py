@@ -29,7 +29,7 @@ def test_after_a_copy_both_stations_reach_the_node(pair: Pair) -> None:
     record = pair.south.nodes.get(pair.board.uuid)
     assert record is not None
     assert (record.name, record.profile) == ("finger 1", "tactile-finger-sensor")
-    assert pair.south.groups.of(pair.board.uuid) == ["left hand"]
+    assert pair.south.groups.names_of_node(pair.board.uuid) == ["left hand"]
     entry = pair.south.pins.entry(pair.board.uuid)
     assert entry is not None
     assert (entry.assurance, entry.fingerprint is not None) == ("import", True)

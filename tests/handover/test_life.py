@@ -155,7 +155,7 @@ def test_a_spare_takes_over_name_groups_and_profile(pair: Pair) -> None:
     record = pair.north.nodes.get(spare.uuid)
     assert record is not None
     assert (record.name, record.profile) == ("finger 1", "tactile-finger-sensor")
-    assert pair.north.groups.of(spare.uuid) == ["left hand"]
+    assert pair.north.groups.names_of_node(spare.uuid) == ["left hand"]
     assert pair.north.nodes.resolve("finger 1") == spare.uuid
     old = pair.north.nodes.get(pair.board.uuid)
     assert old is not None

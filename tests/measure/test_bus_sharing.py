@@ -24,7 +24,7 @@ def measure(share: BusShare, order: list[tuple[bytes, Channel]]) -> dict[bytes, 
         share.wanted[uuid] = plan_node([channel], share.time).load
     plans = {}
     for uuid, channel in order:
-        plans[uuid] = plan_node([channel], share.others(uuid, sharing=True))
+        plans[uuid] = plan_node([channel], share.for_node(uuid, sharing=True))
         share.taken[uuid] = plans[uuid].load
     assert sum(share.taken.values()) <= MOST_LOAD
     return plans
@@ -68,9 +68,9 @@ def test_many_nodes_all_find_room() -> None:
 
 def test_an_asked_rate_is_kept_or_refused_and_never_shared() -> None:
     share = BusShare(BusTime(CanAirtime()), {FIRST, SECOND})
-    assert share.others(FIRST).taken == 0
+    assert share.for_node(FIRST).taken == 0
     share.taken[SECOND] = 0.25
-    assert share.others(FIRST).taken == 0.25
+    assert share.for_node(FIRST).taken == 0.25
 
 
 def test_a_node_waits_for_the_others_to_say_what_they_want() -> None:
@@ -78,11 +78,11 @@ def test_a_node_waits_for_the_others_to_say_what_they_want() -> None:
     seen: list[set[bytes]] = []
 
     def first() -> None:
-        share.want(FIRST, 0.5)
+        share.announce_share(FIRST, 0.5)
         seen.append(set(share.wanted))
 
     thread = threading.Thread(target=first)
     thread.start()
-    share.want(SECOND, 0.01)
+    share.announce_share(SECOND, 0.01)
     thread.join(60)
     assert seen == [{FIRST, SECOND}]

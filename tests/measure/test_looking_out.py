@@ -162,7 +162,7 @@ def test_a_node_that_is_lost_is_looked_for_at_once_while_another_one_is_missing_
     def lost() -> float:
         sightings.add_sighting(replace(one, at=time.monotonic()))
         asked_before, began = asked(hub)[0], time.monotonic()
-        sightings.wrong(one)
+        sightings.search_again(one)
         with suppress(LinkError):
             sightings.find(one.uuid, seconds=PATIENCE, stop=stop, fresh=time.monotonic())
         assert asked(hub)[0] > asked_before

@@ -96,7 +96,7 @@ def test_what_turned_out_wrong_goes_behind_another_that_says_the_same() -> None:
     sightings = Presence()
     forged, true = seen(ONE, 7), seen(ONE, 8)
     sightings.add_sighting(forged)
-    sightings.wrong(forged)
+    sightings.search_again(forged)
     for sighting in (seen(ONE, 7), true, seen(ONE, 7)):
         sightings.add_sighting(sighting)
     assert find(sightings, ONE).address == 8
@@ -111,14 +111,14 @@ def test_the_node_itself_is_waited_for_where_a_copy_of_its_identity_answers_soon
     copy, true = seen(ONE, 7), seen(ONE, 8)
     sightings.add_sighting(copy)
     sightings.add_sighting(true)
-    sightings.wrong(copy)
+    sightings.search_again(copy)
     lost = time.monotonic()
     sightings.add_sighting(seen(ONE, 7))
     with pytest.raises(NoNodeError):
         find(sightings, ONE, fresh=lost)
     sightings.add_sighting(seen(ONE, 8))
     assert find(sightings, ONE, fresh=lost).address == 8
-    sightings.wrong(seen(ONE, 8))
+    sightings.search_again(seen(ONE, 8))
     alone = time.monotonic()
     sightings.add_sighting(seen(ONE, 7))
     monkeypatch.setattr("teds_provision.measure.presence.TWIN", TWIN)
@@ -130,7 +130,7 @@ def test_a_copy_that_refuses_is_no_reason_to_give_a_node_up_that_answers_elsewhe
     sightings, unknown = Presence(), PolicyError("It knows none of the keys.")
     copy = seen(ONE, 7)
     sightings.add_sighting(copy)
-    sightings.wrong(copy)
+    sightings.search_again(copy)
     look = functools.partial(sightings.has_other_place, ONE)
     assert RetryPolicy(60.0).gives_up(unknown, proven=False, elsewhere=look), "nobody else answers"
     threading.Timer(TWIN / 5, sightings.add_sighting, [seen(ONE, 8)]).start()
@@ -145,7 +145,7 @@ def test_a_copy_that_refuses_while_the_node_is_silent_for_a_moment_is_no_reason_
     sightings, unknown = Presence(), PolicyError("It knows none of the keys.")
     for silent_then_copy in (8, 7):
         sightings.add_sighting(seen(ONE, silent_then_copy))
-        sightings.wrong(seen(ONE, silent_then_copy))
+        sightings.search_again(seen(ONE, silent_then_copy))
     look = functools.partial(sightings.has_other_place, ONE)
     assert not RetryPolicy(60.0).gives_up(unknown, proven=False, elsewhere=look)
 

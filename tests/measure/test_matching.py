@@ -51,11 +51,11 @@ def test_those_that_come_together_share_and_those_that_run_keep_what_they_have()
     share = BusShare(BusTime(CanAirtime()))
     first, second, third = (bytes([item]) * 10 for item in (1, 2, 3))
     share.expect([first, second], 0.5)
-    assert share.others(first, sharing=True).taken == pytest.approx(0.3), "half of the room is the other one's"
+    assert share.for_node(first, sharing=True).taken == pytest.approx(0.3), "half of the room is the other one's"
     share.taken[first] = share.taken[second] = 0.3
     share.expect([third], 0.1)
     assert share.room == 0.0
-    assert share.others(third, sharing=True).taken == pytest.approx(0.6)
+    assert share.for_node(third, sharing=True).taken == pytest.approx(0.6)
     share.drop_node(second)
     del share.taken[second]
     assert share.room == pytest.approx(0.3)

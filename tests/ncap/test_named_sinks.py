@@ -44,8 +44,8 @@ def test_a_name_stands_for_its_url_when_it_is_opened_and_is_told_where_it_is_gon
     sinks = DaemonSinks(tmp_path, ("mqtt://own",), actuators=True, brokers={"lab": LAB})
     assert (sinks.open("lab").name, sinks.open("mqtt").name) == ("mqtts://broker.lab", "mqtt://own")
     kept = KeptMeasurement("m", sinks=("mqtt",))
-    assert sinks.more(kept, None) == [], "the daemon's own broker is not served twice"
-    assert [sink.name for sink in sinks.more(KeptMeasurement("m", sinks=("lab",)), None)] == ["mqtt://own"]
+    assert sinks.extra_sinks(kept, None) == [], "the daemon's own broker is not served twice"
+    assert [sink.name for sink in sinks.extra_sinks(KeptMeasurement("m", sinks=("lab",)), None)] == ["mqtt://own"]
     with pytest.raises(UsageError, match="'lab' is no longer configured"):
         DaemonSinks(tmp_path, actuators=True).open("lab")
 

@@ -138,7 +138,7 @@ def test_the_counter_rises_only_by_an_image_that_was_confirmed(owner: Owner, fol
 def test_a_node_is_made_only_with_an_image_that_its_boot_loader_would_start(owner: Owner, tmp_path: Path) -> None:
     with pytest.raises(NotAuthenticError):
         ImageSlots.create(tmp_path, owner.old_file, owner.rival)
-    assert not ImageSlots.has(tmp_path)
+    assert not ImageSlots.exist_in(tmp_path)
     made = ImageSlots.create(tmp_path, owner.old_file, owner.key)
     assert state(made) == ("1.0.0", False, False)
     assert b"PRIVATE" not in b"".join(file.read_bytes() for file in (tmp_path / "firmware").iterdir())

@@ -193,7 +193,7 @@ def test_reasons_and_their_order() -> None:
     assert reading.raw == 1000 + 32768
     assert values.at(1.02) == (MISSING, "200.01 N·m is outside -200 to 200 N·m")
     assert values.at(1.05)[1].startswith("no frame for 30 ms")
-    values.trouble("the bus is gone")
+    values.note_trouble("the bus is gone")
     assert values.at(1.05)[1].endswith(": the bus is gone")
 
 

@@ -328,12 +328,12 @@ def test_a_type_is_read_once_for_all_nodes_that_come_together_and_again_when_it_
     monkeypatch.setattr("teds_provision.station.firmware.time.monotonic", lambda: 7.5)
     file = tmp_path / "type.toml"
     file.write_text(f'extends = "{ANGLE}"\n[firmware]\ntext = "nrf/angle"\n')
-    found = [FirmwareDemands(tmp_path).of(str(file)) for _ in range(20)]
+    found = [FirmwareDemands(tmp_path).demand_of(str(file)) for _ in range(20)]
     assert len(read) == 1
     assert {demand.text for demand in found if demand is not None} == {"nrf/angle"}
     file.write_text(f'extends = "{ANGLE}"\n[firmware]\ntext = "nrf/other"\n')
     os.utime(file, ns=(1, 1))
-    demand = FirmwareDemands(tmp_path).of(str(file))
+    demand = FirmwareDemands(tmp_path).demand_of(str(file))
     assert demand is not None
     assert demand.text == "nrf/other"
-    assert FirmwareDemands(tmp_path).of(str(tmp_path / "none.toml")) is None
+    assert FirmwareDemands(tmp_path).demand_of(str(tmp_path / "none.toml")) is None

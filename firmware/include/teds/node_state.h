@@ -23,14 +23,14 @@ typedef struct teds_node teds_node;
 
 /** @cond INSIDE */
 
-/* As it lies in the identity area; octets alone, so without gaps. */
+/* Layout of the identity area; octets alone, so without gaps. */
 typedef struct teds_identity {
     uint8_t uuid[10];
     teds_key_ref key;
     uint8_t point[65], signature[64]; /* signature: field 102 */
 } teds_identity;
 
-/* What an agreement makes, as it lies in a slot: link key, station, CA. */
+/* Result of an agreement, as stored in a slot: link key, station, CA. */
 typedef struct teds_agreed {
     uint8_t key[16], station[65], ca[65];
 } teds_agreed;
@@ -126,11 +126,11 @@ typedef struct teds_stream {
 #endif
 
 #if TEDS_OPERATION
-/* Of one event sensor, from its interrupt to the main loop: one side writes `in` and `lost`, the other `out` and `told`. */
+/* Of one event sensor, interrupt to main loop: one side writes `in` and `lost`, the other `out` and `reported`. */
 typedef struct teds_events {
     volatile uint8_t in, out;
     volatile uint16_t lost; /* found no room */
-    uint16_t told;
+    uint16_t reported;
     volatile struct {
         uint64_t tick;
         bool valid;
@@ -238,21 +238,21 @@ typedef struct teds_ble {
 } teds_ble;
 #endif
 
-/* What is small and asked for often stands first: an offset that fits into an instruction costs nothing. */
+/* Small members that are used often come first: an offset that fits into an instruction costs nothing. */
 struct teds_node {
     const teds_port *port;
     const teds_config *config;
     uint8_t slot; /* the one that counts */
     uint8_t firmware; /* flags of About, as last read */
     bool free_slot_dirty, old_slot_due;
-    bool identity_changed; /* answers to everyone on CAN that began before hold what Identify said then */
+    bool identity_changed; /* broadcast replies on CAN that began before hold the old reply to Identify */
     bool spare_slot_fails; /* it could not be erased when that was last tried: the node answers and writes nothing */
-    teds_session *staging_of; /* NULL: nobody's */
+    teds_session *staging_of; /* NULL: none */
     uint16_t staging_end;
     uint32_t slot_counter, records_end;
     uint64_t opens; /* c */
     uint64_t staged_until; /* then another session may take the staging */
-    uint64_t old_slot_by; /* then the old slot is erased, whoever still waits for a reply */
+    uint64_t old_slot_by; /* then the old slot is erased, even if a station still waits for a reply */
     uint64_t locate_until; /* 0: it does not blink */
     uint64_t address_again, strangers_again; /* from then on: a write of the address, a plain Read or List beside streams */
 #if TEDS_OPERATION

@@ -93,7 +93,7 @@ static uint32_t take_all(const images *own, int slot, uint32_t at, uint16_t magi
     return at == end ? end : 0;
 }
 
-/* Read what an image says; false if there is none in the slot. */
+/* Read the header of an image; false if there is none in the slot. */
 bool image_read(const images *own, int slot, image_facts *out)
 {
     uint8_t head[HEADER_OCTETS];
@@ -297,7 +297,7 @@ static bool may_start(const images *own, int slot, image_facts *facts)
 static int change(images *own)
 {
     image_facts facts;
-    if (own->mode == TRIAL) { /* nobody confirmed it */
+    if (own->mode == TRIAL) { /* not confirmed */
         return decide(own, other(own), SETTLED, own->counter);
     }
     if (own->mode == PENDING && may_start(own, other(own), &facts)) {

@@ -81,7 +81,7 @@ typedef struct host_pace {
 void host_pace_start(host_pace *pace);
 /* ns of CLOCK_MONOTONIC. */
 uint64_t host_clock(void);
-/* When the kernel had this datagram, by SO_TIMESTAMPNS; now where it does not say. */
+/* When the kernel had this datagram, by SO_TIMESTAMPNS; now if it gives none. */
 uint64_t host_arrival(struct msghdr *message);
 void host_pace_came(host_pace *pace, uint64_t at);
 /* Wait until this frame would be through. */

@@ -25,7 +25,7 @@ typedef struct images_flash {
     uint32_t slot_octets; /* whole pages */
 } images_flash;
 
-/* What header and TLVs of an image say. */
+/* Facts from header and TLVs of an image. */
 typedef struct image_facts {
     uint32_t header, octets, signed_octets, flags; /* signed: header, payload and protected TLVs */
     uint8_t major, minor;
@@ -68,7 +68,7 @@ size_t images_manage(images *own, const uint8_t *packet, size_t length, uint8_t 
 int images_confirm(images *own);
 int images_try(images *own);
 bool images_pending(const images *own);
-/* Read what the image of a slot says; false if there is none. */
+/* Read the facts of a slot's image; false if there is none. */
 bool image_read(const images *own, int slot, image_facts *out);
 
 #endif

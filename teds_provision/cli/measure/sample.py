@@ -228,7 +228,7 @@ def set_value(
     stop = provisioning.meeting.IdleStop(None)
     links = where_met(station, over_the_bus(links), [uuid])
     with (
-        measure.sources.beside(station, links, f"set {uuid.hex()}") as own,
+        measure.sources.own_source_address(station, links, f"set {uuid.hex()}") as own,
         trusted_node(app, station, own, uuid, by="set") as trusted,
         ending(stop),
     ):

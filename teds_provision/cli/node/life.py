@@ -197,7 +197,7 @@ def replace(
     with station.lock("replace", app.note):
         plan = plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
         result, text = _takeover(plan)
-        result["groups"] = station.groups.of(spare if plan.done else octets)
+        result["groups"] = station.groups.names_of_node(spare if plan.done else octets)
         if dry_run:
             app.emit({**result, "plan": True}, f"Plan: {text}.")
             return

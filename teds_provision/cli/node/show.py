@@ -411,7 +411,7 @@ def load(name: str, edition: Edition | None = None, trusted: tuple[bytes, ...] =
         raise _no_teds(name, octets, "")
     if looks_like_certificate(octets):
         certificate = teds.dcc.signature.read_checked(octets, name, trusted, datetime.now(UTC))
-        shown = teds.dcc.shown.ShownCertificate.of(certificate)
+        shown = teds.dcc.shown.ShownCertificate.from_certificate(certificate)
         return ShownFile(name, "xml", certificate=shown, notes=certificate.warnings)
     try:
         kind = detect(octets)

@@ -384,8 +384,11 @@ def measure(app: App, expression: str, rate: float | None, frozen: bool, files: 
 def _stop(app: App, wanted: str) -> None:
     """End the measurements of an expression or group, or the one with an id; raises NotFoundError, PolicyError."""
     with client.connect(home=app.home) as running:
-        kept = {one["id"]: one for one in running.measurements()}
-        named = {id_: one["match"] or one["group"] or ", ".join(one["uuids"]) for id_, one in kept.items()}
+        kept = {measured["id"]: measured for measured in running.measurements()}
+        named = {
+            id_: measured["match"] or measured["group"] or ", ".join(measured["uuids"])
+            for id_, measured in kept.items()
+        }
         meant = [id_ for id_, what in named.items() if wanted in (id_, what, "all")]
         commands = [id_ for id_ in meant if kept[id_]["owner"] == COMMAND]
         ends = [id_ for id_ in meant if id_ not in commands]

@@ -69,7 +69,7 @@ def log(
     choice = AuditFilter(
         station.nodes.resolve(uuid) if uuid else None, act, failed, since=moment(wanted) if wanted is not None else None
     )
-    after = audit_log.before(choice, last=last)
+    after = audit_log.entry_before(choice, last=last)
     verdict = audit_log.check(after)
     if follow:
         _follow(app, station, choice, verdict, after)

@@ -392,7 +392,7 @@ class Measurement:
             {"sink": sink.name, "written": sink.stats.written, "dropped": sink.stats.dropped} for sink in self.sinks
         ]
         totals = [totals for supervisor in self.supervisors for totals in supervisor.streams.totals.values()]
-        rates = [rate for each in totals if (rate := each.lower_rate) is not None]
+        rates = [rate for stream in totals if (rate := stream.lower_rate) is not None]
         return MeasurementEnd(nodes, files, worst, self._common_start.spread, sinks, min(rates, default=None))
 
 

@@ -38,7 +38,7 @@ class RetryPolicy:
         """Seconds in which a first value has to come."""
         return max(0.0, self._until - time.monotonic())
 
-    def again(self, pause: float) -> str:
+    def next_try(self, pause: float) -> str:
         """Return when it is tried again, and for how long, as text."""
         left = self.seconds_left
         return f"{pause:.0f} s" if left == math.inf else f"{min(pause, left):.0f} s, giving up in {left:.0f} s"

@@ -180,7 +180,7 @@ class NodeDirectory:
             members |= {} if verdict is None else {"verdict": verdict}
             self._live.event("node", uuid=uuid, state=state, **members)
 
-    def heard(self) -> frozenset[str]:
+    def answering_on(self) -> frozenset[str]:
         """Return the nodes that answer on a link now, strangers of whitelist mode included."""
         with self._lock:
             here = {uuid for uuid, seen in self._seen.items() if seen.present}
@@ -230,7 +230,7 @@ class NodeDirectory:
         with self._lock:
             return self._stored(uuid).name or ""
 
-    def called(self, uuid: str) -> tuple[str, bool]:
+    def published_name(self, uuid: str) -> tuple[str, bool]:
         """Return the name under which a node is published, and whether it is the node's own, unverified claim."""
         channels = self._sheet(uuid)
         with self._lock:
@@ -321,7 +321,7 @@ class NodeDirectory:
                     "firmware": known.firmware or seen.firmware,
                 }
             )
-        called, unverified = self.called(uuid)
+        called, unverified = self.published_name(uuid)
         out["unverified"] = unverified
         if unverified:  # what it calls itself, marked
             out["name"] = out["name"] or called or None

@@ -141,7 +141,7 @@ class Updates:
         with self._guard:
             return [action.as_json() for action in sorted(self._actions.values(), key=by_age, reverse=True)]
 
-    def one(self, action_id: str) -> dict[str, Any]:
+    def get(self, action_id: str) -> dict[str, Any]:
         """Return an action; raises NotFoundError."""
         with self._guard:
             return self._get(action_id).as_json()

@@ -169,12 +169,12 @@ def _live(daemon: Daemon) -> Callable[[WebSocket], Awaitable[None]]:
             await socket.accept()
             listener = daemon.live.join(reader=caller.read_only)
             try:
-                tasks.append(asyncio.create_task(_send(socket, listener, daemon.hello())))
+                tasks.append(asyncio.create_task(_send(socket, listener, daemon.first_message())))
                 tasks.append(asyncio.create_task(_end_in_time(socket, daemon, caller, leaving)))
                 while (await socket.receive())["type"] != "websocket.disconnect":
                     pass
             finally:
-                daemon.live.leave(listener)
+                daemon.live.remove_client(listener)
         finally:
             places.release(caller.digest, leave)
             for task in tasks:

@@ -114,11 +114,11 @@ class Resources:
     async def profiles(self, _request: Request) -> Response:
         """GET /profiles: the transducer types that can be built."""
 
-        def found() -> list[dict[str, Any]]:
+        def buildable() -> list[dict[str, Any]]:
             entries = [listed(entry) for entry in list_profiles(default_folders(self._daemon.station.home))]
             return [entry for entry in entries if "error" not in entry and not entry.get("abstract")]
 
-        return JSONResponse({"profiles": await asyncio.to_thread(found)})
+        return JSONResponse({"profiles": await asyncio.to_thread(buildable)})
 
     async def log(self, request: Request) -> Response:
         """GET /log: the newest selected entries, before ``before`` if it is given, and the verdict on them."""
@@ -137,7 +137,7 @@ class Resources:
         log = self._daemon.station.audit_log
         if uuid:
             choice = replace(choice, uuid=bytes.fromhex(self._daemon.resolve(uuid)))
-        after = log.before(choice, last=limit)
+        after = log.entry_before(choice, last=limit)
         verdict = log.check(after)
         entries = [
             {
@@ -207,7 +207,7 @@ class Resources:
         why = f"let go for {request.query_params.get('for', 'a command')[:40]}"
         loan = NodeLoan(uuid, why)
 
-        def let_go() -> bool:
+        def lend() -> bool:
             if request.query_params.get("for") == "update":
                 self._daemon.updates.require_free(uuid)
             return measuring.lend_node(loan)
@@ -215,7 +215,7 @@ class Resources:
         async def had() -> AsyncIterator[str]:
             try:
                 try:
-                    yield "let go\n" if await changing(let_go) else "not measured\n"
+                    yield "let go\n" if await changing(lend) else "not measured\n"
                 except TedsProvisionError as error:
                     yield f"refused: {error.message}\n"
                     return
@@ -361,7 +361,7 @@ class Resources:
 
     async def update(self, request: Request) -> Response:
         """GET, DELETE /updates/ID: how an update goes; begin no further board."""
-        work = self._daemon.updates.one if request.method == "GET" else self._daemon.updates.cancel
+        work = self._daemon.updates.get if request.method == "GET" else self._daemon.updates.cancel
         return _shown(request, await changing(work, request.path_params["id"]))
 
     # -- groups and measurements -------------------------------------------------------------------------------------

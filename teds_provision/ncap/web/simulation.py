@@ -108,7 +108,9 @@ class _Session:
     async def run(self, reader: asyncio.StreamReader, gone: asyncio.Event, watching: Awaitable[None]) -> None:
         """Take lines until the simulation, its token or its transducer is gone."""
         await self.socket.accept()
-        tasks = [asyncio.ensure_future(work) for work in (self._take(), self._act(reader), gone.wait(), watching)]
+        tasks = [
+            asyncio.ensure_future(work) for work in (self._receive_lines(), self._act(reader), gone.wait(), watching)
+        ]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             states = self.socket.client_state, self.socket.application_state
@@ -120,7 +122,7 @@ class _Session:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _take(self) -> None:
+    async def _receive_lines(self) -> None:
         ready = {"ready": True, "channels": [channel.as_json() for channel in self.channels], "limit": MOST_OCTETS}
         lines, pace = CheckedLines(self.channels), Pace()
         with suppress(WebSocketDisconnect, RuntimeError, OSError):  # it has gone by itself

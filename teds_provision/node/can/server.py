@@ -67,7 +67,7 @@ class EndpointTable:
         for endpoint in self._endpoints:
             self._at.setdefault(endpoint.address, []).append(endpoint)
 
-    def heard(self, source: int) -> None:
+    def record_use(self, source: int) -> None:
         """Record that an address is in use: a frame came from it."""
         if 1 <= source <= LAST_NODE and source not in self._known:
             self._known.add(source)
@@ -359,7 +359,7 @@ class CanServer:
 
     def _dispatch(self, frame: Frame) -> None:
         source = frame.identifier & 0xFF
-        self._addresses.heard(source)
+        self._addresses.record_use(source)
         if is_announce(frame.identifier):
             self._addresses.announced(frame, None)
         elif FIRST_STATION <= source <= LAST_STATION:

@@ -58,7 +58,7 @@ class ImageSlots:
         Raises NotFoundError, BadDataError, NotAuthenticError, StoreError.
         """
         first = load_firmware_image(image, key)
-        if not cls.has(folder):
+        if not cls.exist_in(folder):
             own = folder / FOLDER
             try:
                 own.mkdir(mode=0o700, exist_ok=True)
@@ -73,7 +73,7 @@ class ImageSlots:
         return slots
 
     @staticmethod
-    def has(folder: Path) -> bool:
+    def exist_in(folder: Path) -> bool:
         """Return True if the node in ``folder`` has slots."""
         return (folder / FOLDER / _STATE).exists()
 

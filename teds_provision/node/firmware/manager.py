@@ -48,7 +48,7 @@ class ImageError(IntEnum):
     SETTING_TEST_TO_ACTIVE_DENIED = 33
 
 
-class _ErrorReply(Exception):
+class _ReplyError(Exception):
     def __init__(self, error: int, group: int = _IMAGE) -> None:
         super().__init__(f"group {group}, error {error}")
         self.group, self.error = group, error
@@ -108,7 +108,7 @@ class ImageManager:
         asked = decode_packet(packet)
         try:
             answer = self._commands[asked.command](decode_map(asked.body))
-        except _ErrorReply as failed:
+        except _ReplyError as failed:
             answer = {"err": {"group": failed.group, "rc": int(failed.error)}}
         except (OSError, TedsProvisionError):
             answer = {"err": {"group": _IMAGE, "rc": int(ImageError.FLASH_WRITE_FAILED)}}
@@ -125,7 +125,7 @@ class ImageManager:
             return {"bootloader": "MCUboot"}
         if query == "mode":
             return {"mode": _SWAP_MOVE}
-        raise _ErrorReply(_QUERY_HAS_NO_ANSWER, _OS)
+        raise _ReplyError(_QUERY_HAS_NO_ANSWER, _OS)
 
     def _states(self) -> Mapping[str, Any]:
         slots, other = self._slots, self._slots.other
@@ -140,9 +140,9 @@ class ImageManager:
         if digest is None:
             self._slots.confirm()
         elif digest == self._slots.running.digest:
-            raise _ErrorReply(ImageError.SETTING_TEST_TO_ACTIVE_DENIED)
+            raise _ReplyError(ImageError.SETTING_TEST_TO_ACTIVE_DENIED)
         elif not self._slots.start_next(digest):
-            raise _ErrorReply(ImageError.INVALID_HASH)
+            raise _ReplyError(ImageError.INVALID_HASH)
         return self._states()
 
     def _list_slots(self, _body: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -152,20 +152,20 @@ class ImageManager:
         """Take a piece and return how far the upload is; a piece that does not fit there changes nothing."""
         offset, data, sha = body.get("off"), body.get("data", b""), body.get("sha", b"")
         if body.get("image", 0) != 0 or not isinstance(data, bytes):
-            raise _ErrorReply(ImageError.UNKNOWN)
+            raise _ReplyError(ImageError.UNKNOWN)
         if offset == 0:
             length = body.get("len")
             if not isinstance(length, int) or isinstance(length, bool) or length < 1:
-                raise _ErrorReply(ImageError.INVALID_LENGTH)
+                raise _ReplyError(ImageError.INVALID_LENGTH)
             if length > SLOT_OCTETS:
-                raise _ErrorReply(ImageError.TOO_LARGE)
+                raise _ReplyError(ImageError.TOO_LARGE)
             if sha and (sha, length) == (self._sha, self._length):
                 return {"off": self._offset}
             self._sha, self._length, self._offset = sha, length, 0
         if offset != self._offset or not self._length:
             return {"off": self._offset}
         if offset + len(data) > self._length:
-            raise _ErrorReply(ImageError.DATA_OVERRUN)
+            raise _ReplyError(ImageError.DATA_OVERRUN)
         self._slots.write(offset, data)
         self._offset += len(data)
         if self._offset < self._length:

@@ -144,7 +144,7 @@ class Board:
     def stop(self) -> None:
         """Bring every actuator to its safe state, and end the source."""
         for channel in self._safe_state:
-            self.safe(channel)
+            self.make_safe(channel)
         self.source.stop()
 
     # -- clock -----------------------------------------------------------------------------------------------------
@@ -213,7 +213,7 @@ class Board:
         """Return the present value of an actuator."""
         return self._set_points[channel]
 
-    def safe(self, channel: int) -> None:
+    def make_safe(self, channel: int) -> None:
         """Bring an actuator to its safe state: LowLimit."""
         with self._lock:
             self._set_points[channel] = self._safe_state[channel]

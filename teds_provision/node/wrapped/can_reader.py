@@ -53,10 +53,10 @@ class MessageReader:
             part = self._by_name[name]
             part.put(frame.at, raw, j1939_state(part.channel.bits, raw) if self._j1939 else "")
 
-    def trouble(self, why: str) -> None:
+    def note_trouble(self, why: str) -> None:
         """Note why nothing comes."""
         for part in self.values:
-            part.trouble(why)
+            part.note_trouble(why)
 
     def _is_ours(self, frame: SensorFrame) -> bool:
         """Return True if the frame is from the first source address that sent this group, until that one is silent."""
@@ -121,7 +121,7 @@ class CanReader:
 
     def _read(self, bus: SensorBus) -> None:
         for reader in self._readers:
-            reader.trouble("")
+            reader.note_trouble("")
         while not self._stop.is_set():
             frame = bus.receive(_WAIT)
             while frame is not None and not self._stop.is_set():
@@ -133,7 +133,7 @@ class CanReader:
     def _lost(self, why: str) -> None:
         self._notify(f"{why} The values of the wrapped sensors are invalid until the bus is back.")
         for reader in self._readers:
-            reader.trouble(why.rstrip("."))
+            reader.note_trouble(why.rstrip("."))
         if self._bus is not None:
             self._bus.close()
             self._bus = None

@@ -53,10 +53,10 @@ class DeviceReader:
         self._node = canopen.RemoteNode(self.node_id, self.objects)
         network.add_node(self._node)
 
-    def trouble(self, why: str) -> None:
+    def note_trouble(self, why: str) -> None:
         """Note why nothing comes, for the reasons; print each new cause once."""
         for part in self.values:
-            part.trouble(why)
+            part.note_trouble(why)
         if why and why != self._told:
             self._notify(f"CANopen device {self.node_id}: {why}.")
         self._told = why
@@ -71,7 +71,7 @@ class DeviceReader:
         try:
             self._node.tpdo.read()  # type: ignore[no-untyped-call]
         except (SdoError, OSError, KeyError, ValueError) as error:
-            self.trouble(f"its PDO mapping cannot be read ({str(error).strip() or type(error).__name__})")
+            self.note_trouble(f"its PDO mapping cannot be read ({str(error).strip() or type(error).__name__})")
             return False
         for pdo in self._node.tpdo.values():
             if not pdo.enabled:
@@ -82,8 +82,8 @@ class DeviceReader:
                 pdo.add_callback(self._received)
         for place, part in self._by_object.items():
             if place not in self._mapped:
-                part.called("SDO reply")
-        self.trouble("")
+                part.set_carrier("SDO reply")
+        self.note_trouble("")
         self._ready = True
         return True
 
@@ -99,9 +99,9 @@ class DeviceReader:
             try:
                 raw = self._sdo(variable).raw
             except (SdoError, OSError, KeyError, ValueError) as error:
-                part.trouble(f"the device refuses it ({str(error).strip() or type(error).__name__})")
+                part.note_trouble(f"the device refuses it ({str(error).strip() or type(error).__name__})")
                 continue
-            part.trouble("")
+            part.note_trouble("")
             if isinstance(raw, int | float):
                 part.put(time.monotonic(), raw)
 
@@ -127,7 +127,7 @@ class DeviceReader:
                 if part is not None and isinstance(raw, int | float):
                     part.put(at, raw)
         except Exception as error:
-            self.trouble(f"a PDO cannot be decoded ({error})")
+            self.note_trouble(f"a PDO cannot be decoded ({error})")
             logging.getLogger(__name__).debug("A PDO could not be decoded.", exc_info=True)
 
 
@@ -183,4 +183,4 @@ class CanopenReader:
         failure = getattr(getattr(self._network, "notifier", None), "exception", None)
         if failure is not None:
             for device in self._devices:
-                device.trouble(f"the CAN bus {self._spec.text} cannot be read ({failure})")
+                device.note_trouble(f"the CAN bus {self._spec.text} cannot be read ({failure})")

@@ -94,9 +94,9 @@ class IioReader:
             raw = float(channel.file.read_text())
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else "it holds no number"
-            part.trouble(f"{channel.file.name} cannot be read: {reason}")
+            part.note_trouble(f"{channel.file.name} cannot be read: {reason}")
             return
-        part.trouble("")
+        part.note_trouble("")
         part.put(at, raw)
 
     # -- buffer ----------------------------------------------------------------------------------------------------
@@ -170,4 +170,4 @@ class IioReader:
 
     def _trouble(self, why: str) -> None:
         for _, part in self._parts:
-            part.trouble(why)
+            part.note_trouble(why)

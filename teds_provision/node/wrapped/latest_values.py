@@ -51,11 +51,11 @@ class LatestValues:
         """Keep an arrival."""
         self._arrivals.append(Arrival(at, raw, problem))
 
-    def called(self, what: str) -> None:
+    def set_carrier(self, what: str) -> None:
         """Name what carries the values in reasons: frame, PDO, SDO reply, reading."""
         self._what = what
 
-    def trouble(self, why: str) -> None:
+    def note_trouble(self, why: str) -> None:
         """Note why nothing comes, "" for no known cause; it is a part of the reason while values are late."""
         self._trouble = why
 

@@ -135,7 +135,7 @@ class Claims:
         return min(due, default=None)
 
     def _go_safe(self, channel: int) -> None:
-        self._hardware.safe(channel)
+        self._hardware.make_safe(channel)
         self.safe.add(channel)
 
 

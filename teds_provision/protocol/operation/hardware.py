@@ -81,7 +81,7 @@ class Hardware(Protocol):
     def set_point(self, channel: int) -> bytes:
         """Return the present value of an actuator."""
 
-    def safe(self, channel: int) -> None:
+    def make_safe(self, channel: int) -> None:
         """Bring an actuator to its safe state, as ActHalt requires."""
 
     def self_test(self, channels: Sequence[int]) -> None:

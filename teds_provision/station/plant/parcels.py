@@ -73,7 +73,7 @@ class Parcels:
             f"INSERT OR REPLACE INTO parcels({_ROW}, document) VALUES({places(values)}, ?)", (*values, document)
         )
 
-    def turn(self, id: str, direction: Direction, state: ParcelState, detail: str = "") -> None:
+    def set_state(self, id: str, direction: Direction, state: ParcelState, detail: str = "") -> None:
         """Note what became of a parcel."""
         self._store.execute(
             "UPDATE parcels SET state = ?, detail = ? WHERE id = ? AND direction = ?", (state, detail, id, direction)

@@ -159,7 +159,7 @@ class AuditLog:
         row = self._database.first_row("SELECT seq, hash FROM audit ORDER BY seq DESC LIMIT 1")
         return (int(row[0]), bytes(row[1]).hex()) if row is not None else (0, self._root.hex())
 
-    def before(self, choice: AuditFilter, *, last: int | None = None) -> int:
+    def entry_before(self, choice: AuditFilter, *, last: int | None = None) -> int:
         """Return the number of the entry before the first one to show: of the ``last`` chosen, or made ``since``.
 
         With ``last`` the search starts at the end. A time does not determine the position, as clocks are set back, so

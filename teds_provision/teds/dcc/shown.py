@@ -20,7 +20,7 @@ class ShownCertificate:
     items: tuple[CertificateItem, ...]
 
     @classmethod
-    def of(cls, certificate: DigitalCertificate) -> ShownCertificate:
+    def from_certificate(cls, certificate: DigitalCertificate) -> ShownCertificate:
         """Find the results of a certificate."""
         return cls(certificate, tuple(items_of(certificate)))
 

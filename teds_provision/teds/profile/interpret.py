@@ -116,7 +116,7 @@ def _channel(section: Section, number: int) -> ChannelProfile | None:
 def _unit(section: Section, key: str, *, required: bool = False) -> WrittenUnit | None:
     text = section.text(key)
     if not text:
-        if required and section.where(key) == section.table.where:
+        if required and section.place_of(key) == section.table.where:
             section.error(key, 'missing (the physical unit). Write for example: unit = "degree"')
         return None
     try:

@@ -225,7 +225,7 @@ def files_digest(path: Path, folders: Sequence[Path]) -> str:
         following = _extended(parse(read_text(following), str(following)), following, folders, chain)
     if len(octets) == 1:
         return hashlib.sha256(octets[0]).hexdigest()
-    framed = (len(one).to_bytes(4, "big") + one for one in reversed(octets))
+    framed = (len(file).to_bytes(4, "big") + file for file in reversed(octets))
     return hashlib.sha256(b"".join(framed)).hexdigest()
 
 

@@ -248,18 +248,18 @@ class Section:
         """Return the dotted path of a key."""
         return f"{self.table.path}.{key}" if self.table.path else key
 
-    def where(self, key: str) -> SourcePlace:
+    def place_of(self, key: str) -> SourcePlace:
         """Return the place of a key, or of the table if the key is missing."""
         entry = self.table.entries.get(key)
         return self.table.where if entry is None else entry.where
 
     def error(self, key: str, message: str) -> None:
         """Report an error at a key."""
-        self.problems.error(self.where(key), self.path(key), message)
+        self.problems.error(self.place_of(key), self.path(key), message)
 
     def warning(self, key: str, message: str) -> None:
         """Report a warning at a key."""
-        self.problems.warning(self.where(key), self.path(key), message)
+        self.problems.warning(self.place_of(key), self.path(key), message)
 
     def item(self, key: str) -> object:
         """Return the value of a key, None if it is absent; a table there is an error."""

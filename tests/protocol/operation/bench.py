@@ -90,7 +90,7 @@ class FakeHardware:
     def set_point(self, channel: int) -> bytes:
         return self.points[channel]
 
-    def safe(self, channel: int) -> None:
+    def make_safe(self, channel: int) -> None:
         self.points[channel] = SAFE_VALUE
         self.log.append(("safe", channel))
 

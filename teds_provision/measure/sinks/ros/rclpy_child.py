@@ -21,7 +21,7 @@ HISTORY = 100  # messages that a reader may be behind: a burst of rows fits
 INTERFACES = ("position", "velocity", "effort")  # of sensor_msgs/JointState
 
 
-def say(**words: object) -> None:
+def send_line(**words: object) -> None:
     """Send one line to the parent."""
     with _OUT:
         sys.stdout.write(json.dumps(words) + "\n")
@@ -205,7 +205,7 @@ class Bridge:
             return
 
         def came(message: Any) -> None:
-            say(event="command", uuid=uuid, channel=channel, value=repr(message.data))
+            send_line(event="command", uuid=uuid, channel=channel, value=repr(message.data))
 
         kind, asked = self.type_of("std_msgs/Float64"), self.qos(latched=False, reading=True)
         self.listening[line["topic"]] = self.node.create_subscription(kind, line["topic"], came, asked)
@@ -217,7 +217,7 @@ class Bridge:
 
         def came(message: Any) -> None:
             given = {name: [repr(float(number)) for number in getattr(message, name)] for name in INTERFACES}
-            say(event="joints", names=list(message.name), **given)
+            send_line(event="joints", names=list(message.name), **given)
 
         kind, asked = self.type_of("sensor_msgs/JointState"), self.qos(latched=False, reading=True)
         self.listening[line["topic"]] = self.node.create_subscription(kind, line["topic"], came, asked)
@@ -237,7 +237,7 @@ def main() -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     threading.Thread(target=executor.spin, daemon=True).start()
-    say(event="ready", node=node.get_name())
+    send_line(event="ready", node=node.get_name())
     for line in sys.stdin:
         words = json.loads(line)
         getattr(bridge, words["op"])(words)

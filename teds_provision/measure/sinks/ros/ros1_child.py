@@ -34,7 +34,7 @@ LEAVING = 1.0  # seconds for the last messages to leave
 INTERFACES = ("position", "velocity", "effort")  # of sensor_msgs/JointState
 
 
-def say(**words: object) -> None:
+def send_line(**words: object) -> None:
     """Send one line to the parent."""
     with _OUT:
         sys.stdout.write(json.dumps(words) + "\n")
@@ -51,7 +51,7 @@ def wait_for_master(rosgraph: Any) -> None:
         if os.getppid() != parent:
             os._exit(0)  # a parent that was killed closes our stdin, which is not read yet
         if not reported:
-            say(event="waiting", master=os.environ.get("ROS_MASTER_URI", "http://localhost:11311"))
+            send_line(event="waiting", master=os.environ.get("ROS_MASTER_URI", "http://localhost:11311"))
             reported = True
         time.sleep(WATCH)
 
@@ -225,7 +225,7 @@ class Bridge:
         try:
             self.rospy.set_param(line["key"], line["value"])
         except Exception as error:  # noqa: BLE001  rospy lets sockets' and XML-RPC's exceptions through
-            say(event="trouble", what=f"parameter {line['key']}: {error}")
+            send_line(event="trouble", what=f"parameter {line['key']}: {error}")
 
     def listen(self, line: dict[str, Any]) -> None:
         """Set points of an actuator, newest only."""
@@ -234,7 +234,7 @@ class Bridge:
             return
 
         def came(message: Any) -> None:
-            say(event="command", uuid=uuid, channel=channel, value=repr(message.data))
+            send_line(event="command", uuid=uuid, channel=channel, value=repr(message.data))
 
         kind = self.type_of("std_msgs/Float64")
         self.listening[line["topic"]] = self.rospy.Subscriber(line["topic"], kind, came, queue_size=1)
@@ -246,7 +246,7 @@ class Bridge:
 
         def came(message: Any) -> None:
             given = {name: [repr(float(number)) for number in getattr(message, name)] for name in INTERFACES}
-            say(event="joints", names=list(message.name), **given)
+            send_line(event="joints", names=list(message.name), **given)
 
         kind = self.type_of("sensor_msgs/JointState")
         self.listening[line["topic"]] = self.rospy.Subscriber(line["topic"], kind, came, queue_size=1)
@@ -262,7 +262,7 @@ def main() -> None:
     rospy.core.add_preshutdown_hook(leave)
     bridge = Bridge(rospy, rosgraph.Master(rospy.get_name()))
     threading.Thread(target=watch_master, args=(rosgraph, rospy.get_name()), daemon=True).start()
-    say(event="ready", node=rospy.get_name())
+    send_line(event="ready", node=rospy.get_name())
     for line in sys.stdin:
         words = json.loads(line)
         getattr(bridge, words["op"])(words)

@@ -142,16 +142,16 @@ class Ros2Sink(TopicSink):
         gid, info = (types.HumbleGid, types.HumbleNodeEntitiesInfo) if humble else (types.Gid, types.NodeEntitiesInfo)
         whole = types.HumbleParticipantEntitiesInfo if humble else types.ParticipantEntitiesInfo
 
-        def of(entity: Any) -> Any:
+        def gid_of(entity: Any) -> Any:
             return gid(data=list(entity.guid.bytes) + [0] * (8 if humble else 0))
 
         node = info(
             node_namespace="/",
             node_name=self._node,
-            reader_gid_seq=[of(reader) for reader, _, _ in self._readers.values()],
-            writer_gid_seq=[of(writer) for writer in self._writers.values()],
+            reader_gid_seq=[gid_of(reader) for reader, _, _ in self._readers.values()],
+            writer_gid_seq=[gid_of(writer) for writer in self._writers.values()],
         )
-        self._write(self._graph, whole(gid=of(self._participant), node_entities_info_seq=[node]), 0)
+        self._write(self._graph, whole(gid=gid_of(self._participant), node_entities_info_seq=[node]), 0)
 
     def _idle(self, now: float) -> None:
         super()._idle(now)
