@@ -28,7 +28,7 @@ _LEAST: Final = 1e-6
 class _AtOnce:
     """Workers that have done their job when it is given to them."""
 
-    def turns(self) -> JobQueue:
+    def new_queue(self) -> JobQueue:
         return JobQueue(lambda job: job())
 
 
