@@ -379,7 +379,8 @@ class VirtualNode:
             if wait is not None:
                 for channel, tick, reading in board.events():
                     self.tim.event(channel, tick, reading.octets, valid=reading.valid)
-        if wait is None:
+        if wait is None:  # no stream runs any more
+            self._report_missed(board)
             return None
         frame = self._send_frames()
         self._report_missed(board)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from teds_provision.node.hardware.board import ActuatorReading, Battery, Board
 from teds_provision.node.hardware.clock import NodeClock
+from teds_provision.node.node_template import create
+from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.operation.commands import PowerFlag
+from teds_provision.protocol.tim import Tim
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import list_profiles, load_profile
 from teds_provision.teds.sheet import Sheet
@@ -84,3 +89,24 @@ def test_a_battery_is_charged_in_the_field_and_emptied_outside() -> None:
     battery.field(present=False)
     now[0] += 60 * 200
     assert battery.power().level == 0
+
+
+def test_what_could_not_be_sent_is_told_to_the_last_when_all_streams_have_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every ten seconds while one runs; nothing was left to do then, and what was missed last was told by nobody."""
+    made, told = (
+        create(tmp_path / "node", uuid=bytes(range(10)), profile="magnetic-angular-position-sensor"),
+        list[str](),
+    )
+    sheet = Sheet.from_image(Image(made.load().uuid, dict(made.load().blocks)))
+    made.release()
+    node = VirtualNode(tmp_path / "node", board=lambda _file: Board(sheet, notify=told.append))
+    counts = iter((1, 3, 4))
+    running = iter((True, True, False))
+    monkeypatch.setattr(Tim, "missed", property(lambda _tim: next(counts)))
+    monkeypatch.setattr(Tim, "streaming", property(lambda _tim: next(running)))
+    for wait in (0.1, 0.1, None):
+        monkeypatch.setattr(Tim, "poll", lambda _tim, wait=wait: wait)
+        node.beat()
+    assert [line.split()[0] + line[-4:] for line in told] == ["1(1).", "3(4)."]
