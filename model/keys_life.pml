@@ -153,6 +153,10 @@ short able;			/* bits 3 n + s: station s may take bundle n in; bits 9 + s: its O
 #define PROOF 17
 #define CONFIRM 18
 #define LOST_RAM 19
+#define SESSION 20
+#define END_SESSION 21
+#define SIGN 22
+#define COMMIT 23
 
 /* ---- the node ------------------------------------------------------------------------------------------------- */
 byte node_key, node_epoch, node_sequence;
@@ -199,7 +203,9 @@ byte backed_up = NOBODY;
 mtype = { idle, replied, stored, confirming, signed_, given };
 mtype at[STATIONS];
 #if defined(BREAK_SESSION) || defined(BREAK_SESSION_RESET) || defined(BREAK_MEASURED_ON) || defined(BREAK_GIVEN_OPEN)
+#ifndef SESSIONS_TOO
 #define SESSIONS_TOO
+#endif
 #endif
 #ifdef SESSIONS_TOO
 byte session[STATIONS];		/* the key under which it is open, 0 for none */
@@ -510,9 +516,10 @@ end:
 		st[s].held = BIT(node_key) }
 #ifdef SESSIONS_TOO
 	/* -- a session, under the key that the node has now ----------------------------------------------------------- */
-	:: atomic { at[s] == idle && OPENS(s) && !st[s].due && st[s].present_key == node_key && session[s] == 0 ->
+	:: atomic { MAY(SESSION) && at[s] == idle && OPENS(s) && !st[s].due && st[s].present_key == node_key && session[s] == 0 ->
+		DID(SESSION, s);
 		session[s] = node_key }
-	:: atomic { session[s] != 0 && at[s] == idle -> session[s] = 0 }
+	:: atomic { MAY(END_SESSION) && session[s] != 0 && at[s] == idle -> DID(END_SESSION, s); session[s] = 0 }
 #endif
 #ifdef BREAK_REFUSAL
 	:: atomic { at[s] == idle && st[s].tombstone == NOBODY && st[s].present_key != 0 && st[s].held != BIT(st[s].present_key) ->
@@ -520,7 +527,8 @@ end:
 #endif
 
 	/* -- sign and commit, in a session ---------------------------------------------------------------------------- */
-	:: atomic { at[s] == idle && COMMITS_AS(s) && st[s].present_key == node_key && commits < COMMITS ->
+	:: atomic { MAY(SIGN) && at[s] == idle && COMMITS_AS(s) && st[s].present_key == node_key && commits < COMMITS ->
+		DID(SIGN, s);
 		commits++;
 #ifdef BREAK_SIGNER
 		st[s].sequence = st[s].sequence + 1;
@@ -530,12 +538,13 @@ end:
 		assert(st[s].sequence > node_sequence);	/* signed in a session, it is newer than what the node has */
 		number[s] = st[s].sequence; fresh[s] = node_key; at[s] = signed_ }
 #if defined(BREAK_COMMIT_UNKEYED)
-	:: atomic { at[s] == signed_ && UP ->
+	:: atomic { MAY(COMMIT) && at[s] == signed_ && UP ->
 #elif defined(BREAK_GIVEN_COMMIT)
-	:: atomic { at[s] == signed_ && UP && KNOWN(s) ->
+	:: atomic { MAY(COMMIT) && at[s] == signed_ && UP && KNOWN(s) ->
 #else
-	:: atomic { at[s] == signed_ && USABLE(s) ->
+	:: atomic { MAY(COMMIT) && at[s] == signed_ && USABLE(s) ->
 #endif
+		DID(COMMIT, s);
 		assert(number[s] <= node_sequence + STEP);	/* else the node refuses for ever (7) */
 		if
 #ifdef BREAK_STALE_EPOCH
@@ -763,8 +772,13 @@ end:
 	:: at[s] == idle && USABLE(s) -> able = able | (1 << (9 + s)) \
 	:: else \
 	fi
+#ifdef SESSIONS_TOO
+#define OPEN_SESSION(s) now.session[s]
+#else
+#define OPEN_SESSION(s) 0
+#endif
 #define PRINT(s) printf(" %d:%d:%d:%d:%d:%d:%d:%d", now.st[s].present_key, now.st[s].held, now.st[s].tombstone, \
-	now.st[s].due, now.st[s].shared, now.st[s].imported, now.st[s].closed, now.at[s])
+	now.st[s].due, now.st[s].shared, now.at[s], now.number[s], OPEN_SESSION(s))
 #endif
 
 active proctype watch()
@@ -789,7 +803,7 @@ end:
 			for (int i = 0; i < now.turn; i++) {
 				printf(" %d.%d.%d", path[i] / 4, path[i] % 4, aims[i]);
 			}
-			printf(" | %d:%d:%d:%d", now.node_key, now.node_epoch, now.ram, now.able);
+			printf(" | %d:%d:%d:%d:%d", now.node_key, now.node_epoch, now.node_sequence, now.ram, now.able);
 			PRINT(0); PRINT(1); PRINT(2);
 			printf("\n");
 		};

@@ -17,6 +17,7 @@ from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.snapshot import Relation, place
 from teds_provision.station.station import Station, initialise
 from teds_provision.station.store.records import (
+    Group,
     Handover,
     Holder,
     NodeRecord,
@@ -69,6 +70,17 @@ def test_an_older_state_brings_back_what_is_missing_and_nothing_goes_back(statio
     assert store.policy.tombstone(TWO) is not None
     assert store.pins.row(NEW) is not None
     assert store.audit_log.check().intact
+
+
+def test_groups_that_were_deleted_or_changed_since_stay_so(station: Station, tmp_path: Path) -> None:
+    station.groups.put(Group("left hand", (ONE,)))
+    station.groups.put(Group("right hand", (TWO,)))
+    back_up(station, tmp_path / "b")
+    station.groups.delete("left hand")
+    station.groups.add("right hand", [ONE])
+    station.audit("group", None, "done")
+    assert merge(station, opened(tmp_path / "b"), dry_run=False).relation is Relation.OLDER
+    assert [(group.name, group.uuids) for group in station.groups.all()] == [("right hand", (ONE, TWO))]
 
 
 def test_a_handover_goes_forward_with_a_newer_backup_and_never_back(station: Station, tmp_path: Path) -> None:

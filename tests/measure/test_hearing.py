@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from teds_provision.links.can.bus_multiplexer import Listener
 from teds_provision.links.can.data_streams import CanDataListener, CanStreams
 from teds_provision.links.can.isotp import Frame
-from teds_provision.links.streaming import MeasuringLink
+from teds_provision.links.streaming import DataMessage, MeasuringLink
 from teds_provision.measure.blocks import Block
 from teds_provision.measure.clock import ClockMap, Exchange, HostClock, MonotonicStamps, WallClock
 from teds_provision.measure.interpreter import BLOCKS, StreamInterpreter
@@ -328,6 +328,17 @@ def test_two_threads_that_take_what_came_take_it_in_order() -> None:
     beside.other.join()
     counts = scene.heard.receiver.counts
     assert (counts.good, counts.lost, counts.late) == (4, 0, 0)
+
+
+def test_a_message_of_before_its_stream_was_asked_for_is_not_kept_for_it() -> None:
+    """It is one of the session before, which waited in the queue of the link."""
+    scene, port = Scene(ago=-60, fd=False), Silent()
+    with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
+        hearing.expect(0x21, 0, scene.plan.length)
+        since = hearing._early[0x21, 0].since
+        for at in (since - 1, since):
+            hearing._dispatch(DataMessage(0x21, 0, scene.message(0), at))
+        assert [message.at for message in hearing._early[0x21, 0].messages] == [since]
 
 
 def test_a_stream_that_is_forgotten_is_taken_no_more_by_its_link() -> None:

@@ -22,24 +22,29 @@ import pytest
 from teds_provision.backup.backup import backup
 from teds_provision.backup.restore import rebuild
 from teds_provision.backup.sealed_file import SealedFile
-from teds_provision.errors import TedsProvisionError
+from teds_provision.errors import PolicyError, TedsProvisionError
 from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
 from teds_provision.handover.outgoing import ExportOrder, ExportPlan, _announced, export_bundle, plan_export
 from teds_provision.handover.pending import close, undo
 from teds_provision.links import LINKS, Capabilities, Contact
+from teds_provision.measure.standing import NodeStanding
+from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.handover.bundle import Mode
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.provisioning.agree import _agree_anew, agree, open_session, reset_node
-from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.conversation import Conversation, SessionLostError
 from teds_provision.provisioning.identify import identify
-from teds_provision.provisioning.teds_read import read_block
+from teds_provision.provisioning.sign import SignResult, sign
+from teds_provision.provisioning.teds_read import read_block, read_identity
+from teds_provision.provisioning.write import _commit, write
 from teds_provision.station import node_keys
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import TrustRecord, WhitelistEntry
-from teds_provision.teds.image import SECURITY
+from teds_provision.teds.image import SECURITY, Image
+from teds_provision.teds.profile import load_profile
 from teds_provision.vault.passphrase import THROWAWAY
 from teds_provision.vault.selection import forget_vaults
 from tests.bench import PASSPHRASE, Board, make_station
@@ -47,6 +52,8 @@ from tests.model.traces import NONE, Kind, State, Step, Trace
 from tests.pace import PATIENCE
 
 NAMES: Final = ("north", "south", "west")
+_LIE: Final = 1_000_000
+"""What every bundle says of the node's sequence."""
 
 
 class CutError(BaseException):
@@ -55,6 +62,10 @@ class CutError(BaseException):
 
 class SameHandoverError(Exception):
     """The model has two copies where the code has one: the same keys to the same station are the same handover."""
+
+
+class LostRequestError(Exception):
+    """A wrong Confirm made the node forget the Request in its RAM: in the model a step of its own, at any time."""
 
 
 @dataclass
@@ -195,6 +206,8 @@ class Desk:
     made: int = 0
     saved: Path | None = None
     saved_of: int = -1
+    sessions: dict[int, tuple[Conversation, NodeStanding]] = field(default_factory=dict)
+    signed: dict[int, SignResult] = field(default_factory=dict)
 
     @classmethod
     def make(cls, folder: Path) -> Desk:
@@ -239,9 +252,26 @@ class Desk:
         """
         refusal = _REFUSALS.get(step.kind)
         running = self.agreements.get(step.station)
-        if refusal is None or (running is not None and running.at != "ended"):
+        busy = running is not None and running.at != "ended" and step.kind not in (Kind.SEND_CONFIRM, Kind.CONFIRM)
+        return refusal is not None and not busy and refusal(self, step, state)
+
+    def _refuse_send(self, step: Step, state: State) -> bool:
+        """The agreement is at another of its steps, and no Confirm of it has left."""
+        agreement = self.agreements.get(step.station)
+        if agreement is None or agreement.at == "ended":
             return False
-        return refusal(self, step, state)
+        assert agreement.at != "send"
+        assert agreement.number not in self.confirms
+        return True
+
+    def _refuse_confirm(self, step: Step, state: State) -> bool:
+        """Every Confirm that ever left comes to the node once more."""
+        for link, frame in self.confirms.values():
+            assert not decode_reply(self.board.tim.handle(frame, link=link, tapped=True)).ok
+        if self.pending() != state.ram:
+            assert self.pending() == 0
+            raise LostRequestError
+        return bool(self.confirms)
 
     def _refuse_request(self, step: Step, state: State) -> bool:
         station = self.stations[step.station]
@@ -251,6 +281,18 @@ class Desk:
 
     def _refuse_open(self, step: Step, state: State) -> bool:
         assert self._opens(step.station) == (step.station in state.opens)
+        return True
+
+    def _refuse_sign(self, step: Step, state: State) -> bool:
+        return self._refuse_open(step, state) and step.station not in state.opens
+
+    def _refuse_commit(self, step: Step, state: State) -> bool:
+        """Try it outside a session: there is none that this station could open."""
+        signed = self.signed.get(step.station)
+        if signed is None or step.station in state.opens:
+            return False
+        with self.talk(step.station) as node, pytest.raises((TedsProvisionError, SessionLostError)):
+            _commit(self.stations[step.station], node, signed.image, None, None)
         return True
 
     def _refuse_export(self, step: Step, state: State) -> bool:
@@ -265,10 +307,24 @@ class Desk:
         return True
 
     def _refuse_receipt(self, step: Step, state: State) -> bool:
-        if step.aim >= len(self.bundles) or not self.bundles[step.aim].receipt:
+        if step.aim >= len(self.bundles):
             return False
+        if not self.bundles[step.aim].receipt:
+            return self._cut_import(self.bundles[step.aim])
         with suppress(TedsProvisionError):
             assert not close(self.stations[step.station], self.bundles[step.aim].receipt).fresh
+        return True
+
+    def _cut_import(self, bundle: _Bundle) -> bool:
+        """Cut the receiver's power before it has taken the bundle in: no receipt leaves, and none is kept."""
+        receiver = self.stations[bundle.receiver]
+        if not bundle.octets or not self._takes(bundle.receiver, bundle):
+            return False
+        plan = plan_import(receiver, bundle.octets)
+        assert isinstance(plan, ImportPlan)
+        with patch.object(receiver, "audit", side_effect=CutError), pytest.raises(CutError):
+            import_bundle(receiver, plan)
+        assert receiver.handovers.get(bundle.id, "in") is None
         return True
 
     def _refuse_undo(self, step: Step, state: State) -> bool:
@@ -295,6 +351,7 @@ class Desk:
         agreement.go()
 
     def cut(self, step: Step) -> None:
+        self.signed.pop(step.station, None)
         agreement = self.agreements.pop(step.station, None)
         if agreement is not None:
             agreement.cut()
@@ -385,11 +442,60 @@ class Desk:
             rebuild(home, content, _ask, costs=THROWAWAY)
         self.stations[step.station] = Station.open(home, ask=_ask)
 
+    def begin_session(self, step: Step) -> None:
+        """Open a session that lasts beyond this step, as a measurement has one."""
+        station, node = self.stations[step.station], self.talk(step.station)
+        node.__enter__()
+        assert open_session(station, node, word=True) is not None
+        self.sessions[step.station] = node, NodeStanding(station, self.board.uuid)
+        assert self._session_lives(step.station)
+
+    def end_session(self, step: Step) -> None:
+        self.sessions.pop(step.station)[0].__exit__(None, None, None)
+
+    def _session_lives(self, station: int) -> bool:
+        """Return True if the station still asks the node in its session, and the node replies."""
+        node, standing = self.sessions[station]
+        if standing.ended is not None:
+            return False
+        try:
+            standing.require()
+            read_identity(node)
+        except (TedsProvisionError, SessionLostError):
+            return False
+        return True
+
+    def sign_datasheet(self, step: Step) -> None:
+        """Sign a datasheet against what the node says of itself in a session."""
+        board = self.board
+        with self.talk(step.station) as node:
+            assert open_session(self.stations[step.station], node, word=True) is not None
+            at = read_identity(node)
+        keys = SignedNodeKey(board.uuid, board.key.point, board.state.node_key_signature)
+        image = Image(board.uuid, load_profile("temperature-sensor").build(board.uuid).blocks)
+        done = sign(self.stations[step.station], keys, image, epoch=at.epoch, node_sequence=at.sequence)
+        self.signed[step.station] = done
+
+    def commit(self, step: Step) -> None:
+        """Write the datasheet that was signed; the node refuses a stale one, as the station does before."""
+        station, signed, key = self.stations[step.station], self.signed.pop(step.station), self.board.state.key
+        assert key is not None
+        assert self._number_of(key) in self.held(step.station)
+        with self.talk(step.station) as node:
+            node.open(key)  # open_session would note, too, which key it was: in the model a step of its own
+            try:
+                write(station, node, signed.image)
+            except PolicyError:
+                with pytest.raises(TedsProvisionError):
+                    _commit(station, node, signed.image, None, None)
+
     # -- what is there ---------------------------------------------------------------------------------------------
 
     def compare(self, state: State, *, thorough: bool = False) -> None:
         """Compare the desk with the model's state; ``thorough``: also what would succeed now, which spends the desk."""
-        assert (self._number_of(self.board.state.key), self.board.state.epoch) == (state.node, state.epoch), "the node"
+        flash = self.board.state
+        there = self._number_of(flash.key), flash.epoch, flash.sequence
+        assert there == (state.node, state.epoch, state.sequence), "the node's key, epoch and sequence"
         assert self.pending() == state.ram, "the agreement in the node's RAM"
         for number, (station, said) in enumerate(zip(self.stations, state.stations, strict=True)):
             keys = station.keys.keys_of(self.board.uuid)
@@ -404,6 +510,10 @@ class Desk:
             assert gone == said.tombstone, f"{where}: the move by which it gave the node away"
             assert (station.keys.rotation_due(self.board.uuid) is not None) == said.due, f"{where}: a rotation is due"
             assert station.keys.holders(self.board.uuid) or not said.shared, f"{where}: who else has the key"
+            signed = self.signed[number].sequence if number in self.signed else 0
+            assert signed == said.signed, f"{where}: the sequence of the datasheet that it signed"
+            if number in self.sessions and not said.session:
+                assert not self._session_lives(number), f"{where}: its session has ended"
         if thorough:
             self._try_imports(state)
             self._try_sessions(state)
@@ -466,8 +576,14 @@ class Desk:
         return plan_export(self.stations[step.station], order)
 
     def _sealed(self, station: Station, plan: ExportPlan) -> bytes:
+        """Return a bundle, in which the sender lies about the node's sequence."""
         path = self.folder / f"bundle {len(list(self.folder.glob('bundle *')))}"
+        known = station.nodes.get(self.board.uuid)
+        assert known is not None
+        statement = "UPDATE nodes SET sequence = ? WHERE uuid = ?"
+        station._store.execute(statement, (_LIE, self.board.uuid))
         export_bundle(station, plan, path)
+        station._store.execute(statement, (known.sequence, self.board.uuid))
         return path.read_bytes()
 
 
@@ -496,6 +612,10 @@ _STEPS: Final[dict[Kind, Callable[[Desk, Step], None]]] = {
     Kind.PROOF: Desk.prove_reset,
     Kind.CONFIRM: Desk.confirm,
     Kind.LOST_RAM: Desk.lose_ram,
+    Kind.SESSION: Desk.begin_session,
+    Kind.END_SESSION: Desk.end_session,
+    Kind.SIGN: Desk.sign_datasheet,
+    Kind.COMMIT: Desk.commit,
 }
 _REFUSALS: Final[dict[Kind, Callable[[Desk, Step, State], bool]]] = {
     Kind.REQUEST: Desk._refuse_request,
@@ -506,26 +626,49 @@ _REFUSALS: Final[dict[Kind, Callable[[Desk, Step, State], bool]]] = {
     Kind.RECEIPT: Desk._refuse_receipt,
     Kind.UNDO: Desk._refuse_undo,
     Kind.PROOF: Desk._refuse_proof,
+    Kind.SEND_CONFIRM: Desk._refuse_send,
+    Kind.CONFIRM: Desk._refuse_confirm,
+    Kind.SESSION: Desk._refuse_open,
+    Kind.SIGN: Desk._refuse_sign,
+    Kind.COMMIT: Desk._refuse_commit,
 }
 
 
-def replay(desk: Desk, trace: Trace, script: Sequence[Step] = ()) -> tuple[int, int]:
-    """Take every step of a trace, comparing after each; return how many were taken, and how many refusals were tried.
+@dataclass
+class Replayed:
+    """How many steps of a trace were taken, and how many tried that the model refused.
+
+    ``untried`` is the first of those for which the code has no action that could be tried; None if there was one.
+    """
+
+    taken: int = 0
+    tried: int = 0
+    untried: Step | None = None
+
+
+def replay(desk: Desk, trace: Trace, script: Sequence[Step] = ()) -> Replayed:
+    """Take every step of a trace, comparing after each.
 
     ``script`` has the steps that the trace was made from, if the model refused some of them (None in the trace).
     """
-    taken = tried = 0
+    done, refused = Replayed(), 0
     for at, (step, state) in enumerate(zip(trace.steps, trace.states, strict=True)):
         try:
-            if step is None:
-                tried += desk.refuse(script[at], state)
-            else:
+            if step is not None:
                 desk.take(step)
-                taken += 1
+                done.taken += 1
+            elif desk.refuse(script[at], state):
+                done.tried += 1
+            elif not refused:
+                done.untried = script[at]
+            refused += step is None
             desk.compare(state, thorough=at == len(trace.steps) - 1)
         except SameHandoverError:
+            break
+        except LostRequestError:
+            done.tried += 1
             break
         except (AssertionError, TedsProvisionError) as difference:
             way = ", ".join(str(step or f"(refused: {script[n]})") for n, step in enumerate(trace.steps[: at + 1]))
             raise AssertionError(f"{way}\nThe model: {state}\n{difference}") from difference
-    return taken, tried
+    return done

@@ -47,7 +47,7 @@ def test_the_code_refuses_what_breaks_the_model(fresh: Desk, tmp_path: Path) -> 
         script = Program(tmp_path / rule, rule).counterexample()
         desk = fresh.copy(tmp_path / f"desk {rule}")
         try:
-            _, tried = replay(desk, model.follow(script), script)
+            done = replay(desk, model.follow(script), script)
         finally:
             desk.leave()
-        assert tried, f"{rule}: {', '.join(map(str, script))}"
+        assert done.tried, f"{rule}: {', '.join(map(str, script))}"

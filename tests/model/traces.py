@@ -45,6 +45,10 @@ class Kind(IntEnum):
     PROOF = 17
     CONFIRM = 18
     LOST_RAM = 19
+    SESSION = 20
+    END_SESSION = 21
+    SIGN = 22
+    COMMIT = 23
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,11 @@ class Step:
 
 @dataclass(frozen=True)
 class StationState:
-    """What the model says of one station."""
+    """What the model says of one station.
+
+    ``signed`` is the sequence of the datasheet that it has signed and not committed yet, ``session`` the key of its
+    open session; 0 for none.
+    """
 
     present: int
     held: frozenset[int]
@@ -74,6 +82,8 @@ class StationState:
     due: bool
     shared: bool
     idle: bool
+    signed: int
+    session: int
 
 
 @dataclass(frozen=True)
@@ -82,6 +92,7 @@ class State:
 
     node: int
     epoch: int
+    sequence: int
     ram: int
     stations: tuple[StationState, ...]
     opens: frozenset[int]
@@ -111,6 +122,7 @@ class Program:
     """The model, compiled with some bounds and, maybe, without some rules."""
 
     def __init__(self, folder: Path, *broken: str, agreements: int = 2, bundles: int = 2, **bounds: int) -> None:
+        """``bounds`` say how much may happen, and with ``sessions_too=1`` that sessions are a part of it."""
         self._folder = folder
         wanted = {"commits": 0, "restores": 0, "resets": 1} | bounds | {"agreements": agreements, "bundles": bundles}
         defines = [f"-D{name.upper()}={value}" for name, value in wanted.items()]
@@ -176,10 +188,11 @@ _Steps = tuple[Step | None, ...]
 def _read(line: str) -> tuple[_Steps, State]:
     steps, _, state = line.removeprefix("STATE ").partition(" | ")
     node, *stations = state.split()
-    key, epoch, ram, able = map(int, node.split(":"))
+    key, epoch, sequence, ram, able = map(int, node.split(":"))
     return tuple(map(_step, steps.split())), State(
         key,
         epoch,
+        sequence,
         ram,
         tuple(map(_station, stations)),
         frozenset(s for s in range(3) if able >> 9 + s & 1),
@@ -193,13 +206,14 @@ def _step(text: str) -> Step | None:
 
 
 def _station(text: str) -> StationState:
-    present, held, tombstone, due, shared, _, _, at = map(int, text.split(":"))
+    present, held, tombstone, due, shared, at, number, session = map(int, text.split(":"))
     keys = frozenset(key for key in range(1, 8) if held >> key & 1)
-    return StationState(present, keys, tombstone, bool(due), bool(shared), at == IDLE)
+    signed = number if at == SIGNED else 0
+    return StationState(present, keys, tombstone, bool(due), bool(shared), at == IDLE, signed, session)
 
 
-IDLE: Final = 6
-"""The number that SPIN gives the first of the model's mtypes, ``idle``."""
+IDLE, SIGNED = 6, 2
+"""The numbers that SPIN gives two of the model's mtypes, ``idle`` and ``signed_``: the first has the highest."""
 
 
 def _trace(steps: _Steps, states: dict[_Steps, State]) -> Trace:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ async def app(scope: Scope, _receive: Receive, send: Send) -> None:
     await send({"type": f"{prefix}http.response.start", "status": 200, "headers": []})
 
 
-def status_of(guard: Guard, headers: dict[str, str], kind: str = "http") -> int:
+def status_of(guard: Guard, headers: dict[str, str], kind: str = "http", *, more: tuple[str, str] | None = None) -> int:
     sent: list[Message] = []
 
     async def run() -> None:
@@ -29,7 +30,8 @@ def status_of(guard: Guard, headers: dict[str, str], kind: str = "http") -> int:
         async def receive() -> Message:
             return {"type": "http.disconnect"}
 
-        pairs = [(name.encode(), value.encode()) for name, value in headers.items()]
+        every = [*headers.items(), *([more] if more else [])]
+        pairs = [(name.encode(), value.encode()) for name, value in every]
         await guard({"type": kind, "method": "GET", "path": "/api/v1/live", "headers": pairs}, receive, send)
 
     asyncio.run(run())
@@ -81,3 +83,25 @@ def test_a_browsers_websocket_names_its_origin(tmp_path: Path) -> None:
 def test_the_users_own_socket_has_no_origin_to_compare(tmp_path: Path) -> None:
     guard = Guard(app, Tokens(tmp_path), None)
     assert status_of(guard, {"host": "anything", "origin": "http://evil.example"}) == 200
+
+
+@pytest.mark.parametrize("name", ["host", "origin", "content-length", "content-type", "authorization"])
+def test_a_header_that_decides_comes_once(tmp_path: Path, name: str) -> None:
+    """A proxy in front and the service behind it would each read another one."""
+    tokens = Tokens(tmp_path)
+    guard = Guard(app, tokens, front((), PORT, tls=False))
+    good = {"host": HERE, "authorization": f"Bearer {tokens.add('script')}", "origin": f"http://{HERE}"}
+    good |= {"content-length": "0", "content-type": "application/json"}
+    assert status_of(guard, good) == 200
+    assert status_of(guard, good, more=(name.title(), good[name])) == 400
+    assert status_of(guard, good, more=("accept", "text/html")) == 200
+
+
+def test_wrong_tokens_of_more_than_a_minute_ago_count_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("teds_provision.ncap.web.guard._SLOWED", 0.0)
+    guard = Guard(app, Tokens(tmp_path), front((), PORT, tls=False))
+    wrong = {"host": HERE, "authorization": "Bearer nonsense"}
+    for ago, status in ((61.0, 401), (30.0, 429)):
+        guard._wrong.clear()
+        guard._wrong.extend([time.monotonic() - ago] * 10)
+        assert status_of(guard, wrong) == status

@@ -6,14 +6,16 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
+from queue import SimpleQueue
 
 import pytest
 
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import Pair, physical_id, single
 from teds_provision.links.can.spec import parse_spec
+from teds_provision.node.can.endpoint import CanEndpoint, StationState
 from teds_provision.node.can.server import CanServer
-from teds_provision.node.worker_pool import MOST_THREADS
+from teds_provision.node.worker_pool import MOST_THREADS, WorkerPool
 from teds_provision.protocol.announce import Announce
 from teds_provision.protocol.messages.identity import NodeState
 from tests.links.can.echo_node import EchoNode
@@ -214,6 +216,15 @@ def wait_for(what: Callable[[], bool], seconds: float = PATIENCE) -> bool:
             return False
         time.sleep(0.005)
     return True
+
+
+def test_of_a_station_that_does_not_wait_for_replies_four_requests_wait(node: EchoNode) -> None:
+    queue: SimpleQueue[object] = SimpleQueue()
+    endpoint = CanEndpoint(node, lambda: True, WorkerPool(), lambda endpoint, frame: None)
+    state = StationState(endpoint, 0xF1, queue)  # type: ignore[arg-type]
+    for _ in range(10):
+        state.put(lambda: None)
+    assert queue.qsize() == 4
 
 
 def test_announces_itself_once_after_its_start(hub: Hub, server: CanServer, node: EchoNode) -> None:

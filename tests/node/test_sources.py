@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from teds_provision.errors import BadDataError, NoReaderError, NotFoundError, TedsProvisionError, UsageError
 from teds_provision.node.sources import SOURCES, make_source
 from teds_provision.node.sources.base import Reading, SourceChannel
-from teds_provision.node.sources.lines import LineSource, StandardInput
+from teds_provision.node.sources.lines import LONGEST_LINE, LineSource, StandardInput, feed
 
 ANGLE, FORCE = SourceChannel(1, "angle", -180.0, 180.0), SourceChannel(2, "force", 0.0, 5.0)
 PLACES = (ANGLE, FORCE, SourceChannel(3, "bare"))
@@ -170,6 +170,25 @@ def test_a_line_that_is_none_changes_nothing_and_is_counted(line: bytes) -> None
     assert source.at(1, 1.0) == Reading(value=1.0)
     source.feed_line(b'{"t": 1, "value": {"angle": 2}}')
     assert source.at(1, 1.0) == Reading(value=2.0)
+
+
+def test_a_number_beyond_every_quantity_is_none() -> None:
+    source, clock = lines([])
+    for member in ("value", "raw"):
+        source.feed_line(b'{"t": 1, "%s": {"angle": 1e15}}' % member.encode())
+    source.feed_line(b'{"t": 1e15, "value": {"angle": 1}}')
+    assert (clock.steps, source.at(1, 0.0)) == ([], None)
+    source.feed_line(b'{"t": 1, "value": {"angle": -9.99e14}}')
+    assert source.at(1, 1.0) == Reading(value=-9.99e14)
+
+
+def test_a_line_without_an_end_takes_no_memory() -> None:
+    sent = iter([*[b"x" * 65536] * 40, b"\n", b'{"a": 1}\n', b"last"])
+    taken: list[bytes] = []
+    feed(lambda: next(sent, b""), taken.append)
+    assert max(map(len, taken)) <= LONGEST_LINE
+    assert taken[-2:] == [b'{"a": 1}', b"last"]
+    assert taken[:2] == [b"x" * 64] * 2
 
 
 def test_a_channel_of_a_simulation_without_a_value_is_invalid_alone(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import CONTENT_TYPE
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.plant.roster import Share
+from teds_provision.station.plant.line import SignRequestRow
 from teds_provision.station.station import Station
 from tests.cli.shell import call
 from tests.plant.handing import Plant, board_of
@@ -149,6 +151,29 @@ def test_requests_that_nobody_answers_any_more_do_not_keep_jobs_out(plant: Plant
     assert parcels.received(west, "sign-request") == []
     sync(plant, "west", at=now(90))
     assert len(parcels.received(west, "job")) == 1
+
+
+def test_an_answer_is_kept_of_the_office_that_was_asked_and_once(plant: Plant) -> None:
+    from teds_provision.protocol.plant.document import SIGNED, seal
+
+    plant.roster(ROLES)
+    west, north = plant["west"], plant["north"]
+    asked = SignRequestRow("ab" * 32, "out", "a job", bytes(10), north.fingerprint, b"the request")
+    west.plant.line.put_sign_request(asked)
+
+    def kept(by: Station, of: str = asked.hash) -> int:
+        signed = seal({"format": SIGNED.format, "of": of}, by.vault.identity(), SIGNED)
+        sealed = jose.encrypt(signed, [west.point], cty=CONTENT_TYPE)
+        plant.post.send(Parcel(os.urandom(4).hex(), west.fingerprint, sealed, time_text(now(60)), by.fingerprint))
+        sync(plant, "west")
+        assert plant.post.there == {}
+        return len(parcels.received(west, "signed"))
+
+    assert kept(plant["south"]) == 0
+    assert kept(north, of="cd" * 32) == 0
+    assert kept(north) == 1
+    west.plant.line.put_sign_request(replace(asked, answer=b"an answer"))
+    assert kept(north) == 1
 
 
 def test_a_person_takes_in_what_waits_and_nothing_else_than_was_shown(
@@ -289,6 +314,15 @@ def test_nothing_goes_by_itself_once_the_roster_has_expired(plant: Plant) -> Non
     sync(plant, "west")
     parcels.take_in(plant["south"], plant.transport, plant.views("south"), now(6))
     assert holds(plant["south"], board.uuid)
+
+
+def test_a_copy_that_is_met_once_the_roster_has_expired_waits_for_a_person(plant: Plant) -> None:
+    plant.roster(ROLES, everything(plant, "south"), days=3)
+    board = board_of(plant["west"], os.urandom(10))
+    sync(plant, "west")
+    sync(plant, "south", at=now(4))
+    assert waits(plant["south"]) == ["the roster has expired"]
+    assert not holds(plant["south"], board.uuid)
 
 
 def test_a_removed_station_gets_nothing(plant: Plant) -> None:

@@ -16,6 +16,7 @@ from teds_provision.node.virtual import VirtualNode
 from teds_provision.provisioning.adoption import FactoryDatasheet, NotAdoptedError
 from teds_provision.provisioning.agree import require_session, reset_node
 from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.calibration_guard import guard
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.operator import AcceptingOperator
@@ -137,6 +138,18 @@ def test_what_the_guard_finds_needs_a_reason_and_that_is_logged(station: Station
     assert done.verified.verdict == "authentic"
 
 
+def test_a_reason_is_logged_once_it_counts_and_not_for_a_dry_run(station: Station) -> None:
+    image = Image(UUID, factory(slope=800.0))
+    for record, entries in ((False, []), (True, ["two turns are right here"])):
+        warnings = guard(station, image, None, "two turns are right here", record=record)
+        assert len(warnings) == 1
+        assert [
+            entry.detail["why"] for entry in station.audit_log.entries() if entry.act == "accept-calibration"
+        ] == entries
+    with pytest.raises(PolicyError, match="The calibration is refused"):
+        guard(station, image, None, None, record=False)
+
+
 def named(blocks: dict[BlockId, bytes], channel: int, name: str) -> dict[BlockId, bytes]:
     return {**blocks, (channel, 12): teds.compose(12, {"Format": 0, "TCName": name})}
 
@@ -152,6 +165,7 @@ def with_tuple(blocks: dict[BlockId, bytes], block: BlockId, kind: int, value: b
         (named(factory(), 1, "angle\u202egnp"), "unprintable"),
         (named(factory(), 1, "a\nb"), "unprintable"),
         (named(factory(), 0, "x" * 121), "more than 120 octets"),
+        (named(factory(), 0, "ä" * 61), "more than 120 octets"),
         (
             {**factory(), (0, 10): teds.compose(10, [("Text", {"LangCode": "en", "Text": "<x>\x1b]0;pwned</x>"})])},
             "text",
@@ -160,7 +174,17 @@ def with_tuple(blocks: dict[BlockId, bytes], block: BlockId, kind: int, value: b
         ({(0, 12): teds.compose(12, {"Format": 0, "TCName": "x"})}, "no TransducerChannel TEDS"),
         ({}, "no TransducerChannel TEDS"),
     ],
-    ids=["escape code", "reversed text", "two lines", "long", "text", "another node", "no channel", "nothing"],
+    ids=[
+        "escape code",
+        "reversed text",
+        "two lines",
+        "long",
+        "long in UTF-8",
+        "text",
+        "another node",
+        "no channel",
+        "nothing",
+    ],
 )
 def test_a_hostile_datasheet_is_never_signed(
     station: Station, tmp_path: Path, blocks: dict[BlockId, bytes], said: str

@@ -50,6 +50,7 @@ def pairs(listed: list[ListedNode]) -> list[tuple[bytes, str | None]]:
         f"uuid,fingerprint\n{ONE.hex()},{KEY}\n{TWO.hex()},\n",
         f"name;UUID;Fingerprint\nfinger;0x{ONE.hex()};{KEY.upper()}\n\n# a remark\n;{TWO.hex()};\n",
         f"{ONE.hex()},{KEY}\n{TWO.hex()}\n",
+        f"{ONE.hex()},{KEY[:32]}\n{TWO.hex()}\n{ONE.hex()},{KEY}\n{ONE.hex()}\n{ONE.hex()},{KEY[:40]}\n",
         json.dumps({"whitelist": [{"uuid": ONE.hex(), "fingerprint": KEY}, {"uuid": TWO.hex(), "fingerprint": None}]}),
         json.dumps([{"UUID": "0x" + ONE.hex(), "fingerprint": KEY}, TWO.hex()]),
     ],

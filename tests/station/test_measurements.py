@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadDataError, NotFoundError, TedsProvisionError
+from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import DetectionMode, Group, KeptMeasurement
 
-ONE, TWO = bytes(range(10)), bytes(range(1, 11))
+ONE, TWO, THREE = bytes(range(10)), bytes(range(1, 11)), bytes(range(2, 12))
 
 
 def test_a_group_has_its_nodes_and_no_node_twice(station: Station) -> None:
@@ -66,10 +66,25 @@ def test_names_of_topics_are_kept_each_once(station: Station) -> None:
     station.measurements.rename(ONE, 1, "crane/angle")
     station.measurements.rename(ONE, 1, "crane/slew")
     assert station.measurements.names == {(ONE, 1): "crane/slew"}
-    with pytest.raises(TedsProvisionError):
+    with pytest.raises(UsageError, match="'crane/slew' is the name of channel 1 of node"):
         station.measurements.rename(TWO, 1, "crane/slew")
     station.measurements.rename(ONE, 1, None)
     assert station.measurements.names == {}
+
+
+def test_a_node_in_the_place_of_another_has_its_names_and_frames_and_keeps_its_own(station: Station) -> None:
+    told = station.measurements
+    for uuid, channel, name in ((ONE, 0, "crane"), (ONE, 1, "slew"), (TWO, 1, "boom"), (THREE, 1, "hook")):
+        told.rename(uuid, channel, name)
+        told.set_frame(uuid, channel, f"{name} frame")
+    done = told.hand_on(ONE, TWO)
+    assert told.names == {(TWO, 0): "crane", (ONE, 1): "slew", (TWO, 1): "boom", (THREE, 1): "hook"}
+    assert told.frames == {(TWO, 0): "crane frame", (TWO, 1): "boom frame", (THREE, 1): "hook frame"}
+    assert done.topics == ("crane",)
+    assert done.kept == ("The topic name 'slew' of channel 1: the new node has the name 'boom'.",)
+    told.hand_on(TWO, None)
+    assert told.names == {(ONE, 1): "slew", (THREE, 1): "hook"}
+    assert told.frames == {(THREE, 1): "hook frame"}
 
 
 def test_how_nodes_are_detected_is_kept(station: Station, home: Path) -> None:

@@ -10,7 +10,8 @@ import pytest
 from teds_provision.errors import KeyMismatchError
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station import pins
-from teds_provision.station.store.records import WhitelistEntry
+from teds_provision.station.store.records import Draft, WhitelistEntry
+from teds_provision.teds.image import Image
 from tests.bench import make_station
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")
@@ -29,3 +30,15 @@ def test_a_flood_of_wrong_keys_does_not_fill_the_audit_log(tmp_path: Path, monke
                 station.pins.check(UUID, SoftwareKey.generate().point)
         entries = [entry.detail for entry in station.audit_log.entries() if entry.outcome == "other key"]
     assert [entry.get("unrecorded", 0) for entry in entries] == [0, 2]
+
+
+def test_the_draft_of_a_board_that_was_replaced_goes_with_its_pin(tmp_path: Path) -> None:
+    """It may hold the old board's calibration; what was built before any board was met is for whichever comes."""
+    with closing(make_station(tmp_path / "home")) as station:
+        for fingerprint_of_it, stays in ((fingerprint(SoftwareKey.generate().point), False), (None, True)):
+            station.pins.put(WhitelistEntry(UUID, fingerprint_of_it))
+            station.datasheets.keep_draft(Draft(UUID, Image(UUID, {(0, 1): b"x"})))
+            station.pins.unpin(UUID)
+            assert (station.datasheets.draft(UUID) is not None) is stays
+            assert station.pins.is_unsettled(UUID) is not stays
+            station.pins.settled(UUID)

@@ -192,8 +192,9 @@ def test_a_start_that_was_not_asked_is_reported(asked: int, start: int, good: bo
 
 def test_a_length_that_was_not_computed_is_reported() -> None:
     made = plan()
-    with pytest.raises(NotAuthenticError, match="18 octets a message; 17"):
-        made.accept(SubscribeReply(1, 18, START).encode(), LATER)
+    for length in (18, 16):
+        with pytest.raises(NotAuthenticError, match=f"{length} octets a message; 17"):
+            made.accept(SubscribeReply(1, length, START).encode(), LATER)
     with pytest.raises(NotAuthenticError, match="run 0"):
         made.accept(SubscribeReply(0, 17, START).encode(), TickBounds(START, START))
     with pytest.raises(GarbledError):
@@ -297,6 +298,15 @@ def test_what_stop_takes_back_after_the_end_of_the_measurement_is_not_lost(
         assert taker.open_message(sealed(counter), LATER)
     taker.finish(9, wanted)
     counted(taker, good=6, lost=lost, cut=cut)
+
+
+def test_a_stop_that_counts_less_than_came_lets_no_message_count_twice() -> None:
+    taker = receiver()
+    for counter in range(6):
+        assert taker.open_message(sealed(counter), LATER)
+    taker.finish(3)
+    assert taker.open_message(sealed(4), LATER) is None
+    counted(taker, good=6, late=1)
 
 
 def test_how_many_messages_had_begun_at_a_tick() -> None:

@@ -275,6 +275,9 @@ def test_the_budget_counts_every_stream_of_the_bus_and_the_largest_gap() -> None
     sent(bench, [("400000 ppm more", subscribe(n=1, period=1 * MS, gap=200), None)], "can:f2")
     assert bench.reason(subscribe(n=1, period=1 * MS, gap=251)) == Reason.DOES_NOT_FIT
     assert bench.reason(subscribe(n=1, period=1 * MS, gap=250)) is None, "2 · 500000 ppm is the most"
+    bench = Bench().open().open("can:f2").operate(1).operate(1, link="can:f2")
+    assert bench.reason(subscribe(n=1, period=1 * MS, gap=300)) is None
+    sent(bench, [("its gap is for both", subscribe(n=1, period=1 * MS, gap=200), U.DOES_NOT_FIT)], "can:f2")
 
 
 @pytest.mark.parametrize(
