@@ -35,7 +35,7 @@
  *   BREAK_RECEIPT_FIRST  the receipt leaves before what it tells of is durable
  *   BREAK_RECEIPT_OTHER  a receipt closes whatever move stands, not the one that it names
  *   BREAK_IMPORT_OLDER   a bundle with an older key is taken in, in the place of the key that is held
- *   BREAK_IMPORT_REPLACES  a bundle's key takes the place of the held one before an Open has proven it
+ *   BREAK_IMPORT_REPLACES  a bundle's key takes the place of the held one before an Open has proven it: harmless
  *   BREAK_RESET_REPLAY   an old proof of a reset counts (no fresh challenge)
  *   BREAK_RESET_UNPROVEN a station believes that a node was reset because it says so
  *   BREAK_RESET_RAM      a reset leaves the agreement under way

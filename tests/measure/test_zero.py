@@ -242,10 +242,12 @@ def test_a_running_ncap_lets_the_node_go_and_measures_it_by_its_new_zero(hall: H
 def test_while_somebody_else_measures_it_nothing_is_signed(hall: Hall, angle: Shaft) -> None:
     angle.turn("angle", 12_345)
     sequence = hall.ask("calibrate", "zero", "angle", 1, "--dry-run")["sequence"]
-    running = hall.begin("angle", "--rate", 20)
-    running.wait_for('"event":"data"')
-    refused = hall.ask("calibrate", "zero", "angle", 1, code=6)["error"]
-    assert "is being measured by" in refused["message"]
-    running.signal(2)
-    assert running.end().code == 0
+    elsewhere = hall.begin("angle", "--rate", 20, can=f"{hall.can}&source=0xF4", station=hall.copy("other"))
+    here = hall.begin("angle", "--rate", 20)
+    for running, said in ((here, "by pid"), (elsewhere, "by another station, source address 0xF4")):
+        running.wait_for('"event":"data"')
+        refused = hall.ask("calibrate", "zero", "angle", 1, code=6)["error"]
+        assert f"is being measured {said}" in refused["message"]
+        running.signal(2)
+        assert running.end().code == 0
     assert hall.ask("calibrate", "zero", "angle", 1)["sequence"] == sequence + 1

@@ -352,6 +352,7 @@ class Desk:
 
     def cut(self, step: Step) -> None:
         self.signed.pop(step.station, None)
+        self.sessions.pop(step.station, None)
         agreement = self.agreements.pop(step.station, None)
         if agreement is not None:
             agreement.cut()
@@ -456,7 +457,7 @@ class Desk:
     def _session_lives(self, station: int) -> bool:
         """Return True if the station still asks the node in its session, and the node replies."""
         node, standing = self.sessions[station]
-        if standing.ended is not None:
+        if standing.ended is not None or not node.sealed:
             return False
         try:
             standing.require()

@@ -132,7 +132,7 @@ def main(arguments: list[str]) -> int:
             flush=True,
         )
         until = time.time() + 60 * minutes
-        model = _model(folder, restores=1)
+        model = _model(folder, commits=1, restores=1, sessions_too=1)
         for depth in count(len(KEYED) + 1):
             traces = [trace for trace in model.every(depth, KEYED) if len(trace.steps) == depth]
             done = replays.run(traces, until)

@@ -949,6 +949,55 @@ PATTERNS = (
         "math.isfinite(number)",
         "tests/node/test_sources.py",
     ),
+    Pattern(
+        "a new PIN is counted on what the file has by then",
+        "Pkcs11Vault.new_passphrase.set_pin",
+        "self.refresh()",
+        "None",
+        "tests/vault/token/test_token_file.py",
+    ),
+    Pattern(
+        "a token's master key is added to those that the file has by then",
+        "Pkcs11Vault.add_master",
+        "self.refresh()",
+        "None",
+        "tests/vault/token/test_token_file.py",
+    ),
+    Pattern(
+        "a token's newest master key stays",
+        "Pkcs11Vault.retire_masters",
+        "self.refresh()",
+        "None",
+        "tests/vault/token/test_token_file.py",
+    ),
+    Pattern(
+        "a token's CA key takes no master key with it",
+        "Pkcs11Vault.drop_ca",
+        "self.refresh()",
+        "None",
+        "tests/vault/token/test_token_file.py",
+    ),
+    Pattern(
+        "a waiting child ends with its parent",
+        "wait_for_master",
+        "os.getppid() != parent",
+        "False",
+        "tests/measure/sinks/test_ros1_parent.py",
+    ),
+    Pattern(
+        "a sensor that another station measures is not zeroed",
+        "_ZeroRun.run",
+        "_require_nobody_else(trusted)",
+        "None",
+        "tests/measure/test_zero.py",
+    ),
+    Pattern(
+        "a topic moves nothing that a request still holds",
+        "ActuatorLeases.admits",
+        "held is None or held.ended",
+        "held is None or held.let_go",
+        "tests/ncap/test_actuator_leases.py",
+    ),
 )
 
 _C_TESTS = "tests/firmware/test_c_tests.py"

@@ -6,7 +6,7 @@ import stat
 
 import pytest
 
-from teds_provision.errors import VaultError
+from teds_provision.errors import VaultChangedError, VaultError
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.vault.pkcs11 import FILE_NAME, Pkcs11Vault
 from tests.vault.softhsm import PIN
@@ -96,6 +96,26 @@ def test_a_change_of_the_master_key(vault, home, store_id, uri):
     assert last.unwrap(after, context=CONTEXT) == b"k" * 16
     with pytest.raises(VaultError, match="lacks"):
         last.unwrap(before, context=CONTEXT)
+
+
+def test_a_change_keeps_what_another_process_changed_before(vault, home, store_id, uri):
+    other = Pkcs11Vault.open(home, store_id, uri, Person())
+    set_pin = vault.new_passphrase(lambda prompt, confirm: PIN)  # to what it is: the other one's session stays open
+    for change in (vault.add_master, vault.retire_masters, vault.drop_ca, set_pin):
+        other.add_master()
+        wrapped = other.wrap(b"k" * 16, context=CONTEXT)
+        change()
+        if change is not set_pin:
+            other.refresh()
+        assert Pkcs11Vault.open(home, store_id, uri, Person()).unwrap(wrapped, context=CONTEXT) == b"k" * 16
+    for change in (
+        other.add_master,
+        other.retire_masters,
+        other.drop_ca,
+        other.new_passphrase(lambda prompt, confirm: PIN),
+    ):
+        with pytest.raises(VaultChangedError):
+            change()
 
 
 def test_a_backup_opens_with_the_same_token_alone(vault, tmp_path, store_id, uri, uris):
