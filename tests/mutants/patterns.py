@@ -868,8 +868,8 @@ PATTERNS = (
     Pattern(
         "a message of before its Subscribe is none of its stream",
         "StreamReceiver._dispatch",
-        "(early := self._early.get(key)) is not None and message.at >= early.since",
-        "(early := self._early.get(key)) is not None",
+        "early is not None and message.at >= early.since",
+        "early is not None",
         "tests/measure/test_hearing.py",
     ),
     Pattern(

@@ -164,9 +164,9 @@ def test_an_answer_is_kept_of_the_office_that_was_asked_and_once(plant: Plant) -
     def kept(by: Station, of: str = asked.hash) -> int:
         signed = seal({"format": SIGNED.format, "of": of}, by.vault.identity(), SIGNED)
         sealed = jose.encrypt(signed, [west.point], cty=CONTENT_TYPE)
-        plant.post.send(Parcel(os.urandom(4).hex(), west.fingerprint, sealed, time_text(now(60)), by.fingerprint))
+        plant.transport.send(Parcel(os.urandom(4).hex(), west.fingerprint, sealed, time_text(now(60)), by.fingerprint))
         sync(plant, "west")
-        assert plant.post.there == {}
+        assert plant.transport.there == {}
         return len(parcels.received(west, "signed"))
 
     assert kept(plant["south"]) == 0
