@@ -43,13 +43,13 @@ _WAIT = 120.0
 class Rows:
     """Prints lines: what was measured, what it came to, its aim and whether that is met."""
 
-    def tell(self, what: str, value: float, unit: str, *, aim: float | None = None, least: bool = False) -> None:
+    def add(self, what: str, value: float, unit: str, *, aim: float | None = None, least: bool = False) -> None:
         """Print one row; ``least``: the aim is a floor, not a ceiling."""
         good = aim is None or (value >= aim if least else value <= aim)
         sign = "≥" if least else "≤"
-        told = "" if aim is None else f"aim {sign} {aim:g}: {'met' if good else 'MISSED'}"
+        verdict = "" if aim is None else f"aim {sign} {aim:g}: {'met' if good else 'MISSED'}"
         shown = f"{value:,.0f}" if value >= 100 else f"{value:.2f}"
-        print(f"{what:<58}{shown:>9} {unit:<9}{told}", flush=True)
+        print(f"{what:<58}{shown:>9} {unit:<9}{verdict}", flush=True)
 
 
 @contextmanager
@@ -104,9 +104,9 @@ def start_up(rows: Rows) -> None:
         return statistics.median(times)
 
     floor = median(sys.executable, "-c", "import click")
-    rows.tell("import click, bare", floor * 1e3, "ms")
+    rows.add("import click, bare", floor * 1e3, "ms")
     for name in ("--help", "--version"):
-        rows.tell(f"{name} against it", median(sys.executable, "-m", "teds_provision", name) / floor, "×", aim=1.4)
+        rows.add(f"{name} against it", median(sys.executable, "-m", "teds_provision", name) / floor, "×", aim=1.4)
     completion(rows)
 
 
@@ -132,8 +132,8 @@ def completion(rows: Rows) -> None:
                 )
                 times.append((time.perf_counter() - began, processor_time() - worked))
             seconds, work = (min(column) * 1e3 for column in zip(*times, strict=True))
-            rows.tell(f"completion of {what}, least of seven", seconds, "ms", aim=150)
-            rows.tell("  of it processor time, whatever else runs", work, "ms")
+            rows.add(f"completion of {what}, least of seven", seconds, "ms", aim=150)
+            rows.add("  of it processor time, whatever else runs", work, "ms")
 
 
 def processor_time() -> float:
@@ -156,10 +156,10 @@ def start_to_end(rows: Rows) -> None:
         fill_images(folder, home, 1)
         (image,) = folder.iterdir()
         commands = {"nodes": 120, "": 160, f"verify {image}": 160, "doctor": 250}
-        rows.tell("import click, processor time", _least_work("-c", "import click"), "ms")
+        rows.add("import click, processor time", _least_work("-c", "import click"), "ms")
         for words, aim in commands.items():
             work = _least_work("-m", "teds_provision", "--home", str(home), *words.split())
-            rows.tell(f"  {words.partition(' ')[0] or 'the bare command'}", work, "ms", aim=aim)
+            rows.add(f"  {words.partition(' ')[0] or 'the bare command'}", work, "ms", aim=aim)
 
 
 def _least_work(*words: str) -> float:
@@ -180,9 +180,9 @@ def fixed_cost(rows: Rows) -> None:
     node.
     """
     stretched = min(timeit.repeat(lambda: SealingKey.derive(PASSPHRASE, costs=PRODUCT), number=1, repeat=7))
-    rows.tell("Argon2id alone", stretched, "s")
+    rows.add("Argon2id alone", stretched, "s")
     with station() as home:
-        rows.tell("nodes, of a new station", min(timed(home, "nodes") for _ in range(7)), "s", aim=0.25)
+        rows.add("nodes, of a new station", min(timed(home, "nodes") for _ in range(7)), "s", aim=0.25)
     for via, link in (
         ("nfc", f"udp:127.0.0.1:{free_port()}"),
         ("can", f"udp_multicast:239.74.163.9?port={free_port()}"),
@@ -200,9 +200,9 @@ def fixed_cost(rows: Rows) -> None:
             board, _ = _changed_at_once(boards, watch, 7)
             watch.terminate()
             watch.communicate(timeout=_WAIT)
-        rows.tell(f"provision over {via}, from start to verdict", min(whole), "s")
-        rows.tell("  of it neither link, node nor Argon2id", min(whole) - board - stretched, "s", aim=0.35)
-        rows.tell(f"verify UUID over {via}, without Argon2id", min(verify) - stretched, "s", aim=0.35)
+        rows.add(f"provision over {via}, from start to verdict", min(whole), "s")
+        rows.add("  of it neither link, node nor Argon2id", min(whole) - board - stretched, "s", aim=0.35)
+        rows.add(f"verify UUID over {via}, without Argon2id", min(verify) - stretched, "s", aim=0.35)
 
 
 def one_command(rows: Rows) -> None:
@@ -223,10 +223,10 @@ def one_command(rows: Rows) -> None:
                         began = time.perf_counter()
                         finished(started(home, *PROVISION, "--via", via, f"--{via}", link, **environment))
                         taken.append(time.perf_counter() - began)
-                    rows.tell(f"provision over {via}, paced, {kind}, {name}", statistics.median(taken), "s")
+                    rows.add(f"provision over {via}, paced, {kind}, {name}", statistics.median(taken), "s")
                 _, before = next_node(process)
                 if slow:
-                    rows.tell(f"  of it {before.operations} point operations", before.operations * slow, "s")
+                    rows.add(f"  of it {before.operations} point operations", before.operations * slow, "s")
 
 
 def zeroing(rows: Rows) -> None:
@@ -252,7 +252,7 @@ def zeroing(rows: Rows) -> None:
                 node.terminate()
                 node.communicate(timeout=_WAIT)
         kind = "80 ms node" if slow else "immediate node"
-        rows.tell(f"calibrate zero over CAN, paced, {kind}", statistics.median(taken), "s", aim=None if slow else 3.0)
+        rows.add(f"calibrate zero over CAN, paced, {kind}", statistics.median(taken), "s", aim=None if slow else 3.0)
 
 
 def watching(rows: Rows) -> None:
@@ -264,13 +264,19 @@ def watching(rows: Rows) -> None:
         count = 8 if slow else 25
         with station(quick=True) as home, nodes(via, link, *delay) as process:
             watch = started(home, *PROVISION, "--watch", "--via", via, f"--{via}", link)
-            each, operations = _changed_at_once(process, watch, count)
+            seconds_each, operations = _changed_at_once(process, watch, count)
             watch.terminate()
             watch.communicate(timeout=_WAIT)
         kind = f"{'80 ms' if slow else 'immediate'} nodes"
-        rows.tell(f"provision --watch over {via}, {kind}, changed at once", 3600 / each, "nodes/h", aim=aim, least=True)
+        rows.add(
+            f"provision --watch over {via}, {kind}, changed at once",
+            3600 / seconds_each,
+            "nodes/h",
+            aim=aim,
+            least=True,
+        )
         if slow:
-            rows.tell(f"  floor of {operations} point operations", 3600 / (operations * slow), "nodes/h")
+            rows.add(f"  floor of {operations} point operations", 3600 / (operations * slow), "nodes/h")
 
 
 def _changed_at_once(process: subprocess.Popen[str], watch: subprocess.Popen[str], count: int) -> tuple[float, int]:
@@ -321,9 +327,9 @@ def eight_readers(rows: Rows) -> None:
             return taken
 
     with station(quick=True) as home:
-        one, all_of_them = side_by_side(home, 1), side_by_side(home, READERS)
-    rows.tell(f"--watch, one reader, 80 ms node ({READERS}: {all_of_them:.2f} s)", one, "s")
-    rows.tell(f"--watch, {READERS} readers against one", all_of_them / one, "×", aim=1.2)
+        alone, all_of_them = side_by_side(home, 1), side_by_side(home, READERS)
+    rows.add(f"--watch, one reader, 80 ms node ({READERS}: {all_of_them:.2f} s)", alone, "s")
+    rows.add(f"--watch, {READERS} readers against one", all_of_them / alone, "×", aim=1.2)
     with station(quick=True) as home, ExitStack() as stack:
         links = [f"udp:127.0.0.1:{free_port()}" for _ in range(READERS)]
         next_nodes([stack.enter_context(nodes("nfc", link, *slow)) for link in links])
@@ -333,9 +339,9 @@ def eight_readers(rows: Rows) -> None:
             finished(command)
         taken, after = time.perf_counter() - began, os.times()
     cpu = after.children_user + after.children_system - before.children_user - before.children_system
-    rows.tell(f"{READERS} commands at once, wall", taken, "s")
+    rows.add(f"{READERS} commands at once, wall", taken, "s")
     cores = len(os.sched_getaffinity(0))
-    rows.tell(f"{READERS} commands at once against their CPU on {cores} cores", taken / (cpu / cores), "×", aim=1.2)
+    rows.add(f"{READERS} commands at once against their CPU on {cores} cores", taken / (cpu / cores), "×", aim=1.2)
 
 
 def whole_bus(rows: Rows, count: int) -> None:
@@ -355,7 +361,7 @@ def whole_bus(rows: Rows, count: int) -> None:
             taken = time.perf_counter() - began
         passed = sum(_passed(json.loads(line)) for line in lines)
         aimed = aim if count == 200 else None
-        rows.tell(f"provision --all, {passed} of {count} slow nodes, {name}", taken, "s", aim=aimed)
+        rows.add(f"provision --all, {passed} of {count} slow nodes, {name}", taken, "s", aim=aimed)
 
 
 def main(words: list[str] | None = None) -> None:

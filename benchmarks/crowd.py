@@ -90,16 +90,16 @@ def provisioned(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kin
             failures.append(line["error"]["message"])
         if passed + len(failures) == len(nodes.uuids):
             break
-    took, taken = time.monotonic() - began, wire.busy_seconds - busy
+    seconds, taken = time.monotonic() - began, wire.busy_seconds - busy
     own = worked(process.pid)
     process.communicate()
-    rows.tell(f"provision --all, {passed} of {len(nodes.uuids)} nodes in C, {kind}", took, "s")
+    rows.add(f"provision --all, {passed} of {len(nodes.uuids)} nodes in C, {kind}", seconds, "s")
     for failure in failures:
         print(f"  failed: {failure}")
-    rows.tell("  the wire time of all frames", taken, "s")
-    rows.tell("  ratio", took / taken, "×", aim=ALL_AIM)
-    rows.tell("  processor time of the station", own, "s")
-    rows.tell("  of the nodes' one process", nodes.ask("cpu") - cpu, "s")
+    rows.add("  the wire time of all frames", taken, "s")
+    rows.add("  ratio", seconds / taken, "×", aim=ALL_AIM)
+    rows.add("  processor time of the station", own, "s")
+    rows.add("  of the nodes' one process", nodes.ask("cpu") - cpu, "s")
 
 
 def measured(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kind: str) -> None:
@@ -130,16 +130,16 @@ def measured(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kind: 
         cpu, own, busy, began = nodes.ask("cpu"), worked(ncap.pid), wire.busy_seconds, time.monotonic()
         nodes.ask("on")
         until(lambda: len(topics.first) >= len(nodes.uuids), why=f"{len(nodes.uuids)} nodes: {len(topics.first)} came")
-        took, taken = max(topics.first.values()) - began, wire.busy_seconds - busy
+        seconds, taken = max(topics.first.values()) - began, wire.busy_seconds - busy
         own, cpu = worked(ncap.pid) - own, nodes.ask("cpu") - cpu
         states = [report["state"] for report in here.measurements()[0]["nodes"]]
-        rows.tell(f"{len(nodes.uuids)} switched on together, {kind}: last first value", took, "s")
-        rows.tell("  the wire time of all frames until then", taken, "s")
-        rows.tell("  ratio", took / taken, "×", aim=MEASURE_AIM[kind])
-        rows.tell("  processor time of the station", own, "s")
-        rows.tell("  of the nodes' one process", cpu, "s")
-        rows.tell("  half of them had a value after", sorted(topics.first.values())[len(nodes.uuids) // 2] - began, "s")
-        rows.tell("  running", states.count("running"), "")
+        rows.add(f"{len(nodes.uuids)} switched on together, {kind}: last first value", seconds, "s")
+        rows.add("  the wire time of all frames until then", taken, "s")
+        rows.add("  ratio", seconds / taken, "×", aim=MEASURE_AIM[kind])
+        rows.add("  processor time of the station", own, "s")
+        rows.add("  of the nodes' one process", cpu, "s")
+        rows.add("  half of them had a value after", sorted(topics.first.values())[len(nodes.uuids) // 2] - began, "s")
+        rows.add("  running", states.count("running"), "")
 
 
 def main(words: list[str] | None = None) -> None:

@@ -91,13 +91,13 @@ def verbs(folder: Path) -> Iterator[tuple[str, Counter[str]]]:
             trust(own, other, "other")
         hall.nodes["a"].start()
         uuid, link = hall.nodes["a"].uuid, ("--can", hall.can, "--via", "can")
-        told: tuple[tuple[object, ...], ...] = (
+        commands: tuple[tuple[object, ...], ...] = (
             ("identify", *link),
             ("verify", uuid, *link),
             ("measure", uuid, "--duration", "1", *link),
             ("export-keys", "--to", "other", uuid, "--output", folder / "keys.jwe", "--yes"),
         )
-        for words in told:
+        for words in commands:
             calls: Counter[str] = Counter()
             with counted(calls):
                 done = call(home, "--json", *words)

@@ -40,7 +40,7 @@ _DATABASE = "plant"
 _TICK = os.sysconf("SC_CLK_TCK")
 
 
-class Ran(NamedTuple):
+class Throughput(NamedTuple):
     """Boards an hour; processor seconds a board of the line's command, and of it with its office and database."""
 
     an_hour: float
@@ -101,7 +101,9 @@ def processor(*processes: int) -> float:
     return total / _TICK
 
 
-def run(home: Path, readers: int, boards: int, words: Sequence[str], node_words: Sequence[str], *others: int) -> Ran:
+def run(
+    home: Path, readers: int, boards: int, words: Sequence[str], node_words: Sequence[str], *others: int
+) -> Throughput:
     """Put ``boards`` boards down on ``readers`` readers, and time them from the second round on."""
     links = [f"udp:127.0.0.1:{free_port()}" for _ in range(readers)]
     with ExitStack() as stack:
@@ -112,12 +114,12 @@ def run(home: Path, readers: int, boards: int, words: Sequence[str], node_words:
         lies = {uuid.hex(): place for place, (uuid, _) in zip(places, next_nodes(places), strict=True)}
         put, began, used = readers, 0.0, (0.0, 0.0)
         for done, text in enumerate(watch.stdout, 1):
-            told = json.loads(text)
-            if told.get("verdict") != "authentic":
-                raise SystemExit(f"a board failed: {told}")
+            record = json.loads(text)
+            if record.get("verdict") != "authentic":
+                raise SystemExit(f"a board failed: {record}")
             if done == readers:  # everything is loaded, unlocked, connected
                 began, used = time.perf_counter(), (processor(watch.pid), processor(watch.pid, *others))
-            place = lies.pop(told["uuid"])
+            place = lies.pop(record["uuid"])
             if put < boards + readers:
                 lies[next_node(place)[0].hex()] = place
                 put += 1
@@ -127,7 +129,7 @@ def run(home: Path, readers: int, boards: int, words: Sequence[str], node_words:
         after = processor(watch.pid), processor(watch.pid, *others)
         watch.terminate()
         watch.communicate(timeout=60)
-    return Ran(3600 * boards / taken, (after[0] - used[0]) / boards, (after[1] - used[1]) / boards)
+    return Throughput(3600 * boards / taken, (after[0] - used[0]) / boards, (after[1] - used[1]) / boards)
 
 
 def main(words: list[str] | None = None) -> None:

@@ -26,10 +26,10 @@ def checks_a_second(cores: int) -> float:
     ]
     total = 0.0
     for speed in speeds:
-        told = speed.communicate()[0]
-        found = re.search(r"nistp256\).*\s(\d+\.\d)\s*$", told, re.MULTILINE)
+        output = speed.communicate()[0]
+        found = re.search(r"nistp256\).*\s(\d+\.\d)\s*$", output, re.MULTILINE)
         if found is None:
-            raise SystemExit(f"openssl said something else:\n{told}")
+            raise SystemExit(f"openssl said something else:\n{output}")
         total += float(found[1])
     return total
 

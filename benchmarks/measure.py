@@ -123,9 +123,9 @@ def main() -> None:
             ours = min(ours, stream.run(together))
             floors = min(floors, floor(stream.messages, together, bare))
             exact = min(exact, floor(stream.messages, together, calibrated))
-        told = (f"{seconds / MESSAGES * 1e6:.1f}" for seconds in (ours, exact, floors))
+        us = (f"{seconds / MESSAGES * 1e6:.1f}" for seconds in (ours, exact, floors))
         print(
-            f"{together:3d} together: ours {next(told)}, calibrated {next(told)}, bare {next(told)}: "
+            f"{together:3d} together: ours {next(us)}, calibrated {next(us)}, bare {next(us)}: "
             f"{ours / exact:.1f} × calibrated (aim {AIM:.0f}: {'met' if ours / exact <= AIM else 'MISSED'}), "
             f"{ours / floors:.1f} × bare",
             flush=True,

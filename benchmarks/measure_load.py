@@ -153,7 +153,7 @@ class Load:
         """Values that were sent."""
         return int(self.seconds * RATE / N) * N * CHANNELS * self.nodes
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """Return the row of the table."""
         below = np.cumsum(self.lags)
         p50, p99 = (float(np.searchsorted(below, below[-1] * share)) * STEP for share in (0.50, 0.99))
@@ -333,7 +333,7 @@ def main() -> None:
     for nodes in options.nodes:
         seconds = options.seconds if nodes == max(options.nodes) else max(5.0, options.seconds / 10)
         with tempfile.TemporaryDirectory() as folder:
-            print(run(nodes, seconds, Path(folder), options.to).told(), flush=True)
+            print(run(nodes, seconds, Path(folder), options.to).summary(), flush=True)
 
 
 if __name__ == "__main__":

@@ -92,7 +92,7 @@ def _sender(server: CanServer, node: VirtualNode) -> Callable[[DataFrame], None]
 
 
 @dataclass
-class Found:
+class SizeResult:
     """What one size came to; seconds."""
 
     nodes: int
@@ -115,7 +115,7 @@ class Bench:
             free.bind(("127.0.0.1", 0))
             self.can = f"udp_multicast:239.74.163.2?port={free.getsockname()[1]}&fd=1"
 
-    def run(self, count: int, seconds: float) -> Found:
+    def run(self, count: int, seconds: float) -> SizeResult:
         """Measure so many nodes; they are switched on while the measurement waits for them."""
         uuids = tuple(self.nodes)[:count]
         file = self.folder / f"run-{count}-{time.monotonic_ns()}.csv"
@@ -164,7 +164,7 @@ def _first_row(file: Path) -> float:
 
 def _found(
     count: int, came: list[tuple[int, Block]], since: dict[str, int], offset: float, apart: float, first: float
-) -> Found:
+) -> SizeResult:
     stamps, lags = [], []
     began = min(at for at, _ in came)
     for at, block in came:
@@ -173,7 +173,7 @@ def _found(
         true = (block.tick.astype(np.float64) + since[block.uuid]) / 1e9
         stamps.append(block.time - (true + offset))
         lags.append(at / 1e9 - true)
-    return Found(count, np.abs(np.concatenate(stamps)), np.concatenate(lags), apart, first)
+    return SizeResult(count, np.abs(np.concatenate(stamps)), np.concatenate(lags), apart, first)
 
 
 def main() -> None:

@@ -112,16 +112,16 @@ def listen(url: str, token: str, stack: ExitStack, count: int, stop: threading.E
     return heard
 
 
-def asked(station_: client.Client, seconds: float, tell: Any) -> list[float]:
+def asked(station_: client.Client, seconds: float, notify: Any) -> list[float]:
     """GET /nodes again and again; how long each took."""
-    times, end, told = [], time.perf_counter() + seconds, time.perf_counter()
+    times, end, started = [], time.perf_counter() + seconds, time.perf_counter()
     while time.perf_counter() < end:
         began = time.perf_counter()
         station_.nodes()
         times.append(time.perf_counter() - began)
-        if time.perf_counter() - told > _EVERY:
-            told = time.perf_counter()
-            tell()
+        if time.perf_counter() - started > _EVERY:
+            started = time.perf_counter()
+            notify()
         select.select([], [], [], 0.1)
     return times
 
@@ -139,7 +139,7 @@ def main(words: list[str] | None = None) -> None:
         process, url = stack.enter_context(daemon(home, link))
         here = stack.enter_context(client.connect(home=home))
         taken = until(lambda: sum(bool(node["verified"]) for node in here.nodes()) >= options.nodes)
-        rows.tell(f"{options.nodes} nodes found and verified after the start", taken, "s")
+        rows.add(f"{options.nodes} nodes found and verified after the start", taken, "s")
         made = here.request("POST", "/virtual", {"profile": "gripper", "name": "hand", "source": "sine:2"})
         until(lambda: (verdict := here.node(made["uuid"])["verdict"]) is not None and verdict["verdict"] == "authentic")
         here.measure(made["uuid"], rate=RATE)
@@ -147,34 +147,34 @@ def main(words: list[str] | None = None) -> None:
         token = json.loads(finished(started(home, "ncap", "token", "add", "load")))["token"]
         stop = threading.Event()
         quiet = asked(here, 3.0, lambda: None)
-        rows.tell("GET /nodes, nobody listens: p50", statistics.median(quiet) * 1e3, "ms")
+        rows.add("GET /nodes, nobody listens: p50", statistics.median(quiet) * 1e3, "ms")
         deaf = [stack.enter_context(deaf_client(url, token)) for _ in range(options.deaf)]
         heard = listen(url, token, stack, options.clients - len(deaf), stop)
         script = stack.enter_context(client.connect(url, token=token))
         before, first = memory(process), here.measurements()[0]["nodes"][0]
 
-        def tell() -> None:
+        def notify() -> None:
             now = here.measurements()[0]["nodes"][0]
             print(f"  {memory(process):.0f} MiB, {now['samples']} values, {now['lost']} lost", flush=True)
 
         began = time.perf_counter()
-        times = sorted(asked(script, options.seconds, tell))
+        times = sorted(asked(script, options.seconds, notify))
         seconds = time.perf_counter() - began
         after, last = memory(process), here.measurements()[0]["nodes"][0]
         stop.set()
         name = f"{options.clients} clients, {options.deaf} deaf"
-        rows.tell(f"GET /nodes, {name}: p50", statistics.median(times) * 1e3, "ms")
-        rows.tell(f"GET /nodes, {name}: p99", times[int(len(times) * 0.99)] * 1e3, "ms", aim=50)
-        rows.tell(
+        rows.add(f"GET /nodes, {name}: p50", statistics.median(times) * 1e3, "ms")
+        rows.add(f"GET /nodes, {name}: p99", times[int(len(times) * 0.99)] * 1e3, "ms", aim=50)
+        rows.add(
             "values measured meanwhile",
             (last["samples"] - first["samples"]) / seconds / 2,
             "/s",
             aim=RATE * 0.95,
             least=True,
         )
-        rows.tell("messages lost", last["lost"] - first["lost"], "", aim=0)
-        rows.tell("sent to those who read", heard[0] / seconds / 1e3, "kB/s")
-        rows.tell(f"memory after {seconds:.0f} s against before", after / before, "×", aim=1.1)
+        rows.add("messages lost", last["lost"] - first["lost"], "", aim=0)
+        rows.add("sent to those who read", heard[0] / seconds / 1e3, "kB/s")
+        rows.add(f"memory after {seconds:.0f} s against before", after / before, "×", aim=1.1)
 
 
 if __name__ == "__main__":

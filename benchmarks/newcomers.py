@@ -67,7 +67,7 @@ MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin")
 # -- the nodes' process: "on NAME …" hangs nodes on the bus together, "off NAME …" cuts their power -------------------
 
 
-class Announcing(CanServer):
+class AnnouncingServer(CanServer):
     """A bus that remembers when its first node announced itself (monotonic)."""
 
     first = math.inf
@@ -83,13 +83,13 @@ class Power:
 
     def __init__(self, link: str, folder: Path) -> None:
         self._link, self._folder, self._pulse = link, folder, RealtimeLoop()
-        self._on: dict[str, tuple[Announcing, VirtualNode]] = {}
+        self._on: dict[str, tuple[AnnouncingServer, VirtualNode]] = {}
         self._missed = 0
         self._pulse.start()
 
     def on(self, names: Sequence[str]) -> None:
         """Hang them on the bus, as a board that gets power does."""
-        server = Announcing(self._link)
+        server = AnnouncingServer(self._link)
         for name in names:
             node = VirtualNode(
                 self._folder / name,
@@ -160,15 +160,15 @@ class Wire:
             sender, to = frame.identifier & 0xFF, frame.identifier >> 8 & 0xFF
             if at > until or (address is not None and address not in (sender, to)):
                 continue
-            took = (
+            wire_time = (
                 fd_seconds(frame.identifier, frame.data, BITRATE, DATA_BITRATE)
                 if frame.fd
                 else classic_bits(frame.identifier, frame.data) / BITRATE
             )
             if frame.identifier >> 16 == 0x1CFF:
-                data += took
+                data += wire_time
             else:
-                talk += took
+                talk += wire_time
         return talk, data
 
     def _after(self, since: float) -> list[tuple[float, Frame]]:
@@ -359,10 +359,10 @@ def one_after_the_other(on: Scene, joins: int) -> None:
         on.leaves(joiner)
         time.sleep(1.0)  # as somebody who takes it off and puts it back: it is asked for meanwhile
     taken.sort()
-    on.rows.tell(f"one joins {BASE}, first value after its Announce, p50", median(taken) * 1e3, "ms")
+    on.rows.add(f"one joins {BASE}, first value after its Announce, p50", median(taken) * 1e3, "ms")
     p95 = taken[-max(1, round(0.05 * joins))]
-    on.rows.tell("  p95", p95 * 1e3, "ms", aim=FIRST * 1e3)
-    on.rows.tell("  of it its commands and replies on the wire", median(wired) * 1e3, "ms")
+    on.rows.add("  p95", p95 * 1e3, "ms", aim=FIRST * 1e3)
+    on.rows.add("  of it its commands and replies on the wire", median(wired) * 1e3, "ms")
     _tell_losses(on, base, before, f"lost by the {BASE} in {joins} joinings and leavings")
 
 
@@ -372,14 +372,14 @@ def together(on: Scene) -> None:
     more = [f"n{number}" for number in range(BASE, 2 * BASE)]
     before = on.lost_until_now(base)
     _, announced, came = on.joins(more)
-    on.rows.tell(f"{BASE} join {BASE} together, last one's first value", came - announced, "s", aim=TOGETHER)
+    on.rows.add(f"{BASE} join {BASE} together, last one's first value", came - announced, "s", aim=TOGETHER)
     on.leaves(*more)
     _tell_losses(on, base, before, f"lost by the {BASE} meanwhile")
 
 
 def _tell_losses(on: Scene, names: Sequence[str], before: tuple[int, int], what: str) -> None:
     lost, own = (now - then for now, then in zip(on.lost_until_now(names), before, strict=True))
-    on.rows.tell(f"{what}, beside {own} that their process left out", max(0, lost - own), "", aim=0)
+    on.rows.add(f"{what}, beside {own} that their process left out", max(0, lost - own), "", aim=0)
 
 
 def many(on: Scene, count: int, seconds: float, kind: str) -> None:
@@ -387,31 +387,35 @@ def many(on: Scene, count: int, seconds: float, kind: str) -> None:
     names = [f"n{number}" for number in range(count)]
     began, announced, came = on.joins(names)
     talk, data = on.wire.seconds(began, came)
-    took = came - announced
-    one = median(
+    elapsed = came - announced
+    seconds_of_one = median(
         on.wire.seconds(began, on.topics.first[name], address=default_can_address(on.uuids[name]))[0]
         for name in names[:BASE]
     )
-    on.rows.tell(f"{count} switched on together, {kind}: computed, {count} × {one * 1e3:.1f} ms", count * one, "s")
-    on.rows.tell("  measured until the last one's first value", took, "s")
-    on.rows.tell("  of it the wire was taken by commands and replies", 100 * talk / took, "%")
-    on.rows.tell("  and by data of those that were in", 100 * data / took, "%")
+    on.rows.add(
+        f"{count} switched on together, {kind}: computed, {count} × {seconds_of_one * 1e3:.1f} ms",
+        count * seconds_of_one,
+        "s",
+    )
+    on.rows.add("  measured until the last one's first value", elapsed, "s")
+    on.rows.add("  of it the wire was taken by commands and replies", 100 * talk / elapsed, "%")
+    on.rows.add("  and by data of those that were in", 100 * data / elapsed, "%")
     time.sleep(5.0)  # that it runs is told after its first values, where all begin at once
     states = [report["state"] for report in on.here.measurements()[0]["nodes"]]
-    on.rows.tell(f"  measured of {count}", states.count("running"), "", aim=count, least=True)
-    on.rows.tell("  memory of the station", memory(on.ncap), "MB", aim=MEMORY + MEMORY_OF_A_NODE * count)
+    on.rows.add(f"  measured of {count}", states.count("running"), "", aim=count, least=True)
+    on.rows.add("  memory of the station", memory(on.ncap), "MB", aim=MEMORY + MEMORY_OF_A_NODE * count)
 
     def read_whole(uuid: bytes) -> bool:
         verdict = on.here.node(uuid.hex())["verdict"]
         return verdict is not None and verdict["from"] == "session"
 
     until(lambda: all(map(read_whole, on.uuids.values())), 900)
-    on.rows.tell("  read whole behind the measurement after", time.monotonic() - announced, "s")
+    on.rows.add("  read whole behind the measurement after", time.monotonic() - announced, "s")
     before, since = on.lost_until_now(names), time.monotonic()
     time.sleep(seconds)
     talk, data = on.wire.seconds(since, since + seconds)
-    on.rows.tell(f"clocks of {count} nodes, {kind}", 100 * talk / seconds, "%", aim=CLOCK_SHARE)
-    on.rows.tell("  beside their data", 100 * data / seconds, "%")
+    on.rows.add(f"clocks of {count} nodes, {kind}", 100 * talk / seconds, "%", aim=CLOCK_SHARE)
+    on.rows.add("  beside their data", 100 * data / seconds, "%")
     _tell_losses(on, names, before, "  lost meanwhile")
 
 

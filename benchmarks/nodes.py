@@ -96,12 +96,12 @@ def one_after_the_other_in_c(options: argparse.Namespace, place: Path) -> None:
     """Serve another node in C for each line of input."""
     process: subprocess.Popen[str] | None = None
     for number, _ in enumerate(sys.stdin):
-        told = ended(process) if process is not None else dict.fromkeys(("chip", "flash", "turned"), 0.0)
+        usage = ended(process) if process is not None else dict.fromkeys(("chip", "flash", "turned"), 0.0)
         words = [str(PROGRAM), "--flash", str(place / f"{number}.bin"), f"--{options.via}", options.link, "--pace"]
         process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
         uuid = json.loads(process.stdout.readline())["uuid"]
-        print(uuid, 0, told["flash"], 0.0, told["chip"], told["turned"], flush=True)
+        print(uuid, 0, usage["flash"], 0.0, usage["chip"], usage["turned"], flush=True)
     if process is not None:
         ended(process)
 
@@ -109,8 +109,8 @@ def one_after_the_other_in_c(options: argparse.Namespace, place: Path) -> None:
 def ended(process: subprocess.Popen[str]) -> dict[str, float]:
     """Take a node in C away: what it says of its own part."""
     process.terminate()
-    told: dict[str, float] = json.loads(process.communicate(timeout=20)[0])
-    return told
+    output: dict[str, float] = json.loads(process.communicate(timeout=20)[0])
+    return output
 
 
 def all_at_once(options: argparse.Namespace, place: Path) -> None:
@@ -137,8 +137,8 @@ def main() -> None:
     parser.add_argument("--c", action="store_true")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        one = one_after_the_other_in_c if options.c else one_after_the_other
-        (all_at_once if options.many else one)(options, Path(folder))
+        run = one_after_the_other_in_c if options.c else one_after_the_other
+        (all_at_once if options.many else run)(options, Path(folder))
 
 
 if __name__ == "__main__":

@@ -49,13 +49,13 @@ def chain(key: SoftwareKey, pages: int, events: int) -> Pages:
     made: Pages = []
     before = ""
     for n in range(1, pages + 1):
-        told = [
+        page_events = [
             event.made("agreed", os.urandom(8).hex(), "2026-11-23T09:00:00Z", os.urandom(10),
                        {"fingerprint": "ab" * 32, "epoch": 1, "key_id": os.urandom(8).hex()})
             for _ in range(events)
         ]  # fmt: skip
         draft = PageDraft(REGISTRY, n, before, "0" * 16, datetime.now(UTC), {}, (1, "0" * 64))
-        octets = seal_page(draft, told, key)
+        octets = seal_page(draft, page_events, key)
         made.append((n, before, octets))
         before = hash_of(octets)
     return made
@@ -151,11 +151,11 @@ def _history(nodes: int) -> None:
         stick, key, place = FolderTransport(made.stick), west.vault.identity(), (0, "")
         made.sync(made.north)
         for _ in range(0, nodes, 250):
-            told = [entry for _ in range(250) for entry in _told_of(os.urandom(10))]
+            events = [entry for _ in range(250) for entry in _told_of(os.urandom(10))]
             draft = PageDraft(
                 made.roster.registry, place[0] + 1, place[1], "0" * 16, datetime.now(UTC), {}, (1, "0" * 64)
             )
-            octets = seal_page(draft, told, key)
+            octets = seal_page(draft, events, key)
             place = draft.number, hash_of(octets)
             stick.append(west.fingerprint, draft.number, draft.previous, place[1], octets)
         made.close()
@@ -168,13 +168,13 @@ def _told_of(uuid: bytes) -> list[dict[str, Any]]:
     at, who, digest = "2026-11-23T09:00:00Z", os.urandom(32).hex(), os.urandom(32).hex()
     written = {"epoch": 1, "sequence": 1, "teds_sha256": digest}
     kind = {"profile": "magnetic-angular-position-sensor", "profile_sha256": "ab" * 32, "due": "2027-11-23"}
-    said: list[tuple[str, dict[str, Any]]] = [
+    events: list[tuple[str, dict[str, Any]]] = [
         ("pinned", {"fingerprint": who, "assurance": "tap"}),
         ("agreed", {"fingerprint": who, "epoch": 1, "key_id": os.urandom(8).hex()}),
         ("signed", written),
         ("written", {**written, **kind}),
     ]
-    return [event.made(act, os.urandom(8).hex(), at, uuid, members) for act, members in said]
+    return [event.made(act, os.urandom(8).hex(), at, uuid, members) for act, members in events]
 
 
 def _take_in(folder: Path) -> None:
@@ -182,10 +182,10 @@ def _take_in(folder: Path) -> None:
     south.unlock()
     before, cpu, began = _peak(), time.process_time(), time.monotonic()
     done = sync(south, FolderTransport(folder / "stick"))
-    spent, took = time.process_time() - cpu, time.monotonic() - began
+    spent, seconds = time.process_time() - cpu, time.monotonic() - began
     store = sum(path.stat().st_size for path in (folder / "south").rglob("*") if path.is_file())
     south.close()
-    print(f"  {done.fetched} pages in: {spent:.1f} s of CPU ({took:.1f} s by the clock), {_peak():.0f} MB at most")
+    print(f"  {done.fetched} pages in: {spent:.1f} s of CPU ({seconds:.1f} s by the clock), {_peak():.0f} MB at most")
     print(f"  ({before:.0f} MB before it), home {store / 1e6:.0f} MB")
 
 
@@ -198,14 +198,14 @@ def _peak() -> float:
 
 
 def _pushed(posts: list[postgres.Registry], chains: list[Pages], size: argparse.Namespace) -> None:
-    took: list[float] = []
+    durations: list[float] = []
 
     def push(transport: postgres.Registry, pages: Pages) -> Callable[[], None]:
         def work() -> None:
             for page in pages:
                 began = time.perf_counter()
                 transport.append([page])
-                took.append(time.perf_counter() - began)
+                durations.append(time.perf_counter() - began)
 
         return work
 
@@ -218,13 +218,13 @@ def _pushed(posts: list[postgres.Registry], chains: list[Pages], size: argparse.
 
     floor = at_once([empty(transport) for transport in posts])
     seconds = at_once([push(transport, pages) for transport, pages in zip(posts, chains, strict=True)])
-    pages, took = len(took), sorted(took)
+    pages, durations = len(durations), sorted(durations)
     heads = posts[0].look().heads
     newest = {h for _, h in heads.values()}
     whole = sum(hash_of(pages_of[-1][2]) in newest for pages_of in chains)
     print(f"{pages} pages of {len(posts)} stations in {seconds:.2f} s: {pages / seconds:.0f} pages/s,")
-    print(f"  {pages * size.events / seconds:.0f} events/s; page p50 {1000 * took[pages // 2]:.0f} ms,")
-    print(f"  p99 {1000 * took[pages * 99 // 100]:.0f} ms; {whole} chains whole")
+    print(f"  {pages * size.events / seconds:.0f} events/s; page p50 {1000 * durations[pages // 2]:.0f} ms,")
+    print(f"  p99 {1000 * durations[pages * 99 // 100]:.0f} ms; {whole} chains whole")
     print(f"  as many empty round trips at once: {floor:.2f} s")
     looks = []
     for _ in range(50):
@@ -240,7 +240,7 @@ def _woken(posts: list[postgres.Registry], keys: list[SoftwareKey]) -> None:
     listener.listen()
     while listener.wait(0.2):
         pass
-    name, took = fingerprint(keys[2].point), []
+    name, seconds = fingerprint(keys[2].point), []
     n, before = writer.look().heads[name]
     for n in range(n + 1, n + 101):  # noqa: B020
         draft = PageDraft(REGISTRY, n, before, "0" * 16, datetime.now(UTC), {}, (1, "0" * 64))
@@ -250,11 +250,11 @@ def _woken(posts: list[postgres.Registry], keys: list[SoftwareKey]) -> None:
         pushing.start()
         assert listener.wait(10)
         assert [page for _, _, page in reader.pages({name: n - 1})] == [octets]
-        took.append(time.perf_counter() - began)
+        seconds.append(time.perf_counter() - began)
         pushing.join()
         before = hash_of(octets)
-    took.sort()
-    print(f"a page is at a watching station after p50 {1000 * took[50]:.0f} ms, p99 {1000 * took[98]:.0f} ms")
+    seconds.sort()
+    print(f"a page is at a watching station after p50 {1000 * seconds[50]:.0f} ms, p99 {1000 * seconds[98]:.0f} ms")
 
 
 if __name__ == "__main__":

@@ -57,7 +57,7 @@ class Span(NamedTuple):
 
 
 @dataclass
-class Timed:
+class TimedLink:
     """A link that counts: when each exchange was, and the octets of its request and reply."""
 
     inner: Any
@@ -149,7 +149,7 @@ class Run:
     commits: int
     waited: int
     authentic: bool
-    timed: Timed
+    timed: TimedLink
     operations: int = 0
     flash: float = 0.0
     chip: float = 0.0
@@ -225,7 +225,7 @@ def nodes(via: str, link: str, *extra: str) -> Iterator[subprocess.Popen[str]]:
         process.wait(20)
 
 
-class Before(NamedTuple):
+class NodeUsage(NamedTuple):
     """What the node before took: point operations, seconds of its flash, and of its wait before it answered all.
 
     Of a node in C also the seconds of its P-256, and of all else that was its own.
@@ -238,19 +238,19 @@ class Before(NamedTuple):
     turned: float
 
 
-def next_node(process: subprocess.Popen[str]) -> tuple[bytes, Before]:
+def next_node(process: subprocess.Popen[str]) -> tuple[bytes, NodeUsage]:
     """Put another node down: its UUID, and what the one before took."""
     return next_nodes([process])[0]
 
 
-def next_nodes(processes: Sequence[subprocess.Popen[str]]) -> list[tuple[bytes, Before]]:
+def next_nodes(processes: Sequence[subprocess.Popen[str]]) -> list[tuple[bytes, NodeUsage]]:
     """Put another node down on each of these readers, all of them at once; see :func:`next_node`."""
     for process in processes:
         assert process.stdin is not None
         process.stdin.write("\n")
         process.stdin.flush()
     lines = [process.stdout.readline().split() for process in processes if process.stdout is not None]
-    return [(bytes.fromhex(line[0]), Before(int(line[1]), *map(float, line[2:]))) for line in lines]
+    return [(bytes.fromhex(line[0]), NodeUsage(int(line[1]), *map(float, line[2:]))) for line in lines]
 
 
 def measure(station: Station, disk: Disk, line: Line, count: int) -> list[Run]:
@@ -281,7 +281,7 @@ def measure(station: Station, disk: Disk, line: Line, count: int) -> list[Run]:
                 address = default_can_address(uuid) if line.named else None
                 contact = port.find(partial(_has_uuid, uuid), seconds=20, notice=_quiet, address=address)
                 found = time.perf_counter()
-                timed = Timed(contact.link)
+                timed = TimedLink(contact.link)
                 known = Contact(contact.identity, timed, contact.tag_uid, contact.address)
                 with Conversation(known, notice=_quiet) as node:
                     done = provision(station, node, order, operator=AcceptingOperator(), reporter=SilentReporter())

@@ -101,9 +101,9 @@ def pn532(place: Path, station: Station) -> None:
     for tag in ("4", "2"):
         rows = []
         for turn in range(_RUNS):
-            with _serial(place / f"pn532-{tag}-{turn}", tag) as (where, tell):
+            with _serial(place / f"pn532-{tag}-{turn}", tag) as (where, link_usage):
                 _, found, seconds = _run(station, LinkSettings(nfc=where, timeout=30), secrets.token_hex(4))
-            rows.append((*tell(), found + seconds))
+            rows.append((*link_usage(), found + seconds))
         commands, octets, limit, seconds = sorted(rows, key=lambda row: row[3])[len(rows) // 2]
         print(f"Type {tag:>2} {commands:9d} {octets:8d} {seconds:8.2f} {limit:7.2f} {seconds / limit:6.2f}")
 
@@ -123,11 +123,11 @@ def _serial(folder: Path, tag: str) -> Iterator[tuple[str, Callable[[], tuple[in
         chip.stdout.readline()
         counts: list[Any] = []
 
-        def tell() -> tuple[int, int, float]:
+        def usage() -> tuple[int, int, float]:
             return int(counts[0]), int(counts[1]), float(counts[2]) + float(counts[3])
 
         try:
-            yield f"tty:{name}:pn532", tell
+            yield f"tty:{name}:pn532", usage
         finally:
             chip.terminate()
             counts += json.loads(chip.stdout.readline() or "[0, 0, 0, 0]")
@@ -167,8 +167,8 @@ def chips(place: Path, station: Station) -> None:
             with _node(folder, *words, *slow):
                 done, found, seconds = _run(station, links, secrets.token_hex(4))
                 seconds += found
-            took = {step.name: step.seconds for step in done.steps}
-            row = " ".join(f"{took[step]:9.2f}" for step in steps)
+            durations = {step.name: step.seconds for step in done.steps}
+            row = " ".join(f"{durations[step]:9.2f}" for step in steps)
             print(f"{link:<12} {delay:8d} {row} {seconds:7.2f}  {seconds / PAPER_SECONDS:7.0%}")
 
 

@@ -54,7 +54,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Taken:
+class CommandCost:
     """Seconds on the wall and of the processor, and megabytes, of one command."""
 
     seconds: float
@@ -144,7 +144,7 @@ def commands(folder: Path, count: int) -> Iterator[Row]:
     yield Row("provision (NFC)", ("provision", "-p", "temperature-sensor", "--yes", "--nfc", nfc), None, None, True)
 
 
-def told(home: Path, *words: str) -> dict[str, Any]:
+def json_of(home: Path, *words: str) -> dict[str, Any]:
     """Run a command with --json that is not timed; its one object."""
     read, write = os.pipe()
     os.write(write, PASSPHRASE.encode() + b"\n")
@@ -158,17 +158,20 @@ def told(home: Path, *words: str) -> dict[str, Any]:
 def acquaint(folder: Path, home: Path, count: int) -> None:
     """Make a second station, and exchange keys: one hands over, one takes in."""
     receiver = folder / f"receiver{count}"
-    keys = {"sender": told(home, "init"), RECEIVER: told(receiver, "init", "--keystore", "file", "--name", RECEIVER)}
+    keys = {
+        "sender": json_of(home, "init"),
+        RECEIVER: json_of(receiver, "init", "--keystore", "file", "--name", RECEIVER),
+    }
     for at, name in ((receiver, "sender"), (home, RECEIVER)):
         file = folder / f"{name}{count}.pem"
         file.write_text(keys[name]["public_key"])
-        told(at, "trust", "add", name, str(file), "--yes")
+        json_of(at, "trust", "add", name, str(file), "--yes")
 
 
 @contextmanager
 def node(folder: Path) -> Iterator[None]:
     """Run a factory node on the simulated reader of ``provision``."""
-    told(folder, "node", "create", str(folder / "node"))
+    json_of(folder, "node", "create", str(folder / "node"))
     command = [sys.executable, "-m", "teds_provision", "node", "run", str(folder / "node")]
     process = subprocess.Popen([*command, "--nfc", f"udp:localhost:{NODE_PORT}"], stdout=subprocess.PIPE)
     try:
@@ -181,7 +184,7 @@ def node(folder: Path) -> Iterator[None]:
         shutil.rmtree(folder / "node")
 
 
-def run(home: Path, words: tuple[str, ...]) -> Taken:
+def run(home: Path, words: tuple[str, ...]) -> CommandCost:
     """Run the program once, output thrown away; the passphrase comes through a pipe."""
     read, write = os.pipe()
     os.write(write, PASSPHRASE.encode() + b"\n")
@@ -194,12 +197,12 @@ def run(home: Path, words: tuple[str, ...]) -> Taken:
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         print(f"exit {process.returncode}: {' '.join(words)}", file=sys.stderr)
-    return Taken(time.perf_counter() - begun, usage.ru_maxrss / 1024, usage.ru_utime + usage.ru_stime)
+    return CommandCost(time.perf_counter() - begun, usage.ru_maxrss / 1024, usage.ru_utime + usage.ru_stime)
 
 
 def main(sizes: tuple[int, ...]) -> None:
     """Fill a store of each size, time every command on it, and print the table."""
-    taken: dict[str, dict[int, Taken]] = {}
+    taken: dict[str, dict[int, CommandCost]] = {}
     rows: dict[str, Row] = {}
     with tempfile.TemporaryDirectory() as name:
         for size in sizes:
@@ -214,11 +217,11 @@ def main(sizes: tuple[int, ...]) -> None:
                     runs = [run(home, row.words) for _ in range(1 if row.once or size >= 100_000 else 3)]
                 median = statistics.median(taken.seconds for taken in runs)
                 cpu, most = statistics.median(taken.cpu for taken in runs), max(taken.megabytes for taken in runs)
-                taken.setdefault(row.name, {})[size] = Taken(median, most, cpu)
+                taken.setdefault(row.name, {})[size] = CommandCost(median, most, cpu)
     print_table(sizes, rows, taken)
 
 
-def print_table(sizes: tuple[int, ...], rows: dict[str, Row], taken: dict[str, dict[int, Taken]]) -> None:
+def print_table(sizes: tuple[int, ...], rows: dict[str, Row], taken: dict[str, dict[int, CommandCost]]) -> None:
     """Print one row per command: seconds at each size, memory at the largest, the exponent, the verdict on its aim."""
     print("command".ljust(18) + "".join(f"{size:>10}" for size in sizes) + "       CPU        MB  exponent  aim")
     nothing = taken["--version"]
@@ -231,21 +234,21 @@ def print_table(sizes: tuple[int, ...], rows: dict[str, Row], taken: dict[str, d
     print(f"table / JSON: {table.seconds / listed.seconds:.2f} (aim 2)")
 
 
-def _exponent(sizes: tuple[int, ...], taken: dict[int, Taken], nothing: dict[int, Taken]) -> str:
+def _exponent(sizes: tuple[int, ...], taken: dict[int, CommandCost], nothing: dict[int, CommandCost]) -> str:
     if len(sizes) < 2:
         return "-"
     small, large = (max(0.005, taken[size].seconds - nothing[size].seconds) for size in sizes[-2:])
     return f"{math.log(large / small) / math.log(sizes[-1] / sizes[-2]):.2f}"
 
 
-def _aim(row: Row, at_most: Taken, nothing: Taken) -> str:
-    told = []
+def _aim(row: Row, at_most: CommandCost, nothing: CommandCost) -> str:
+    notes = []
     if row.seconds is not None:
         own = at_most.seconds - (nothing.seconds if row.seconds < 1 else 0)
-        told.append(f"{'met' if own <= row.seconds else 'MISSED'}: {own:.2f} of {row.seconds} s")
+        notes.append(f"{'met' if own <= row.seconds else 'MISSED'}: {own:.2f} of {row.seconds} s")
     if row.megabytes is not None and at_most.megabytes > row.megabytes:
-        told.append(f"MISSED: {at_most.megabytes:.0f} of {row.megabytes:.0f} MB")
-    return ", ".join(told)
+        notes.append(f"MISSED: {at_most.megabytes:.0f} of {row.megabytes:.0f} MB")
+    return ", ".join(notes)
 
 
 if __name__ == "__main__":

@@ -122,12 +122,12 @@ def measured(name: str, link: str, *, fd: bool, bitrate: int, table: float, seco
             provisioned(folder, link, home)
             before = thrown_away()
             words = ("--rate", str(RATE), "--duration", str(seconds), "--can", link, "--to", str(run))
-            told = command(home, "measure", NODE, *words)
+            report = command(home, "measure", NODE, *words)
             harness = thrown_away() - before
             running.terminate()
             missed = [line.split(": ", 1)[-1].strip() for line in running.stdout if "could not leave" in line]
         rows = rows_of(run)
-    text = told.stdout + told.stderr
+    text = report.stdout + report.stderr
     found = re.search(r"(\d+) values in (\d+) messages, lost (\d+), late (\d+), bad (\d+)", text)
     assert found is not None, text
     values, messages, lost, late, bad = map(int, found.groups())

@@ -84,13 +84,13 @@ def recorders(folder: Path, seconds: float, nodes: int) -> None:
             while sink.stats.written + 500_000 < given and not sink.stats.error:
                 time.sleep(0.01)
         sink.close()
-        took, used = time.perf_counter() - began, time.process_time() - cpu
+        elapsed, used = time.perf_counter() - began, time.process_time() - cpu
         stats = sink.stats
         assert stats.dropped == 0
         size = sum(os.path.getsize(name) for name in sink.files)
         share = f"{used / seconds:.0%} of a core at {rate:,} values/s"
         print(
-            f"{suffix:6s} {nodes:2d} nodes: {seconds / took:5.1f} × real time, {share}, "
+            f"{suffix:6s} {nodes:2d} nodes: {seconds / elapsed:5.1f} × real time, {share}, "
             f"{size / stats.written:.1f} octets a value",
             stats.error,
         )
@@ -218,7 +218,7 @@ def topics(name: str, sink: Sink, reader: subprocess.Popen[str], seconds: float,
         time.sleep(1)
     dropped = sink.stats.dropped
     rows = int(seconds * RATE)
-    took, used, late = paced(sink, keys, rows, nodes)
+    elapsed, used, late = paced(sink, keys, rows, nodes)
     end = np.full((1, len(keys)), -1.0)
     stats = sink.stats
     for _ in range(20):  # the end, for the reader
@@ -232,7 +232,7 @@ def topics(name: str, sink: Sink, reader: subprocess.Popen[str], seconds: float,
         f"{name}  {nodes * CHANNELS:3d} channels: {len(lags) + 10} of {rows} rows read; "
         f"lag p50 {p50:.1f}, p99 {p99:.1f} ms (aim {LAG:.0f}: {verdict(met=p99 <= LAG)}); "
         f"p99 of the halves {first:.1f}, {second:.1f} (aim flat: {verdict(met=second <= first + FLAT)}); "
-        f"{used / took:.0%} of a core, {late} ticks late, {stats.dropped - dropped} values dropped, {stats.detail}",
+        f"{used / elapsed:.0%} of a core, {late} ticks late, {stats.dropped - dropped} values dropped, {stats.detail}",
         flush=True,
     )
 

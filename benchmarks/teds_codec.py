@@ -201,11 +201,11 @@ def images(count: int) -> dict[str, float]:
                     raise SystemExit(f"{path.name} {key} is not clean")
             if number == count // 10:
                 early = peak()
-        took = time.perf_counter() - start
+        seconds = time.perf_counter() - start
     return {
         "images": count,
-        "images/s": count / took,
-        "MB/s": total / took / 1e6,
+        "images/s": count / seconds,
+        "MB/s": total / seconds / 1e6,
         "peak MiB at a tenth": early,
         "peak MiB at the end": peak(),
     }

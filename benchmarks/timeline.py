@@ -34,7 +34,7 @@ def table(line: Line, runs: list[Run]) -> None:
     print(f"{'':>15}" + "".join(f"{total * 1e3:>9.2f}" for total in sums))
 
 
-def took(run: Run, number: int) -> float:
+def elapsed(run: Run, number: int) -> float:
     """Return the seconds of an exchange."""
     span = run.timed.spans[number]
     return span.ended - span.began
@@ -47,7 +47,7 @@ def then(run: Run, number: int) -> float:
 
 
 def _beyond(runs: list[Run], number: int, wire: float) -> tuple[float, float]:
-    return _spread([took(run, number) - wire for run in runs])
+    return _spread([elapsed(run, number) - wire for run in runs])
 
 
 def _spread(seconds: list[float]) -> tuple[float, float]:

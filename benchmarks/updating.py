@@ -124,9 +124,9 @@ class PacingTime:
         def wait(pacer: Pacer, identifier: int, data: bytes, *, fd: bool) -> None:
             began = time.thread_time()
             plain(pacer, identifier, data, fd=fd)
-            took = time.thread_time() - began
+            seconds = time.thread_time() - began
             with self._lock:
-                self.seconds += took
+                self.seconds += seconds
 
         Pacer.wait = wait  # type: ignore[method-assign, assignment]
 
@@ -209,11 +209,11 @@ class WireUse:
         for frame in frames:
             if not began < frame.at <= ended:
                 continue
-            took = wire_seconds(frame)
-            use.frames += took
+            wire_time = wire_seconds(frame)
+            use.frames += wire_time
             use.count += 1
-            gap = frame.at - took - free
-            use.overlap += min(took, max(0.0, -gap))
+            gap = frame.at - wire_time - free
+            use.overlap += min(wire_time, max(0.0, -gap))
             use.gaps[f"{before} to {_kind(frame)}"].append(gap)
             free, before = max(free, frame.at), _kind(frame)
         return use

@@ -150,7 +150,7 @@ def run(folder: Path, nodes: int, rate: int, seconds: float) -> int:
         file = folder / "run.csv"
         before, began = cpu_seconds(node.process.pid), time.monotonic()
         outcome = station.start("measure", *uuids, *can, "--duration", str(seconds), "--to", file).end(seconds + 60)
-        used, took = cpu_seconds(node.process.pid) - before, time.monotonic() - began
+        used, elapsed = cpu_seconds(node.process.pid) - before, time.monotonic() - began
         player.kill()
         player.wait()
         node.read(0.2)
@@ -159,11 +159,11 @@ def run(folder: Path, nodes: int, rate: int, seconds: float) -> int:
         rows, values, distinct = values_of(file)
         print(machine())
         print(f"{nodes} sensors at {rate} Hz, measured for {seconds:g} s:")
-        print(f"  the wrapper took                      {used / took:9.2f} cores  aim ≤ {CORES:g}")
+        print(f"  the wrapper took                      {used / elapsed:9.2f} cores  aim ≤ {CORES:g}")
         print(f"  messages lost                         {sum(lost):9}        aim = 0, of {len(lost)} nodes")
         print(f"  values invalid, of {2 * rows:9}           {invalid:9}")
         print(f"  of the sensors' frames in the file    {distinct / max(values, 1):9.1%}")
-        return 0 if len(lost) == nodes and not any(lost) and used / took <= CORES else 1
+        return 0 if len(lost) == nodes and not any(lost) and used / elapsed <= CORES else 1
     finally:
         desk.clear()
 

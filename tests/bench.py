@@ -22,7 +22,7 @@ from teds_provision.protocol.tim import Tim
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.station.station import Station, initialise
 from teds_provision.vault import passphrase
-from tests.protocol.memory import PowerCut, RamFlash
+from tests.protocol.memory import PowerCutError, RamFlash
 
 PASSPHRASE = "correct horse battery"
 
@@ -111,7 +111,7 @@ class MemoryLink:
                 lambda octets: self.board.tim.handle(octets, link=self.via, tapped=self.tapped),
                 now=self.board.seconds,
             )
-        except PowerCut:
+        except PowerCutError:
             self.board.power_on()
             raise NodeSilentError("The node lost power.") from None
         if self.count == self.lose_reply:

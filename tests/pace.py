@@ -28,8 +28,8 @@ def costs_at_most(seconds: float) -> Iterator[None]:
     """What is done under it takes no more of this process's CPU than that; what others take is not counted."""
     began = time.process_time()
     yield
-    took = time.process_time() - began
-    assert took < seconds, f"{took:.3f} s of CPU"
+    elapsed = time.process_time() - began
+    assert elapsed < seconds, f"{elapsed:.3f} s of CPU"
 
 
 def best_of(tries: int, limit: float, attempt: Callable[[], float], *, because: str = "") -> None:
@@ -38,12 +38,12 @@ def best_of(tries: int, limit: float, attempt: Callable[[], float], *, because: 
     Each failed try is a warning of the run. More than three tries must say what a busy machine spoils (``because``).
     """
     _require_reason(tries, because)
-    took: list[float] = []
-    while not took or took[-1] >= limit:
-        assert len(took) < tries, f"{took} s, never less than {limit} s"
-        took.append(attempt())
-        if took[-1] >= limit:
-            _report_failed_try(len(took), tries, f"{took[-1]:.3f} s, not less than {limit} s")
+    durations: list[float] = []
+    while not durations or durations[-1] >= limit:
+        assert len(durations) < tries, f"{durations} s, never less than {limit} s"
+        durations.append(attempt())
+        if durations[-1] >= limit:
+            _report_failed_try(len(durations), tries, f"{durations[-1]:.3f} s, not less than {limit} s")
 
 
 def succeeds(tries: int, attempt: Callable[[], object], *, because: str = "") -> None:

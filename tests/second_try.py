@@ -60,7 +60,7 @@ class Outcomes:
             facts = json.loads(file.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
-        facts["failures"] = [Failure(**each) for each in facts["failures"]]
+        facts["failures"] = [Failure(**failure) for failure in facts["failures"]]
         return cls(**facts)
 
 
@@ -74,7 +74,7 @@ def refusal(code: int, outcomes: Outcomes | None) -> str:
         return "no test is recorded as failed"
     if len(outcomes.failures) > MOST:
         return f"{len(outcomes.failures)} tests failed, more than {MOST}"
-    pure = [each.test for each in outcomes.failures if not each.because]
+    pure = [failure.test for failure in outcomes.failures if not failure.because]
     if pure:
         return f"no other process or network port takes part in {', '.join(pure)}"
     return ""
@@ -89,7 +89,7 @@ def main(arguments: list[str]) -> int:
     if refused or outcomes is None:
         print(f"\nNo second try: {refused}.", flush=True)
         return code
-    profile = [each for each in arguments if each.startswith("--hypothesis-profile=")]
+    profile = [argument for argument in arguments if argument.startswith("--hypothesis-profile=")]
     for failure in outcomes.failures:
         for number in range(1, RUNS + 1):
             print(f"\nSecond try of {failure.test}, alone, run {number} of {RUNS}:", flush=True)
@@ -178,7 +178,7 @@ class _Watch:
                 return f"below {place}"
         theirs = getattr(item, "_fixtureinfo", None)
         used = theirs.name2fixturedefs.values() if theirs else ()
-        shared = [self.fixtures[each] for several in used for each in several if each in self.fixtures]
+        shared = [self.fixtures[fixture] for several in used for fixture in several if fixture in self.fixtures]
         return self.since(*item.stash[_BEFORE]) or (shared[0] if shared else "")
 
 
@@ -213,7 +213,7 @@ class _Record:
             self.outcomes.errors.append(f"worker {getattr(getattr(node, 'gateway', None), 'id', '?')}: {error}")
 
     def pytest_sessionfinish(self) -> None:
-        facts = vars(self.outcomes) | {"failures": [vars(each) for each in self.outcomes.failures]}
+        facts = vars(self.outcomes) | {"failures": [vars(failure) for failure in self.outcomes.failures]}
         self.file.write_text(json.dumps(facts), encoding="utf-8")
 
 

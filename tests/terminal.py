@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from tests.cli.shell import clean_environment, zygote
-from tests.zygote import FIRST_FD, Forked, forkable
+from tests.zygote import FIRST_FD, ForkedProcess, forkable
 
 PATIENCE = 60.0
 STREAMS = ("stdin", "stdout", "stderr")
 
 
 @dataclass(frozen=True)
-class Shown:
+class TerminalOutcome:
     """How a command ended; ``screen`` is what stood on the terminal, ``out`` and ``err`` what went elsewhere."""
 
     code: int
@@ -41,7 +41,7 @@ def on_terminal(
     passphrase: str | None = None,
     columns: int | None = None,
     environment: dict[str, str] | None = None,
-) -> Shown:
+) -> TerminalOutcome:
     """Run a command with these streams on a terminal, the others in pipes; each answer is typed at a prompt of its own.
 
     A prompt ends with a colon, maybe with "[y/N]" before it; what is typed earlier the program throws away.
@@ -72,14 +72,14 @@ def on_terminal(
         process.wait(PATIENCE)
         for place in places.values():
             os.close(place)
-    return Shown(
+    return TerminalOutcome(
         code, *(seen[name].decode(errors="replace").replace("\r\n", "\n") for name in ("screen", "out", "err"))
     )
 
 
 def _begun(
     words: list[str], variables: dict[str, str], ends: dict[str, int], secret: int | None
-) -> Forked | subprocess.Popen[bytes]:
+) -> ForkedProcess | subprocess.Popen[bytes]:
     """Start the program in a session of its own: a fork if nobody can see the difference, else an interpreter."""
     fork = forkable(variables, zygote().environment)
     given = () if secret is None else (secret,)

@@ -112,9 +112,9 @@ run(["--help"])
     done = run(core, "-c", code)
     assert done.returncode == 0, done.stdout + done.stderr
     lines = done.stdout.splitlines()
-    for line, said in zip(lines, refused.values(), strict=False):
+    for line, message in zip(lines, refused.values(), strict=False):
         error = json.loads(line)["error"]
-        assert (error["code"], error["message"].startswith(said)) == ("usage", True), line
+        assert (error["code"], error["message"].startswith(message)) == ("usage", True), line
     help_text = "\n".join(lines[len(refused) :])
     assert "Create and run virtual nodes.\n" in help_text
     assert "The plant" not in help_text

@@ -209,7 +209,7 @@ def test_a_folder_that_cannot_be_brought_to_the_disk_is_told(tmp_path: Path, mon
 def test_a_file_holds_these_octets_and_no_more_is_read_of_it(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"one")
-    told = {octets: holds(path, octets) for octets in (b"one", b"on", b"one ", b"")}
-    assert told == {b"one": True, b"on": False, b"one ": False, b"": False}
+    matches = {octets: holds(path, octets) for octets in (b"one", b"on", b"one ", b"")}
+    assert matches == {b"one": True, b"on": False, b"one ": False, b"": False}
     assert not holds(tmp_path / "none", b"")
     assert not holds(Path("/dev/zero"), b"\0")

@@ -7,7 +7,7 @@ import pytest
 from tests.nightly import REFUSED, UNNAMED, refusals
 
 
-class Invented(pytest.Item):
+class FakeItem(pytest.Item):
     def runtest(self) -> None:
         """Nothing: only its marks count."""
 
@@ -16,7 +16,7 @@ class Invented(pytest.Item):
 def suite(request: pytest.FixtureRequest) -> list[pytest.Item]:
     """Two tests, and one with two cases, of which the second is out of the gate."""
     items: list[pytest.Item] = [
-        Invented.from_parent(request.node.parent, name=name, nodeid=f"tests/{name}")
+        FakeItem.from_parent(request.node.parent, name=name, nodeid=f"tests/{name}")
         for name in ("x.py::test_holder", "x.py::test_moved", "y.py::test_case[a]", "y.py::test_case[b]")
     ]
     items[3].add_marker(pytest.mark.nightly("tests/y.py::test_case[a] holds it"))

@@ -197,13 +197,13 @@ def test_every_page_says_what_for_what_to_type_what_you_will_see_what_can_go_wro
 
 @pytest.mark.needs_room("plant")
 def test_what_can_go_wrong_quotes_what_the_program_says() -> None:
-    said = texts("teds_provision", "benchmarks", "tests/vectors")
+    text = texts("teds_provision", "benchmarks", "tests/vectors")
     wrong = []
     for page in GUIDES:
         _, _, part = page.read_text(encoding="utf-8").partition("\n## What can go wrong\n")
         for row in re.findall(r"^\| (?!what |---)([^|]+) \|", part.partition("\n## ")[0], re.MULTILINE):
             for quoted in re.findall("`([^`]+)`", row):
                 pieces = [piece.strip(" .") for piece in quoted.split("…")]
-                if not quoted.startswith("tests/") and not all(piece in said for piece in pieces):
+                if not quoted.startswith("tests/") and not all(piece in text for piece in pieces):
                     wrong.append(f"{page.name}: {quoted}")
     assert not wrong, "\n".join(wrong)

@@ -59,7 +59,7 @@ LARGEST = 1 << 17
 
 
 @dataclass
-class Forked:
+class ForkedProcess:
     """A process of the zygote, as ``subprocess.Popen`` has one: its id, and how it ended (minus the signal)."""
 
     pid: int
@@ -95,7 +95,7 @@ class Forked:
 
 
 @dataclass
-class Child(Forked):
+class Child(ForkedProcess):
     """One whose output is kept: what it wrote."""
 
     out: int  # a file in memory, or the reading end of a pipe
@@ -139,19 +139,19 @@ class Child(Forked):
         os.close(self.err)
 
 
-def first_of(one: Child, other: Child, seconds: float) -> Child | None:
-    """Which of two ends first (``one`` where both have), or None where neither does within ``seconds``."""
+def first_of(wanted: Child, other: Child, seconds: float) -> Child | None:
+    """Return the child that ends first (``wanted`` if both have), or None if neither ends within ``seconds``."""
     until = time.monotonic() + seconds
     with selectors.PollSelector() as poll:
-        for child in (one, other):
+        for child in (wanted, other):
             poll.register(child.status, selectors.EVENT_READ)
-        while one.returncode is None and other.returncode is None:
+        while wanted.returncode is None and other.returncode is None:
             left = until - time.monotonic()
             if left <= 0 or not poll.select(left):
                 return None
-            one.poll()
+            wanted.poll()
             other.poll()
-    return one if one.returncode is not None else other
+    return wanted if wanted.returncode is not None else other
 
 
 @dataclass
@@ -190,14 +190,14 @@ class Zygote:
         given: tuple[int, ...] = (),
         cwd: Path = ROOT,
         stdin: int | None = None,
-    ) -> Forked:
+    ) -> ForkedProcess:
         """Run ``python -m module words`` with its output to two files; ``given`` become descriptors 3, 4 … there.
 
         With a ``stdin`` it leads a session of its own: the terminal of the tests is not its terminal.
         """
         sys.audit("tests.zygote.run", module)  # tests/second_try.py counts the processes of a test
         nothing = os.dup(stdin) if stdin is not None else os.open(os.devnull, os.O_RDONLY)
-        status, told = os.pipe()
+        status, output = os.pipe()
         facts = {
             "module": module,
             "words": words,
@@ -208,12 +208,12 @@ class Zygote:
         }
         try:
             with self._lock:
-                socket.send_fds(self._control, [json.dumps(facts).encode()], [told, nothing, out, err, *given])
+                socket.send_fds(self._control, [json.dumps(facts).encode()], [output, nothing, out, err, *given])
         finally:
-            os.close(told)
+            os.close(output)
             os.close(nothing)
         assert _readable(status, PATIENCE), "the zygote does not answer"
-        return Forked(int(os.read(status, 16)), status)
+        return ForkedProcess(int(os.read(status, 16)), status)
 
     def start(
         self,

@@ -51,8 +51,8 @@ def test_a_body_is_refused_exactly_where_its_published_schema_forbids_it(body: t
 def test_a_text_is_as_long_as_its_published_schema_lets_it_be(match: str) -> None:
     published = jsonschema.Draft202012Validator(schema_of(bodies.NewMeasurement, {})).is_valid({"match": match})
     assert published == (0 < len(match) <= 1000)
-    said = f"'match' must have 1 to 1000 characters, not {len(match)}."
-    with nullcontext() if published else pytest.raises(BadRequestError, match=said):
+    message = f"'match' must have 1 to 1000 characters, not {len(match)}."
+    with nullcontext() if published else pytest.raises(BadRequestError, match=message):
         assert read(bodies.NewMeasurement, json.dumps({"match": match}).encode()).match == match
 
 
@@ -106,7 +106,7 @@ def test_whole_numbers_and_numbers_come_as_what_they_are() -> None:
 
 
 @pytest.mark.parametrize(
-    ("body", "members", "said"),
+    ("body", "members", "message"),
     [
         (bodies.NewGroup, {}, "Member 'name' is missing."),
         (bodies.NewGroup, {"name": "g", "colour": 1}, "Unknown member 'colour'."),
@@ -117,10 +117,10 @@ def test_whole_numbers_and_numbers_come_as_what_they_are() -> None:
         (bodies.SetPoint, {"hold": 1}, "to let it go."),
     ],
 )
-def test_a_refusal_names_the_member_and_what_it_may_be(body: type[Any], members: dict[str, Any], said: str) -> None:
+def test_a_refusal_names_the_member_and_what_it_may_be(body: type[Any], members: dict[str, Any], message: str) -> None:
     with pytest.raises(BadRequestError) as refused:
         read(body, json.dumps(members).encode())
-    assert said in refused.value.message
+    assert message in refused.value.message
 
 
 @pytest.mark.parametrize(

@@ -48,16 +48,16 @@ def test_no_module_path_goes_into_a_backup_or_comes_out_of_one(station: Station,
 def test_a_backup_beside_a_stuck_writer_says_so_and_leaves_no_file(
     station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[str] = []
+    messages: list[str] = []
     held = station.lock("provision")
     monkeypatch.setattr(
         Station, "lock", lambda self, command, notice: StoreLock(self.home, command=command, wait=1.0, notice=notice)
     )
     before = station.audit_log.check().count
     with held, pytest.raises(StoreLockedError):
-        backup(station, tmp_path / "b", ask, costs=THROWAWAY, notice=told.append)
-    assert len(told) == 1
-    assert "provision" in told[0]
+        backup(station, tmp_path / "b", ask, costs=THROWAWAY, notice=messages.append)
+    assert len(messages) == 1
+    assert "provision" in messages[0]
     assert not (tmp_path / "b").exists()
     assert station.audit_log.check().count == before
 
@@ -82,14 +82,14 @@ def test_a_backup_beside_a_writer_of_the_file_itself_says_what_it_waits_for(
     station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not one of our commands: a program that holds SQLite's own lock."""
-    told: list[str] = []
-    station.notice = told.append
+    messages: list[str] = []
+    station.notice = messages.append
     monkeypatch.setattr("teds_provision.station.store.connection.BUSY_SECONDS", 0.5)
     with closing(sqlite3.connect(station.home / "store.sqlite3", isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
         with pytest.raises(StoreLockedError):
             back_up(station, tmp_path / "b")
-        assert told == ["Waiting up to 0 s for another process that is writing to the store."]
+        assert messages == ["Waiting up to 0 s for another process that is writing to the store."]
         assert not (tmp_path / "b").exists()
         other.execute("ROLLBACK")
     assert back_up(station, tmp_path / "b").nodes == 2

@@ -265,8 +265,8 @@ def signature_before_points(patch: Patch) -> None:
 
     def request(self: AgreementSlot, payload: bytes, origin: Any, flash: Flash) -> bytes:
         if len(payload) == 259:
-            said = RequestPayload.decode(payload)
-            if not verify(said.ca, b"TEDS1 station key\0" + said.station, said.station_signature):
+            request = RequestPayload.decode(payload)
+            if not verify(request.ca, b"TEDS1 station key\0" + request.station, request.station_signature):
                 raise CommandRefusedError(Reason.BAD_SIGNATURE)
         return original(self, payload, origin, flash)
 
@@ -616,7 +616,7 @@ def _decoded(text: Callable[[bytes], bytes]) -> Bend:
     def bend(patch: Patch) -> None:
         original = security.decode
 
-        class Lax:
+        class LaxSecurity:
             NotCanonical = security.NotCanonicalError
 
             @staticmethod
@@ -625,7 +625,7 @@ def _decoded(text: Callable[[bytes], bytes]) -> Bend:
 
                 return original(frame(text(teds[4:-2])))
 
-        patch.setattr(teds_access, "security", Lax)
+        patch.setattr(teds_access, "security", LaxSecurity)
 
     return bend
 
@@ -665,7 +665,7 @@ any_base64 = _decoded(_any_base64)
 def refuses_111(patch: Patch) -> None:
     original = security.decode
 
-    class Strict:
+    class StrictSecurity:
         NotCanonical = security.NotCanonicalError
 
         @staticmethod
@@ -675,7 +675,7 @@ def refuses_111(patch: Patch) -> None:
                 raise security.NotCanonicalError("A field 111 is unknown here.")
             return shown
 
-    patch.setattr(teds_access, "security", Strict)
+    patch.setattr(teds_access, "security", StrictSecurity)
 
 
 def signs_without_111(patch: Patch) -> None:

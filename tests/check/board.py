@@ -162,26 +162,26 @@ def main() -> None:
     words.add_argument("--nfc")
     words.add_argument("--can")
     words.add_argument("--wait-time", type=int, default=4)
-    said = words.parse_args()
+    options = words.parse_args()
     patch = pytest.MonkeyPatch()
     patch.setattr(node, "_ADDRESS_SECONDS", ADDRESS_SECONDS)
-    one = FAULTS.get(said.fault)
-    if one is not None and one.bend is not None:
-        one.bend(patch)
-    if said.fault in LINK_FAULTS:
-        LINK_FAULTS[said.fault](patch)
+    fault = FAULTS.get(options.fault)
+    if fault is not None and fault.bend is not None:
+        fault.bend(patch)
+    if options.fault in LINK_FAULTS:
+        LINK_FAULTS[options.fault](patch)
     board = Board()
     board.flash.state = replace(board.state, blocks={(0, 1): META, (1, 12): NAME}, epoch=4)
     board.power_on()
-    handler = OnLinks(board, one.fault if one is not None else None)
-    handler.mute = said.fault == "mute"
+    handler = OnLinks(board, fault.fault if fault is not None else None)
+    handler.mute = options.fault == "mute"
     servers: list[NfcServer | CanServer] = []
-    if said.nfc:
-        servers.append(NfcServer(said.nfc, handler, wt_int=said.wait_time))
-    if said.can:
-        always = said.fault == "tapped by bus"
-        tapped = lambda: always or (not said.nfc and board.state.state == NodeState.FACTORY)  # noqa: E731
-        servers.append(CanServer(said.can, handler, counts_as_tapped=tapped))
+    if options.nfc:
+        servers.append(NfcServer(options.nfc, handler, wt_int=options.wait_time))
+    if options.can:
+        always = options.fault == "tapped by bus"
+        tapped = lambda: always or (not options.nfc and board.state.state == NodeState.FACTORY)  # noqa: E731
+        servers.append(CanServer(options.can, handler, counts_as_tapped=tapped))
     for server in servers:
         server.start()
     print("ready", flush=True)

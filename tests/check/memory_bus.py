@@ -25,7 +25,7 @@ _LEAST: Final = 1e-6
 """Seconds by which the board's time goes on at least."""
 
 
-class _AtOnce:
+class _SynchronousPool:
     """Workers that have done their job when it is given to them."""
 
     def new_queue(self) -> JobQueue:
@@ -95,7 +95,7 @@ class MemoryServer(CanServer):
         super().__init__("virtual:memory")
         self._line, self._handler, self._outbox = bus, _Handler(bus), _Outbox()
         self._bus = self._outbox  # type: ignore[assignment]
-        self._workers = _AtOnce()  # type: ignore[assignment]
+        self._workers = _SynchronousPool()  # type: ignore[assignment]
         tapped: Callable[[], bool] = lambda: bus.board.tim.identity().state == NodeState.FACTORY  # noqa: E731
         self._endpoints = [CanEndpoint(self._handler, tapped, self._workers, self._out, self._handler)]  # type: ignore[arg-type]
         self._endpoint_of = {id(self._handler): self._endpoints[0]}

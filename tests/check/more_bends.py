@@ -54,10 +54,10 @@ def session_of_any_address(patch: Patch) -> None:
 
     def open_frame(self: Sessions, payload: bytes, link: str) -> OpenedFrame:
         others = [other for other in self._links if other != link]
-        for each in (link, *others):
-            if each in self._links:
+        for peer in (link, *others):
+            if peer in self._links:
                 try:
-                    return original(self, payload, each)
+                    return original(self, payload, peer)
                 except CommandRefusedError as refused:
                     if refused.reason != Reason.BAD_TAG:
                         raise
@@ -272,10 +272,10 @@ def lease_of_255(patch: Patch) -> None:
 
 
 def any_digest(patch: Patch) -> None:
-    class Same:
+    class SameDigest:
         @staticmethod
         def sha256(_octets: bytes) -> Any:
-            return SimpleNamespace(digest=lambda: Same.asked)
+            return SimpleNamespace(digest=lambda: SameDigest.asked)
 
         asked = b""
 
@@ -283,11 +283,11 @@ def any_digest(patch: Patch) -> None:
 
     def decode(cls: type[OperateCommand], *args: Any, **more: Any) -> OperateCommand:
         asked: OperateCommand = original(cls, *args, **more)
-        Same.asked = asked.digest
+        SameDigest.asked = asked.digest
         return asked
 
     patch.setattr(OperateCommand, "decode", classmethod(decode))
-    patch.setattr(role, "hashlib", Same)
+    patch.setattr(role, "hashlib", SameDigest)
 
 
 def writes_under_a_claim(patch: Patch) -> None:

@@ -56,7 +56,7 @@ class Board(bench.Board):
         self.tim = Tim(self.key, self.flash, lambda: self.seconds, **more)
 
 
-class Measuring(Board):
+class MeasuringBoard(Board):
     """A node with channels, which a session may claim; their TEDS fit."""
 
     hardware: TimedHardware
@@ -68,9 +68,9 @@ class Measuring(Board):
 
 def made(over: str = "nfc", *, epoch: int = 4) -> Board:
     """A node in factory state that was keyed before, with a Meta-TEDS and a name of its own."""
-    board = Measuring() if over.startswith("measuring") else Board()
+    board = MeasuringBoard() if over.startswith("measuring") else Board()
     blocks = {(0, 1): META, (1, 12): NAME}
-    if isinstance(board, Measuring) and not over.endswith("blank"):
+    if isinstance(board, MeasuringBoard) and not over.endswith("blank"):
         blocks |= {(number, 3): channel_teds(facts) for number, facts in board.hardware.channels.items()}
     read_only = frozenset({ORIGIN} if over.endswith("read-only") else ())
     blocks |= dict.fromkeys(read_only, ORIGIN_TEDS)

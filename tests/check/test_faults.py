@@ -8,14 +8,14 @@ from teds_provision.check.rule import RULES
 from teds_provision.check.run import CheckReport
 from teds_provision.station.station import Station
 
-from .faults import FAULTS, Faulty
+from .faults import FAULTS, FaultyNode
 from .nodes import checked, failed
 
 OF_FRAMES = {"can-flow-control", "can-form", "nfc-wait-time", "nfc-wtx", "identify-found"}
 """Rules that hear frames, which a link in memory has none of: ``test_link_rules`` finds faults by them."""
 
 
-def run(station: Station, patch: pytest.MonkeyPatch, faulty: Faulty) -> CheckReport:
+def run(station: Station, patch: pytest.MonkeyPatch, faulty: FaultyNode) -> CheckReport:
     if faulty.bend is not None:
         faulty.bend(patch)
     return checked(station, patch, over=faulty.over, fault=faulty.fault, **faulty.link)
@@ -23,14 +23,14 @@ def run(station: Station, patch: pytest.MonkeyPatch, faulty: Faulty) -> CheckRep
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_faulty_node_is_found_by_its_rule(station: Station, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    one = FAULTS[name]
-    report = run(station, monkeypatch, one)
+    fault = FAULTS[name]
+    report = run(station, monkeypatch, fault)
     found = failed(report)
-    assert one.rule in found, (found, [result for result in report.checks if result.result == "skipped"])
-    assert one.words in found[one.rule].detail
-    assert found[one.rule].slip == one.slip
-    if "*" not in one.also:
-        assert set(found) <= {one.rule, *one.also}, {rule: check.detail for rule, check in found.items()}
+    assert fault.rule in found, (found, [result for result in report.checks if result.result == "skipped"])
+    assert fault.words in found[fault.rule].detail
+    assert found[fault.rule].slip == fault.slip
+    if "*" not in fault.also:
+        assert set(found) <= {fault.rule, *fault.also}, {rule: check.detail for rule, check in found.items()}
 
 
 def test_the_table_leaves_out_only_rules_that_another_fault_breaks_first() -> None:

@@ -83,16 +83,16 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(
-    ("fault", "link", "options", "rule", "told"),
+    ("fault", "link", "options", "rule", "message"),
     FAULTS,
     ids=["can-form fd", "nfc-wait-time nfc", "nfc-wtx nfc", "identify-found nfc", "identify-found can"],
 )
 def test_a_fault_of_the_link_is_found(
-    station: Station, fault: str, link: str, options: tuple[str, ...], rule: str, told: str
+    station: Station, fault: str, link: str, options: tuple[str, ...], rule: str, message: str
 ) -> None:
     found = broken(checked(station, fault, link, *options))
     assert set(found) == {rule}
-    assert told in found[rule]
+    assert message in found[rule]
 
 
 OTHER_CHOICE = pytest.mark.nightly(
@@ -102,7 +102,7 @@ OTHER_CHOICE = pytest.mark.nightly(
 
 
 @pytest.mark.parametrize(
-    ("choice", "told"),
+    ("choice", "message"),
     [
         pytest.param("padding 00", "padding 00", marks=OTHER_CHOICE),
         pytest.param("block size 8", "block size 8, STmin 0 ms", marks=OTHER_CHOICE),
@@ -110,12 +110,12 @@ OTHER_CHOICE = pytest.mark.nightly(
         pytest.param("gap of 5 ms", "block size 16, STmin 5 ms", marks=OTHER_CHOICE),
     ],
 )
-def test_what_a_node_may_choose_is_told_and_not_failed(station: Station, choice: str, told: str) -> None:
+def test_what_a_node_may_choose_is_told_and_not_failed(station: Station, choice: str, message: str) -> None:
     """Small controllers need a block size of 0, or 20 ms between frames: they failed."""
     report = checked(station, choice, "can")
     assert broken(report) == {}
     (seen,) = [check.detail for check in report.checks if check.rule == "can-flow-control"]
-    assert told in seen
+    assert message in seen
 
 
 def test_an_address_that_no_node_may_take_is_found_on_a_bus(station: Station) -> None:

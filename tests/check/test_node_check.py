@@ -120,14 +120,14 @@ def test_a_board_without_channel_teds_is_lent_some(station: Station, patch: pyte
 def test_data_messages_that_were_on_their_way_accuse_no_slow_board(station: Station, patch: pytest.MonkeyPatch) -> None:
     """One that came before the reply to Stop was taken for one after it, one of run 1 for one of run 2."""
 
-    class Slow(FaultyBus):
+    class SlowBus(FaultyBus):
         def exchange(self, frame: bytes) -> bytes:
             if isinstance(self.end, MemoryServer):
                 self.end.pass_time(0.3)
             return super().exchange(frame)
 
     board = nodes.made("measuring can")
-    report = nodes.checked(station, patch, board, over="measuring can", line=Slow(board))
+    report = nodes.checked(station, patch, board, over="measuring can", line=SlowBus(board))
     streams = [check for check in report.checks if check.rule == "stream-messages"]
     assert [(check.result, check.detail) for check in streams if check.result != "passed"] == []
 
@@ -241,13 +241,13 @@ def test_a_node_of_another_owner_is_left_alone(station: Station, tmp_path: Path,
 def test_a_reply_that_is_torn_each_time_is_the_nodes_fault(station: Station, via: str) -> None:
     """It was skipped, and a board that answered 0 octets over NFC passed; so did it on a bus, with exit code 0."""
 
-    class Torn(FaultyLink):
+    class TornLink(FaultyLink):
         def exchange(self, frame: bytes) -> bytes:
             if frame[2:4] == bytes([128, 99]):
                 raise GarbledError("The node keeps asking for the same pieces.")
             return super().exchange(frame)
 
-    report = check_node(station, talk(board := Board(), Torn(board, via=via)))
+    report = check_node(station, talk(board := Board(), TornLink(board, via=via)))
     torn = {check.rule: check for check in report.checks if check.rule in ("unknown-command", "refusal-form")}
     assert {check.result for check in torn.values()} == {"failed"}
     assert len(torn) == 2
@@ -258,11 +258,11 @@ def test_a_reply_that_is_torn_each_time_is_the_nodes_fault(station: Station, via
 def test_a_good_node_with_nfc_that_is_checked_over_its_bus_fails_no_rule(station: Station) -> None:
     """Its Request is for a tap: "confirm-newest" called that a broken rule."""
 
-    class Untapped(FaultyLink):
+    class UntappedLink(FaultyLink):
         def reference(self, octets: bytes) -> bytes:
             return self.board.tim.handle(octets, link=self.name, tapped=False)
 
-    report = check_node(station, talk(board := Board(), Untapped(board, via="can")), factory=True)
+    report = check_node(station, talk(board := Board(), UntappedLink(board, via="can")), factory=True)
     assert not names(report, "failed")
     assert {"agreement", "confirm-newest"} <= names(report, "skipped")
     assert board.state.state == NodeState.FACTORY
@@ -273,17 +273,17 @@ def test_a_board_that_refuses_what_it_announces_fails_and_is_not_skipped(
 ) -> None:
     """It announced 1024, refused more than 512 on the link, and 15 rules were skipped with exit code 0."""
 
-    class Short(FaultyLink):
+    class ShortLink(FaultyLink):
         def exchange(self, frame: bytes) -> bytes:
             if len(frame) > 512:
                 raise MessageTooLongError("The node refuses it (flow control: overflow).")
             return super().exchange(frame)
 
     board = Board(max_message=1024)
-    report = nodes.checked(station, patch, board, line=Short(board))
+    report = nodes.checked(station, patch, board, line=ShortLink(board))
     assert {"max-message", "commit", "write-drops"} <= names(report, "failed")
-    (said,) = [check.detail for check in report.checks if check.rule == "max-message"]
-    assert "1024 octets are refused on the link; maxMessage is 1024" in said
+    (detail,) = [check.detail for check in report.checks if check.rule == "max-message"]
+    assert "1024 octets are refused on the link; maxMessage is 1024" in detail
     assert not [check for check in report.checks if check.result == "skipped" and "refuse" in check.detail]
 
 
@@ -328,22 +328,22 @@ def test_explain_tells_an_agreement_that_is_never_confirmed(
 ) -> None:
     board = nodes.made(over)
     before = board.state
-    told = nodes.checked(station, patch, board, over=over, factory=False, explained=True).explained
-    assert isinstance(told, ExplainedRequest)
-    assert (len(told.transcript), len(told.okm), len(told.confirmation_key)) == (32, 48, 32)
-    assert told.tag_due == told.reply[85:101]
-    assert not told.problem
+    explanation = nodes.checked(station, patch, board, over=over, factory=False, explained=True).explained
+    assert isinstance(explanation, ExplainedRequest)
+    assert (len(explanation.transcript), len(explanation.okm), len(explanation.confirmation_key)) == (32, 48, 32)
+    assert explanation.tag_due == explanation.reply[85:101]
+    assert not explanation.problem
     assert board.state == before
-    assert station.identity.point not in told.request, "a stranger asks, whose keys are for this one question"
+    assert station.identity.point not in explanation.request, "a stranger asks, whose keys are for this one question"
 
 
 def test_explain_shows_what_is_due_beside_what_came(station: Station, patch: pytest.MonkeyPatch) -> None:
     agreeing_so(label=b"TEDS1 transcript")(patch)
-    told = nodes.checked(station, patch, factory=False, explained=True).explained
-    assert isinstance(told, ExplainedRequest)
-    assert told.slip == "transcript-label-without-00"
-    assert told.tag_due != told.reply[85:101]
-    assert "tagN is wrong" in told.problem
+    explanation = nodes.checked(station, patch, factory=False, explained=True).explained
+    assert isinstance(explanation, ExplainedRequest)
+    assert explanation.slip == "transcript-label-without-00"
+    assert explanation.tag_due != explanation.reply[85:101]
+    assert "tagN is wrong" in explanation.problem
 
 
 @pytest.mark.parametrize("over", ["nfc", "can"])
@@ -351,12 +351,12 @@ def test_explain_of_a_node_of_ours_never_tells_its_key(station: Station, patch: 
     board = Board()
     agreed(station, board)
     held = board.state.key
-    told = nodes.checked(station, patch, board, over=over, factory=False, explained=True).explained
-    assert isinstance(told, ExplainedRequest)
+    explanation = nodes.checked(station, patch, board, over=over, factory=False, explained=True).explained
+    assert isinstance(explanation, ExplainedRequest)
     assert board.state.key == held
     assert held is not None
-    assert told.okm[:16] != held
-    confirmed = security_command(Function.CONFIRM, told.station_tag).encode()
+    assert explanation.okm[:16] != held
+    confirmed = security_command(Function.CONFIRM, explanation.station_tag).encode()
     reply = decode_reply(board.tim.handle(confirmed, link="nfc", tapped=True))
     assert reply.reason == Reason.WRONG_STATE, "what is printed can be confirmed by nobody"
 

@@ -50,27 +50,27 @@ def test_a_virtual_node_on_a_bus_keeps_every_rule(desk: Desk) -> None:
     node = desk.node().start(nfc=False, can=True)
     outcome = check(desk, "bench", "check", "--factory", "--yes")
     assert outcome.code == 0, outcome
-    told = outcome.json
-    assert told["uuid"] == node.uuid
-    skipped = {check["rule"] for check in told["checks"] if check["result"] == "skipped"}
+    report = outcome.json
+    assert report["uuid"] == node.uuid
+    skipped = {check["rule"] for check in report["checks"] if check["result"] == "skipped"}
     of_channels = {rule.name for rule in RULES if rule.stage == Stage.MEASURING}
     assert skipped == {"nfc-wait-time", "nfc-wtx", "confirm-elsewhere", "write-read-only", *of_channels}
-    assert (told["passed"], told["failed"]) == (len(RULES) - len(skipped), 0)
-    assert set(told["checks"][0]) == {"rule", "clause", "result", "detail", "slip"}
-    assert {check["slip"] for check in told["checks"]} == {None}
-    assert "explain" not in told
+    assert (report["passed"], report["failed"]) == (len(RULES) - len(skipped), 0)
+    assert set(report["checks"][0]) == {"rule", "clause", "result", "detail", "slip"}
+    assert {check["slip"] for check in report["checks"]} == {None}
+    assert "explain" not in report
 
 
 def test_explain_prints_a_test_agreement_and_no_key_of_anybody(desk: Desk) -> None:
     desk.node().start(nfc=False, can=True)
     outcome = check(desk, "bench", "check", "--explain")
     assert outcome.code == 0, outcome
-    told = outcome.json["explain"]
-    assert {key: len(told[key]) // 2 for key in ("t", "okm", "m", "tag_n", "tag_s")} == {
+    explain = outcome.json["explain"]
+    assert {key: len(explain[key]) // 2 for key in ("t", "okm", "m", "tag_n", "tag_s")} == {
         "t": 32, "okm": 48, "m": 32, "tag_n": 16, "tag_s": 16
     }  # fmt: skip
-    assert told["tag_n"] == told["tag_n_received"]
-    assert (told["problem"], told["slip"]) == (None, None)
+    assert explain["tag_n"] == explain["tag_n_received"]
+    assert (explain["problem"], explain["slip"]) == (None, None)
     where = ("--via", "can", "--can", desk.links.can)
     words = spawn("--home", desk.folder / "bench", "node", "check", "--explain", *where, passphrase=PASSPHRASE)
     assert "never confirmed" in words.out

@@ -18,7 +18,7 @@ from typing import Any
 from teds_provision.cli.main import run
 from tests.bench import PASSPHRASE
 from tests.pace import PATIENCE
-from tests.zygote import FIRST_FD, Forked, Zygote, forkable
+from tests.zygote import FIRST_FD, ForkedProcess, Zygote, forkable
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = (sys.executable, "-m", "teds_provision")
@@ -110,7 +110,7 @@ def begin(
     cwd: Path | None = None,
     program: tuple[str, ...] = PROGRAM,
     fork: bool = True,
-) -> Forked | subprocess.Popen[bytes]:
+) -> ForkedProcess | subprocess.Popen[bytes]:
     """Start the program as a process of its own that writes to two files; the passphrase goes by --passphrase-fd.
 
     It, and a module of the tests, is a fork of the zygote where nobody could tell, else (and without ``fork``) a start
@@ -164,5 +164,5 @@ def spawn(
             code = done.wait(60)
         finally:
             done.kill()
-        said = [os.pread(file.fileno(), os.fstat(file.fileno()).st_size, 0).decode() for file in (out, err)]
-    return Outcome(code, *said)
+        texts = [os.pread(file.fileno(), os.fstat(file.fileno()).st_size, 0).decode() for file in (out, err)]
+    return Outcome(code, *texts)

@@ -41,15 +41,15 @@ def restore(home: Path, path: Path, *words: str, passphrase: str = PASSPHRASE) -
 def test_backup_and_restore_into_an_empty_home(home: Path, sealed: Path, tmp_path: Path) -> None:
     first = call(home, "--json", "init").json
     new = tmp_path / "new"
-    code, told = restore(new, sealed, "--dry-run")
-    assert (code, told["action"], new.exists()) == (0, "rebuild", False)
-    code, told = restore(new, sealed)
-    assert (code, told["action"], told["keystore"]) == (0, "rebuilt", "file")
+    code, plan = restore(new, sealed, "--dry-run")
+    assert (code, plan["action"], new.exists()) == (0, "rebuild", False)
+    code, plan = restore(new, sealed)
+    assert (code, plan["action"], plan["keystore"]) == (0, "rebuilt", "file")
     again = call(new, "--json", "init").json
     assert (again["fingerprint"], again["ca"]) == (first["fingerprint"], first["ca"])
     assert call(new, "--json", "whitelist", "list").json == call(home, "--json", "whitelist", "list").json
-    code, told = restore(new, sealed)
-    assert (code, told["action"], told["relation"]) == (0, "nothing", "older")
+    code, plan = restore(new, sealed)
+    assert (code, plan["action"], plan["relation"]) == (0, "nothing", "older")
 
 
 def test_an_existing_file_is_replaced_only_when_told(home: Path, sealed: Path) -> None:
@@ -81,8 +81,8 @@ def test_a_merge_shows_its_plan_and_asks(home: Path, sealed: Path) -> None:
     assert "restored: whitelist: 1" in refused.err
     assert "an older state" in refused.err
     assert call(home, "--json", "whitelist", "list").json == {"whitelist": []}
-    code, told = restore(home, sealed, "--yes")
-    assert (code, told["action"], told["back"]) == (0, "merged", {"whitelist": 1})
+    code, plan = restore(home, sealed, "--yes")
+    assert (code, plan["action"], plan["back"]) == (0, "merged", {"whitelist": 1})
     assert call(home, "--json", "log").json["entries"][-1]["act"] == "restore"
 
 
@@ -139,8 +139,8 @@ def test_a_recovery_key_that_openssl_made(home: Path, tmp_path: Path) -> None:
     assert restore(new, path, "--recovery-key", str(private))[0] == 7
     code, _ = restore(new, path, "--recovery-key", str(private), passphrase="words of the key")
     assert code == 6  # whose backup it is, only the fingerprint tells
-    code, told = restore(new, path, "--recovery-key", str(private), "--yes", passphrase="words of the key")
-    assert (code, told["action"]) == (0, "rebuilt")
+    code, plan = restore(new, path, "--recovery-key", str(private), "--yes", passphrase="words of the key")
+    assert (code, plan["action"]) == (0, "rebuilt")
 
 
 OTHER_MOMENTS = pytest.mark.nightly(

@@ -58,8 +58,8 @@ def test_build_reports_certificate_and_signature_and_a_bad_one_ends_it(home: Pat
     trusted = ("--trust-dcc", folder / "lab.pem")
     done = call(home, "--json", *BUILD, folder / "good.xml", *trusted, "--due", "2027-06-30", "--output", image)
     assert done.code == 0, done.err
-    told = done.json["calibration"]
-    assert told == {
+    calibration = done.json["calibration"]
+    assert calibration == {
         "certificate": "B2-2026-0042",
         "laboratory": "Bench 2, robot laboratory",
         "date": "2026-10-12",
@@ -69,7 +69,7 @@ def test_build_reports_certificate_and_signature_and_a_bad_one_ends_it(home: Pat
     assert done.json["calibrations"][0]["due"].startswith("2027-06-30")
     reference = certificate_reference_of(Image.from_json(image.read_text()).blocks, 1)
     assert reference is not None
-    assert reference.sha256 == told["sha256"]
+    assert reference.sha256 == calibration["sha256"]
     plain = call(home, "--json", *BUILD, f"1={EXAMPLES / 'angle.xml'}")
     assert plain.json["calibration"]["signature"] == "not checked"
     assert call(home, "--json", *BUILD, EXAMPLES / "angle.csv").json.keys() & {"calibration"} == set()

@@ -51,7 +51,7 @@ def offered(home: Path, line: str) -> list[str]:
     return done.stdout.split("\n")[:-1] if done.stdout.strip() else []
 
 
-class Typed:
+class CompletionShell:
     """A shell on a terminal, in a folder of its own, that knows the program by its name."""
 
     def __init__(self, shell: str, folder: Path, home: Path) -> None:
@@ -112,7 +112,7 @@ def test_a_name_is_inserted_as_one_word_and_runs_nothing(home: Path, tmp_path: P
     assert call(home, "whitelist", "add", UUID, "--name", HOSTILE).code == 0
     folder = tmp_path / "desk"
     folder.mkdir()
-    typed = Typed(shell, folder, home)
+    typed = CompletionShell(shell, folder, home)
     try:
         typed.read_until(b"ready> ")
         typed.type(f"teds-provision verify {begun}\t")

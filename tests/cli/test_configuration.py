@@ -34,7 +34,7 @@ def test_what_follows_from_the_command_line_is_up_to_date() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ('cann = "x"', "line 1: no command has an option --cann. Did you mean 'can'?"),
         ("[provisoin]\nyes = true", "line 1: there is no command 'provisoin'. Did you mean 'provision'?"),
@@ -44,23 +44,23 @@ def test_what_follows_from_the_command_line_is_up_to_date() -> None:
         ("can = ", "is not valid TOML"),
     ],
 )
-def test_a_name_that_nothing_knows_is_an_error_with_its_line(home: Path, text: str, told: str) -> None:
+def test_a_name_that_nothing_knows_is_an_error_with_its_line(home: Path, text: str, message: str) -> None:
     (home / "config.toml").write_text(text)
     done = call(home, "--json", "nodes")
     assert done.code == 8
-    assert told in done.json["error"]["message"]
+    assert message in done.json["error"]["message"]
 
 
 def test_config_show_names_values_and_where_they_come_from(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (home / "config.toml").write_text('can = "socketcan:can9"\n[provision]\ntimeout = 5\n')
     monkeypatch.setenv("TEDS_PROVISION_VIA", "can")
-    told = call(home, "--json", "config", "show").json["settings"]
-    assert {(row["name"], str(row["value"])) for row in told[1:]} == {
+    settings = call(home, "--json", "config", "show").json["settings"]
+    assert {(row["name"], str(row["value"])) for row in settings[1:]} == {
         ("via", "can"),
         ("can", "socketcan:can9"),
         ("provision.timeout", "5"),
     }
-    assert [row["source"] for row in told if row["name"] == "via"] == ["environment (TEDS_PROVISION_VIA)"]
+    assert [row["source"] for row in settings if row["name"] == "via"] == ["environment (TEDS_PROVISION_VIA)"]
     assert call(home, "--json", "config", "path").json == {"path": str(home / "config.toml"), "exists": True}
 
 
@@ -169,8 +169,8 @@ def test_a_setting_is_written_beside_what_stands_there_and_taken_away_again(home
         '[provision]  # one\n# patience\ntimeout = 5\nvia = "can"\n\n'
         '[whitelist.add]\ndry-run = true\n\n[ncap.brokers]\nlab = "mqtts://lab"\n'
     )
-    told = call(home, "--json", "config", "set", "provision.via", "can").json["settings"]
-    assert told == [{"name": "provision.via", "value": "can", "source": str(file)}]
+    settings = call(home, "--json", "config", "set", "provision.via", "can").json["settings"]
+    assert settings == [{"name": "provision.via", "value": "can", "source": str(file)}]
     for name in ("provision.via", "whitelist.add.dry_run", "timeout", "ncap.brokers.lab"):
         assert call(home, "config", "unset", name).code == 0
     file.write_text(file.read_text().replace("\n[whitelist.add]\n", "").replace("\n[ncap.brokers]\n", ""))
@@ -220,7 +220,7 @@ def test_a_path_in_the_file_means_the_same_file_wherever_the_command_is_typed(
 
 
 def test_a_relative_path_in_the_file_starts_at_the_folder_of_the_file() -> None:
-    said = {
+    settings = {
         "trace": "frames.pcapng",
         "profile": "gripper",
         "provision": {"profile": "own/arm.toml", "name": "a/b"},
@@ -230,7 +230,7 @@ def test_a_relative_path_in_the_file_starts_at_the_folder_of_the_file() -> None:
         "ncap": {"brokers": {"lab": "mqtts://a@lab?password-file=secret/arm&ca=/etc/ca.pem"}},
     }
     folder = Path("/etc/teds")
-    assert anchored(said, folder) == {
+    assert anchored(settings, folder) == {
         "trace": "/etc/teds/frames.pcapng",
         "profile": "gripper",
         "provision": {"profile": "/etc/teds/own/arm.toml", "name": "a/b"},
@@ -239,4 +239,4 @@ def test_a_relative_path_in_the_file_starts_at_the_folder_of_the_file() -> None:
         "export-keys": {"to": "north"},
         "ncap": {"brokers": {"lab": "mqtts://a@lab?password-file=/etc/teds/secret/arm&ca=/etc/ca.pem"}},
     }
-    assert anchored(anchored(said, folder), Path("/elsewhere")) == anchored(said, folder)
+    assert anchored(anchored(settings, folder), Path("/elsewhere")) == anchored(settings, folder)

@@ -26,9 +26,9 @@ def test_the_whole_story_as_make_demo_starts_it(tmp_path: Path) -> None:
         env=clean_environment(TMPDIR=str(tmp_path)),
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    told = json.loads(done.stdout)
-    assert told["verdict"] == "authentic"
-    assert {"import-keys", "verify", "measure", "set"} <= {step["name"] for step in told["steps"]}
+    record = json.loads(done.stdout)
+    assert record["verdict"] == "authentic"
+    assert {"import-keys", "verify", "measure", "set"} <= {step["name"] for step in record["steps"]}
     assert list(tmp_path.iterdir()) == []
 
 

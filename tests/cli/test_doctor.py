@@ -10,13 +10,13 @@ from .shell import call, clean_environment, spawn
 
 
 def test_every_check_has_name_result_cause_and_cure(home: Path) -> None:
-    told = spawn("--home", home, "--json", "doctor")
-    assert told.code == 0, told.out
-    checks = told.json["checks"]
+    outcome = spawn("--home", home, "--json", "doctor")
+    assert outcome.code == 0, outcome.out
+    checks = outcome.json["checks"]
     assert all(set(check) == {"name", "result", "why", "fix", "sampled"} for check in checks)
     assert {check["result"] for check in checks} <= {"ok", "warning", "skipped"}
     assert {"python", "libraries", "clock", "store", "keyring", "can loopback"} <= {check["name"] for check in checks}
-    assert "Traceback" not in told.err
+    assert "Traceback" not in outcome.err
 
 
 def test_people_see_the_cure_under_each_trouble(home: Path) -> None:
@@ -32,9 +32,9 @@ def test_people_see_the_cure_under_each_trouble(home: Path) -> None:
     [(("--nfc", "tty:NONE7:pn532"), 5), (("--can", "nosuch:can0"), 5)],
 )
 def test_a_named_link_that_fails_is_exit_5(home: Path, words: tuple[str, ...], code: int) -> None:
-    told = call(home, "--json", "doctor", *words)
-    assert told.code == code
-    assert any(check["result"] == "failed" and check["fix"] for check in told.json["checks"])
+    outcome = call(home, "--json", "doctor", *words)
+    assert outcome.code == code
+    assert any(check["result"] == "failed" and check["fix"] for check in outcome.json["checks"])
 
 
 def test_a_broken_store_is_exit_7_whatever_else_fails(home: Path) -> None:
@@ -43,9 +43,9 @@ def test_a_broken_store_is_exit_7_whatever_else_fails(home: Path) -> None:
 
 
 def test_it_works_before_there_is_a_station_and_makes_nothing(tmp_path: Path) -> None:
-    told = spawn("--home", tmp_path / "none", "doctor", environment=clean_environment(HOME=str(tmp_path)))
-    assert told.code == 0
-    assert "teds-provision init" in told.out
+    outcome = spawn("--home", tmp_path / "none", "doctor", environment=clean_environment(HOME=str(tmp_path)))
+    assert outcome.code == 0
+    assert "teds-provision init" in outcome.out
     assert not (tmp_path / "none").exists()
 
 

@@ -61,9 +61,9 @@ def folder(tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 def test_a_file_of_another_kind_is_named(home: Path, folder: Path, words: list[str], code: int, kind: str) -> None:
     del folder
-    said = call(home, "--json", *words, passphrase=PASSPHRASE)
-    assert said.code == code, said
-    assert kind in said.json["error"]["hint"], said
+    outcome = call(home, "--json", *words, passphrase=PASSPHRASE)
+    assert outcome.code == code, outcome
+    assert kind in outcome.json["error"]["hint"], outcome
 
 
 def test_a_file_of_the_right_kind_is_not_explained(home: Path, folder: Path) -> None:
@@ -71,5 +71,5 @@ def test_a_file_of_the_right_kind_is_not_explained(home: Path, folder: Path) -> 
     for words in (["show", "image.json"], ["provision", "--batch", "boards.csv", "-p", "gripper"], ["show", "none"]):
         assert mistaken_file(words) == ""
     (folder / "angle.csv").write_text("raw,value [degree]\n0,zero\n")
-    said = call(home, "--json", "calibrate", "fit", "angle.csv").json["error"]
-    assert "angle.csv is" not in said["hint"]
+    error = call(home, "--json", "calibrate", "fit", "angle.csv").json["error"]
+    assert "angle.csv is" not in error["hint"]

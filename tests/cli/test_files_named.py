@@ -45,19 +45,19 @@ def test_a_folder_or_nothing_in_the_place_of_a_file_is_no_such_thing(desk: Path,
     """``import-keys FOLDER`` ended with 2, ``show FOLDER`` with 3."""
     (tmp_path / "folder").mkdir()
     for name in ("folder", "none"):
-        said = call(desk, "--json", *words(command), name)
-        assert (said.code, said.json["error"]["code"]) == (3, "not-found"), said.out
-        assert name in said.json["error"]["message"]
+        outcome = call(desk, "--json", *words(command), name)
+        assert (outcome.code, outcome.json["error"]["code"]) == (3, "not-found"), outcome.out
+        assert name in outcome.json["error"]["message"]
 
 
 @pytest.mark.parametrize("command", WRITTEN)
 def test_a_file_to_be_written_needs_its_folder_and_is_no_folder(desk: Path, command: str, tmp_path: Path) -> None:
     """``label --output`` ended with 7, ``--report`` with 2, ``profile new --output`` made folders."""
     name = f"file{SUFFIX.get(command.partition(' ')[0], '')}"
-    said = call(desk, "--json", *words(command), f"none/{name}")
-    assert (said.code, said.json["error"]["code"]) == (3, "not-found"), said.out
-    assert said.json["error"]["message"].startswith("There is no folder ")
+    outcome = call(desk, "--json", *words(command), f"none/{name}")
+    assert (outcome.code, outcome.json["error"]["code"]) == (3, "not-found"), outcome.out
+    assert outcome.json["error"]["message"].startswith("There is no folder ")
     assert not (tmp_path / "none").exists()
     (tmp_path / name).mkdir()
-    said = call(desk, "--json", *words(command), name)
-    assert (said.code, said.json["error"]["code"]) == (2, "usage"), said.out
+    outcome = call(desk, "--json", *words(command), name)
+    assert (outcome.code, outcome.json["error"]["code"]) == (2, "usage"), outcome.out

@@ -81,9 +81,9 @@ def test_no_option_can_hold_a_secret(tmp_path: Path, name: str) -> None:
 
 
 def test_a_mistyped_command_is_usage_with_the_nearest_one(tmp_path: Path) -> None:
-    told = spawn("--json", "--home", tmp_path, "whitlist")
-    assert (told.code, told.json["error"]["code"]) == (2, "usage")
-    assert "'whitelist'" in told.json["error"]["message"]
+    outcome = spawn("--json", "--home", tmp_path, "whitlist")
+    assert (outcome.code, outcome.json["error"]["code"]) == (2, "usage")
+    assert "'whitelist'" in outcome.json["error"]["message"]
 
 
 # -- results and errors ------------------------------------------------------------------------------------------------
@@ -107,29 +107,29 @@ def test_json_is_one_object_on_stdout_and_nothing_else(
     home: Path, tmp_path: Path, words: list[str], exit_code: int, code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    told = spawn("--home", home, "--json", *words)
-    assert told.code == exit_code, told
-    assert "Traceback" not in told.err
+    outcome = spawn("--home", home, "--json", *words)
+    assert outcome.code == exit_code, outcome
+    assert "Traceback" not in outcome.err
     if code:
-        assert set(told.json) == {"error"}
-        assert set(told.json["error"]) == {"code", "message", "hint"}
-        assert told.json["error"]["code"] == code
-        assert told.json["error"]["message"]
+        assert set(outcome.json) == {"error"}
+        assert set(outcome.json["error"]) == {"code", "message", "hint"}
+        assert outcome.json["error"]["code"] == code
+        assert outcome.json["error"]["message"]
 
 
 def test_without_a_station_every_command_says_init(tmp_path: Path) -> None:
     for words in (["nodes"], ["log"], ["whitelist", "list"], ["backup", "b"]):
-        told = call(tmp_path / "none", "--json", *words)
-        assert (told.code, told.json["error"]["code"]) == (3, "not-found")
-        assert "teds-provision init" in told.json["error"]["hint"]
+        outcome = call(tmp_path / "none", "--json", *words)
+        assert (outcome.code, outcome.json["error"]["code"]) == (3, "not-found")
+        assert "teds-provision init" in outcome.json["error"]["hint"]
     assert not (tmp_path / "none").exists()
 
 
 def test_an_error_for_people_is_at_most_three_lines_on_stderr(home: Path) -> None:
-    told = spawn("--home", home, "nodes", "none")
-    assert (told.code, told.out) == (3, "")
-    assert told.err.startswith("Error: ")
-    assert told.err.count("\n") <= 3
+    outcome = spawn("--home", home, "nodes", "none")
+    assert (outcome.code, outcome.out) == (3, "")
+    assert outcome.err.startswith("Error: ")
+    assert outcome.err.count("\n") <= 3
 
 
 def test_debug_alone_shows_a_traceback(home: Path) -> None:
@@ -144,9 +144,9 @@ def test_a_bug_is_told_as_one_without_a_traceback(home: Path, monkeypatch: pytes
         raise ZeroDivisionError("secret detail")
 
     monkeypatch.setattr("teds_provision.station.station.Station.open", broken)
-    told = call(home, "--json", "nodes")
-    assert (told.code, told.json["error"]["code"]) == (1, "bug")
-    assert "secret detail" not in told.out + told.err
+    outcome = call(home, "--json", "nodes")
+    assert (outcome.code, outcome.json["error"]["code"]) == (1, "bug")
+    assert "secret detail" not in outcome.out + outcome.err
 
 
 OTHER_TABLES = pytest.mark.nightly(
@@ -167,9 +167,9 @@ OTHER_TABLES = pytest.mark.nightly(
 def test_a_pipe_and_no_color_have_no_escape_codes(home: Path, words: list[str]) -> None:
     call(home, "whitelist", "add", ONE)
     for more in ({}, {"NO_COLOR": "1"}, {"TERM": "xterm-256color", "COLORTERM": "truecolor"}):
-        told = spawn("--home", home, *words, environment=clean_environment(**more))
-        assert told.code == 0
-        assert "\x1b" not in told.out + told.err
+        outcome = spawn("--home", home, *words, environment=clean_environment(**more))
+        assert outcome.code == 0
+        assert "\x1b" not in outcome.out + outcome.err
 
 
 def test_quiet_says_nothing_but_the_result(home: Path) -> None:
@@ -188,8 +188,8 @@ def test_a_reader_that_stops_reading_is_no_error_message(home: Path) -> None:
 
 def test_a_terminal_of_another_encoding_and_names_that_are_no_text_are_no_failure(home: Path, tmp_path: Path) -> None:
     home.chmod(0o755)
-    told = spawn("--home", home, "doctor", environment=clean_environment(PYTHONIOENCODING="ascii"))
-    assert (told.code, "chmod 700" in told.out) == (0, True)
+    outcome = spawn("--home", home, "doctor", environment=clean_environment(PYTHONIOENCODING="ascii"))
+    assert (outcome.code, "chmod 700" in outcome.out) == (0, True)
     path = os.fsdecode(os.fsencode(tmp_path) + b"/\xff.csv")
     done = subprocess.run(
         [sys.executable, "-m", "teds_provision", "--home", str(home), "--json", "whitelist", "export", path],
@@ -238,11 +238,11 @@ def test_an_option_that_is_called_like_a_command_takes_no_table_for_its_value(ho
     """``profile`` is both: another value in the file must not become the profile of every node."""
     (home / "config.toml").write_text("timeout = 5\n")
     call(home, "whitelist", "add", ONE)
-    told = call(home, "--json", "build", ONE)
-    assert "timeout" not in told.json["error"]["message"]
+    outcome = call(home, "--json", "build", ONE)
+    assert "timeout" not in outcome.json["error"]["message"]
     (home / "config.toml").write_text('profile = "no-such-type"\n')
-    told = call(home, "--json", "build", ONE)
-    assert (told.code, "no-such-type" in told.json["error"]["message"]) == (3, True)
+    outcome = call(home, "--json", "build", ONE)
+    assert (outcome.code, "no-such-type" in outcome.json["error"]["message"]) == (3, True)
 
 
 def test_the_groups_of_the_table_are_those_of_the_program() -> None:
@@ -257,9 +257,9 @@ def test_the_groups_of_the_table_are_those_of_the_program() -> None:
 
 def test_a_config_that_is_no_toml_is_bad_data(home: Path) -> None:
     (home / "config.toml").write_text("can = \n")
-    told = spawn("--home", home, "--json", "nodes")
-    assert (told.code, told.json["error"]["code"]) == (8, "bad-data")
-    assert "config.toml" in told.json["error"]["message"]
+    outcome = spawn("--home", home, "--json", "nodes")
+    assert (outcome.code, outcome.json["error"]["code"]) == (8, "bad-data")
+    assert "config.toml" in outcome.json["error"]["message"]
     (home / "config.toml").write_bytes(b"\xff\xfe")
     assert spawn("--home", home, "nodes").code == 8
 
@@ -270,29 +270,29 @@ def test_a_config_that_is_no_toml_is_bad_data(home: Path) -> None:
 def test_a_question_can_be_answered_on_a_terminal(home: Path) -> None:
     call(home, "whitelist", "add", ONE)
     words = ("whitelist", "remove", ONE)
-    told = on_terminal(home, *words, streams=["stdin"], answers=["n"])
-    assert (told.code, "[y/N]" in told.err, "Cancelled" in told.err) == (6, True, True)
-    told = on_terminal(home, *words, streams=["stdin"], answers=["y"], passphrase=PASSPHRASE)
-    assert (told.code, "no longer on the whitelist" in told.out) == (0, True)
+    outcome = on_terminal(home, *words, streams=["stdin"], answers=["n"])
+    assert (outcome.code, "[y/N]" in outcome.err, "Cancelled" in outcome.err) == (6, True, True)
+    outcome = on_terminal(home, *words, streams=["stdin"], answers=["y"], passphrase=PASSPHRASE)
+    assert (outcome.code, "no longer on the whitelist" in outcome.out) == (0, True)
 
 
 @pytest.mark.parametrize("words", [["--no-input"], ["--json"]])
 def test_no_input_and_json_never_ask(home: Path, words: list[str]) -> None:
     call(home, "whitelist", "add", ONE)
-    told = on_terminal(home, *words, "whitelist", "remove", ONE, streams=["stdin"])
-    assert told.code == 6
-    assert "--yes" in told.out + told.err
-    told = on_terminal(home, *words, "backup", home / "b", streams=["stdin"])
-    assert told.code == 7
-    assert "--passphrase-fd" in told.out + told.err
+    outcome = on_terminal(home, *words, "whitelist", "remove", ONE, streams=["stdin"])
+    assert outcome.code == 6
+    assert "--yes" in outcome.out + outcome.err
+    outcome = on_terminal(home, *words, "backup", home / "b", streams=["stdin"])
+    assert outcome.code == 7
+    assert "--passphrase-fd" in outcome.out + outcome.err
 
 
 def test_a_passphrase_that_is_typed_is_not_shown(home: Path, tmp_path: Path) -> None:
     words = "the words of the backup"
-    told = on_terminal(home, "backup", tmp_path / "b", answers=[PASSPHRASE, words, words])
-    assert told.code == 0, told
-    assert PASSPHRASE not in told.screen
-    assert words not in told.screen
+    outcome = on_terminal(home, "backup", tmp_path / "b", answers=[PASSPHRASE, words, words])
+    assert outcome.code == 0, outcome
+    assert PASSPHRASE not in outcome.screen
+    assert words not in outcome.screen
 
 
 @pytest.mark.parametrize(("line", "code"), [(b"", "wrong-passphrase"), (b"\n", "wrong-passphrase")])
@@ -309,9 +309,9 @@ def test_an_empty_passphrase_descriptor_is_told(home: Path, tmp_path: Path, line
 
 
 def test_a_passphrase_descriptor_that_is_closed_is_usage(home: Path, tmp_path: Path) -> None:
-    told = spawn("--home", home, "--json", "--passphrase-fd", "77", "backup", tmp_path / "b")
-    assert (told.code, told.json["error"]["code"]) == (2, "usage")
-    assert "77" in told.json["error"]["message"]
+    outcome = spawn("--home", home, "--json", "--passphrase-fd", "77", "backup", tmp_path / "b")
+    assert (outcome.code, outcome.json["error"]["code"]) == (2, "usage")
+    assert "77" in outcome.json["error"]["message"]
 
 
 def test_a_passphrase_that_is_no_text_is_told_and_not_shown(home: Path, tmp_path: Path) -> None:

@@ -26,10 +26,10 @@ def measured(home: Path) -> Path:
 
 
 def test_a_group_that_does_not_exist_is_named_as_one_that_may_be_meant(measured: Path) -> None:
-    said = call(measured, "--json", "measure", "arm", "--can", "udp_multicast:239.74.163.2")
-    assert said.code == 3, said
-    assert said.json["error"]["message"] == "No node or group is known as 'arm'."
-    assert all(word in said.json["error"]["hint"] for word in ("crane", "spare", "group create arm UUID"))
+    outcome = call(measured, "--json", "measure", "arm", "--can", "udp_multicast:239.74.163.2")
+    assert outcome.code == 3, outcome
+    assert outcome.json["error"]["message"] == "No node or group is known as 'arm'."
+    assert all(word in outcome.json["error"]["hint"] for word in ("crane", "spare", "group create arm UUID"))
 
 
 def kept(home: Path) -> list[str]:

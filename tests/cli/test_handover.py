@@ -148,15 +148,15 @@ def test_people_are_shown_both_fingerprints_in_fours_and_what_it_means(homes: Ho
     station = open_station(homes.north)
     both = [spoken(station.fingerprint), *(spoken(record.fingerprint) for record in station.policy.trusted())]
     station.close()
-    told = {}
+    screens = {}
     for mode in ("copy", "move"):
         words = ["export-keys", "--to", "south", "--all", "--mode", mode, "--output", homes.folder / f"{mode}.jwe"]
         done = spawn("--home", homes.north, *words, "--yes", passphrase=PASSPHRASE)
         assert done.code == 0
         assert all(digits in done.err for digits in both)
-        told[mode] = done.err
-    assert "can impersonate a node to the other" in told["copy"]
-    assert "when the other station has rotated them" in told["move"]
+        screens[mode] = done.err
+    assert "can impersonate a node to the other" in screens["copy"]
+    assert "when the other station has rotated them" in screens["move"]
     done = spawn("--home", homes.south, "import-keys", homes.folder / "move.jwe", "--yes", passphrase=PASSPHRASE)
     assert all(digits in done.err for digits in both)
     assert "will be trusted for these nodes only" in done.err
@@ -173,8 +173,8 @@ def test_a_move_tells_who_else_holds_a_copy(homes: Homes) -> None:
     assert homes.run(homes.north, *words, homes.folder / "copy.jwe", "--to", "west").code == 0
     move = [*words, homes.folder / "move.jwe", "--to", "south", "--mode", "move"]
     assert homes.run(homes.north, *move, "--dry-run").json["also_held_by"] == [fingerprint(west.point)]
-    said = spawn("--home", homes.north, *move, passphrase=PASSPHRASE)
-    assert "also held by west from an earlier copy" in said.err
+    outcome = spawn("--home", homes.north, *move, passphrase=PASSPHRASE)
+    assert "also held by west from an earlier copy" in outcome.err
 
 
 def test_it_asks_and_nobody_answers(homes: Homes) -> None:
@@ -236,10 +236,10 @@ def test_a_receiver_that_is_none(homes: Homes) -> None:
         "stranger.pem": (_public(key), 6, "is not trusted here"),
     }
     output = homes.folder / "keys.jwe"
-    for name, (octets, code, says) in files.items():
+    for name, (octets, code, message) in files.items():
         (homes.folder / name).write_bytes(octets)
         words = ["export-keys", "--to", homes.folder / name, "--all", "--output", output, "--yes"]
-        assert says in homes.refused(code, *words, home=homes.north)["message"]
+        assert message in homes.refused(code, *words, home=homes.north)["message"]
     homes.refused(3, "export-keys", "--to", "nobody", "--all", "--output", output, "--yes", home=homes.north)
     assert not output.exists()
 
@@ -398,9 +398,9 @@ BAD: dict[str, tuple[Callable[[Forger], bytes], int, str]] = {
 
 @pytest.mark.parametrize("name", list(BAD))
 def test_a_bad_bundle(homes: Homes, forger: Forger, name: str) -> None:
-    make, code, says = BAD[name]
+    make, code, message = BAD[name]
     error = homes.refused(code, "import-keys", forger.file(make(forger)), "--yes")
-    assert says in error["message"]
+    assert message in error["message"]
     assert not (homes.folder / "bad.jwe.receipt").exists()
 
 

@@ -129,9 +129,9 @@ def test_a_command_that_is_missing_in_a_group_shows_its_help() -> None:
     shown = spawn("trust")
     assert (shown.code, shown.out) == (2, "")
     assert shown.err.startswith(f"Usage: {path} [OPTIONS] COMMAND")
-    told = spawn("--json", "trust")
-    assert told.code == 2
-    assert told.json["error"]["message"] == f"Missing command. (see: {path} --help)"
+    outcome = spawn("--json", "trust")
+    assert outcome.code == 2
+    assert outcome.json["error"]["message"] == f"Missing command. (see: {path} --help)"
 
 
 def test_the_program_alone_says_what_comes_first(tmp_path: Path) -> None:
@@ -147,9 +147,9 @@ def test_the_program_alone_says_what_comes_first(tmp_path: Path) -> None:
 )
 def test_a_shell_is_told_how_a_line_goes_on(typed: str, offered: list[str]) -> None:
     asked = {"_TEDS_PROVISION_COMPLETE": "bash_complete", "COMP_WORDS": typed}
-    told = spawn(environment=clean_environment(**asked, COMP_CWORD=str(len(typed.split()) - 1)))
-    assert told.code == 0
-    assert told.out.splitlines() == [f"plain,{word}" for word in offered]
+    outcome = spawn(environment=clean_environment(**asked, COMP_CWORD=str(len(typed.split()) - 1)))
+    assert outcome.code == 0
+    assert outcome.out.splitlines() == [f"plain,{word}" for word in offered]
     assert (
         "_teds_provision_completion" in spawn(environment=clean_environment(_TEDS_PROVISION_COMPLETE="bash_source")).out
     )

@@ -101,14 +101,14 @@ def fifo(tmp_path: Path) -> Iterator[Path]:
 def test_a_pipe_that_nobody_writes_to_is_no_file(bench: Path, command: str, fifo: Path) -> None:
     """Every one of them waited for ever."""
     began = time.monotonic()
-    said = call(bench, "--json", *arranged(bench, command, fifo))
+    outcome = call(bench, "--json", *arranged(bench, command, fifo))
     assert time.monotonic() - began < SECONDS
     if command == "CONFIG doctor":
-        (check,) = [check for check in said.json["checks"] if check["name"] == "config"]
+        (check,) = [check for check in outcome.json["checks"] if check["name"] == "config"]
         assert (check["result"], "is a pipe" in check["why"]) == ("failed", True)
         return
-    assert said.code in (3, 7, 8), said.out
-    assert fifo.name in said.json["error"]["message"]
+    assert outcome.code in (3, 7, 8), outcome.out
+    assert fifo.name in outcome.json["error"]["message"]
 
 
 def test_what_another_command_writes_is_read_through_its_pipe(home: Path, tmp_path: Path) -> None:
@@ -135,9 +135,9 @@ def test_a_small_file_of_the_wrong_kind_is_no_bug(bench: Path, name: str, tmp_pa
         if command in ("show", "node run node --source file:"):
             continue  # some of these are hex, or values, for all that they know
         began = time.monotonic()
-        said = call(bench, "--json", *arranged(bench, command, path))
-        assert said.code not in (0, 1) or command == "CONFIG doctor", (command, said)
-        assert "Traceback" not in said.err
+        outcome = call(bench, "--json", *arranged(bench, command, path))
+        assert outcome.code not in (0, 1) or command == "CONFIG doctor", (command, outcome)
+        assert "Traceback" not in outcome.err
         assert time.monotonic() - began < SECONDS, command
         (bench / "config.toml").unlink(missing_ok=True)
 
@@ -160,8 +160,8 @@ def test_a_large_file_of_the_wrong_kind_costs_little(bench: Path, name: str, com
     """90 MB of JSON as a backup took 2.3 GB, 60 MB of XML elements a minute."""
     path = tmp_path / name
     path.write_bytes(LARGE[name][0]())
-    code, seconds, megabytes, said = measured(bench, *arranged(bench, command, path))
-    assert code not in (0, 1), said
+    code, seconds, megabytes, error = measured(bench, *arranged(bench, command, path))
+    assert code not in (0, 1), error
     assert seconds < SECONDS
     assert megabytes < MEGABYTES
 
@@ -177,8 +177,8 @@ def test_a_large_file_of_the_wrong_kind_costs_little(bench: Path, name: str, com
 )
 def test_a_device_that_never_ends_is_no_file_either(bench: Path, command: str) -> None:
     """``trace show /dev/zero`` took 2 GB."""
-    code, seconds, megabytes, said = measured(bench, *arranged(bench, command, Path("/dev/zero")))
-    assert (code in (3, 8), seconds < SECONDS, megabytes < MEGABYTES) == (True, True, True), (said, seconds, megabytes)
+    code, seconds, megabytes, error = measured(bench, *arranged(bench, command, Path("/dev/zero")))
+    assert (code in (3, 8), seconds < SECONDS, megabytes < MEGABYTES) == (True, True, True), (error, seconds, megabytes)
 
 
 LAUNCH = """import os, subprocess, sys

@@ -65,11 +65,11 @@ def test_a_package_for_labels_is_missed_before_a_board_is_built(
 ) -> None:
     home = tmp_path / "home"
     assert call(home, "init", "--keystore", "file", "--name", "bench").code == 0
-    for missing, label_format, said in (("PIL", "png", "A PNG needs Pillow"), ("segno", "svg", "Labels need segno")):
+    for missing, label_format, message in (("PIL", "png", "A PNG needs Pillow"), ("segno", "svg", "Labels need segno")):
         monkeypatch.setitem(sys.modules, missing, None)
         words = ("--job", "none", "--watch", "--yes", "--label-to", tmp_path / "labels", "--label-format", label_format)
         done = call(home, "provision", *words)
-        assert (done.code, said in done.err) == (1, True), done.err
+        assert (done.code, message in done.err) == (1, True), done.err
 
 
 def test_the_doctor_runs_without_and_says_so(tmp_path: Path) -> None:

@@ -33,12 +33,12 @@ def test_init_makes_the_keys_once_and_shows_them_again_without_a_passphrase(tmp_
     home = tmp_path / "home"
     made = init(home, "--keystore", "file", "--name", "bench")
     assert made.code == 0
-    told = made.json
-    assert (told["name"], told["keystore"]) == ("bench", "file")
-    assert fingerprint(from_pem(told["public_key"].encode())) == told["fingerprint"]
-    assert fingerprint(from_pem(told["ca"]["public_key"].encode())) == told["ca"]["fingerprint"]
-    assert told["fingerprint"] != told["ca"]["fingerprint"]
-    assert init(home, passphrase=None).json == told
+    report = made.json
+    assert (report["name"], report["keystore"]) == ("bench", "file")
+    assert fingerprint(from_pem(report["public_key"].encode())) == report["fingerprint"]
+    assert fingerprint(from_pem(report["ca"]["public_key"].encode())) == report["ca"]["fingerprint"]
+    assert report["fingerprint"] != report["ca"]["fingerprint"]
+    assert init(home, passphrase=None).json == report
     assert home.stat().st_mode & 0o777 == 0o700
     assert {path.name: oct(path.stat().st_mode & 0o777) for path in home.iterdir() if path.is_file()} == {
         path.name: "0o600" for path in home.iterdir()
@@ -48,10 +48,10 @@ def test_init_makes_the_keys_once_and_shows_them_again_without_a_passphrase(tmp_
 
 
 def test_without_a_keyring_it_takes_the_passphrase_file_and_says_why(tmp_path: Path) -> None:
-    told = init(tmp_path / "home")
-    assert told.code == 0
-    assert told.json["keystore"] == "file"
-    assert "no keyring" in told.json["why"]
+    outcome = init(tmp_path / "home")
+    assert outcome.code == 0
+    assert outcome.json["keystore"] == "file"
+    assert "no keyring" in outcome.json["why"]
 
 
 OTHER_BACKEND = pytest.mark.nightly(
@@ -116,9 +116,9 @@ def test_two_inits_at_once_make_one_station(tmp_path: Path) -> None:
 def test_why_where_and_how_long_is_said_before_anybody_is_asked(tmp_path: Path) -> None:
     done = call(tmp_path / "new", "init", "--keystore", "file")
     assert done.code == 0, done
-    told = done.err
-    assert str(tmp_path / "new" / "vault.json") in told
-    assert all(word in told for word in ("about a second", "8 characters", "backup"))
+    stderr = done.err
+    assert str(tmp_path / "new" / "vault.json") in stderr
+    assert all(word in stderr for word in ("about a second", "8 characters", "backup"))
     assert "will be stored" not in call(tmp_path / "new", "init").err
 
 
@@ -203,9 +203,9 @@ def test_a_tool_of_uv_is_installed_again_with_the_extra_and_all_that_it_has(
 def test_what_the_demo_installs_is_enough_for_the_steps_that_readme_shows_after_it(tmp_path: Path) -> None:
     """`ncap run` ended in a missing extra."""
     plan = ["make", "-n", "demo", f"VENV={tmp_path / 'venv'}", "PYTHON=python3"]
-    said = subprocess.run(plan, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    output = subprocess.run(plan, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     assert "teds-provision ncap run" in (ROOT / "README.md").read_text()
-    assert "--editable '.[ncap]'" in said
+    assert "--editable '.[ncap]'" in output
 
 
 @pytest.mark.needs_room("plant")

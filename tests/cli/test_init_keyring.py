@@ -42,7 +42,7 @@ def run(session: Session, lines: str, **options: Any) -> dict[str, Any]:
 
 
 def test_the_whole_life_of_a_station_with_a_keyring(session: Session) -> None:
-    said = run(
+    outcomes = run(
         session,
         f"""
 made, again = program("init"), program("init")
@@ -51,13 +51,13 @@ backup = program("backup", str(home / "b"), passphrase={WORDS!r})
 say(made=made, again=again, doctor=doctor, backup=backup)
 """,
     )
-    (code, made), (_, again) = said["made"], said["again"]
+    (code, made), (_, again) = outcomes["made"], outcomes["again"]
     assert (code, made["keystore"], made["why"]) == (0, "keyring", "an OS keyring is available")
     assert again == made
-    results = {check["name"]: check["result"] for check in said["doctor"][1]["checks"]}
-    assert (said["doctor"][0], results["keyring"], results["vault"]) == (0, "ok", "ok")
+    results = {check["name"]: check["result"] for check in outcomes["doctor"][1]["checks"]}
+    assert (outcomes["doctor"][0], results["keyring"], results["vault"]) == (0, "ok", "ok")
     assert results["seals"] == "ok", "a keyring asks nobody for a passphrase"
-    assert said["backup"][0] == 0
+    assert outcomes["backup"][0] == 0
     assert [path.name for path in (session.home / "station").iterdir() if "vault" in path.name] == []
 
     locked = run(session, 'say(doctor=program("doctor"), backup=program("backup", str(home / "c")))', password=None)
@@ -80,7 +80,9 @@ say(lost=lost, back=back, doctor=program("doctor"), backup=program("backup", str
 
 
 def test_a_keyring_station_comes_back_on_a_machine_without_a_keyring(session: Session, tmp_path: Path) -> None:
-    said = run(session, f'say(made=program("init"), backup=program("backup", str(home / "b"), passphrase={WORDS!r}))')
+    results = run(
+        session, f'say(made=program("init"), backup=program("backup", str(home / "b"), passphrase={WORDS!r}))'
+    )
     words = tmp_path / "words"
     words.write_text(WORDS + "\n")
     command = f"{sys.executable} -m teds_provision --json --home {tmp_path / 'new'} --passphrase-fd 3 restore"
@@ -93,6 +95,6 @@ def test_a_keyring_station_comes_back_on_a_machine_without_a_keyring(session: Se
         check=True,
         timeout=60,
     )
-    told = json.loads(done.stdout)
-    assert (told["action"], told["keystore"]) == ("rebuilt", "file")
-    assert told["station"] == said["made"][1]["fingerprint"]
+    record = json.loads(done.stdout)
+    assert (record["action"], record["keystore"]) == ("rebuilt", "file")
+    assert record["station"] == results["made"][1]["fingerprint"]

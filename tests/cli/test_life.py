@@ -95,10 +95,10 @@ def test_a_node_that_a_measurement_holds_is_not_taken_out_of_service(yard: Yard)
     running = yard.desk.start("--home", yard.homes["north"], "--json", *words, passphrase=PASSPHRASE)
     running.wait_for('"data"')
     for more in ([], ["--force"]):
-        said = yard.run("north", "decommission", node.uuid, "--yes", *more, *yard.bus)
-        assert (said.code, said.json["error"]["code"]) == (6, "frozen"), said
-        assert "stays in service" in said.json["error"]["message"]
-        assert said.json["error"]["hint"] == "End that measurement first."
+        outcome = yard.run("north", "decommission", node.uuid, "--yes", *more, *yard.bus)
+        assert (outcome.code, outcome.json["error"]["code"]) == (6, "frozen"), outcome
+        assert "stays in service" in outcome.json["error"]["message"]
+        assert outcome.json["error"]["hint"] == "End that measurement first."
     running.signal(signal.SIGINT)
     assert running.end().code == 0
     assert yard.done("north", "decommission", node.uuid, "--yes", *yard.bus)["confirmed"] is True

@@ -37,9 +37,9 @@ def tamper(home: Path, *statements: str) -> None:
 def test_each_act_is_one_entry_and_the_chain_holds(home: Path) -> None:
     call(home, "whitelist", "add", ONE)
     call(home, "whitelist", "add", TWO)
-    told = call(home, "--json", "log")
-    assert (told.code, told.json["intact"], told.json["count"]) == (0, True, 3)
-    assert [(entry["act"], entry["uuid"]) for entry in told.json["entries"]] == [
+    outcome = call(home, "--json", "log")
+    assert (outcome.code, outcome.json["intact"], outcome.json["count"]) == (0, True, 3)
+    assert [(entry["act"], entry["uuid"]) for entry in outcome.json["entries"]] == [
         ("init", None),
         ("whitelist", ONE),
         ("whitelist", TWO),
@@ -63,8 +63,8 @@ def test_a_broken_chain_is_exit_7_and_named(home: Path, statement: str, first_ba
     call(home, "whitelist", "add", ONE)
     call(home, "whitelist", "add", TWO)
     tamper(home, statement)
-    told = call(home, "--json", "log")
-    assert (told.code, told.json["intact"], told.json["first_bad"]) == (7, False, first_bad)
+    outcome = call(home, "--json", "log")
+    assert (outcome.code, outcome.json["intact"], outcome.json["first_bad"]) == (7, False, first_bad)
     shown = call(home, "log")
     assert shown.code == 7
     assert "is not intact" in shown.err
@@ -184,8 +184,8 @@ def test_a_part_of_the_log_is_checked_from_its_first_entry_on(home: Path) -> Non
     tamper(home, "UPDATE audit SET outcome = 'nothing' WHERE seq = 3")
     assert call(home, "log").code == 7
     assert call(home, "log", "--last", 5).code == 7
-    said = call(home, "--json", "log", "--last", 3)
-    assert (said.code, said.json["intact"], said.json["checked"]) == (0, True, {"after": 4, "to": 7})
+    outcome = call(home, "--json", "log", "--last", 3)
+    assert (outcome.code, outcome.json["intact"], outcome.json["checked"]) == (0, True, {"after": 4, "to": 7})
     tamper_again = "DELETE FROM audit WHERE seq = 7"
     with closing(sqlite3.connect(home / "store.sqlite3")) as connection, connection:
         connection.execute(tamper_again)
@@ -210,9 +210,9 @@ def test_times_are_shown_in_local_time_with_offset(home: Path, monkeypatch: pyte
 
 def test_a_terminal_of_80_columns_cuts_nothing_off(home: Path) -> None:
     call(home, "whitelist", "add", ONE, "--name", "a rather long name of a finger", "--fingerprint", "ab" * 32)
-    told = on_terminal(home, "log", columns=80, environment=clean_environment(TERM="xterm"))
-    assert told.code == 0
-    lines = told.screen.splitlines()
+    outcome = on_terminal(home, "log", columns=80, environment=clean_environment(TERM="xterm"))
+    assert outcome.code == 0
+    lines = outcome.screen.splitlines()
     assert max(map(len, lines)) <= 80
     assert any(ONE in line and "whitelist" in line and "added" in line for line in lines)
-    assert "assurance" in told.screen
+    assert "assurance" in outcome.screen

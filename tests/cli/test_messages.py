@@ -28,18 +28,18 @@ UUID = "8d4d9da65281f7000000"
 
 
 def test_a_wrong_passphrase_is_called_so(home: Path) -> None:
-    said = call(home, "--json", "trust", "ca", "drop", "--yes", passphrase="not this one").json["error"]
-    assert (said["code"], said["message"]) == ("wrong-passphrase", "Wrong passphrase.")
+    error = call(home, "--json", "trust", "ca", "drop", "--yes", passphrase="not this one").json["error"]
+    assert (error["code"], error["message"]) == ("wrong-passphrase", "Wrong passphrase.")
 
 
 def test_no_hint_offers_a_profile_that_is_only_a_base(home: Path) -> None:
-    said = call(home, "--json", "provision", "-p", "smart-senso", "--nfc", "udp:localhost:1").json["error"]
-    assert "temperature-sensor" in said["hint"]
-    assert "smart-sensor" not in said["hint"]
+    error = call(home, "--json", "provision", "-p", "smart-senso", "--nfc", "udp:localhost:1").json["error"]
+    assert "temperature-sensor" in error["hint"]
+    assert "smart-sensor" not in error["hint"]
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said", "cure"),
+    ("words", "code", "message", "cure"),
     [
         (["verify", "none.json"], 3, "There is no file none.json", ""),
         (["sign", "none.json"], 3, "There is no file none.json", ""),
@@ -68,7 +68,7 @@ def test_no_hint_offers_a_profile_that_is_only_a_base(home: Path) -> None:
     ],
 )
 def test_a_message_names_what_it_is(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], code: int, said: str, cure: str
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], code: int, message: str, cure: str
 ) -> None:
     (tmp_path / "hello.txt").write_text("hello\n")
     (tmp_path / "empty").touch()
@@ -76,12 +76,12 @@ def test_a_message_names_what_it_is(
     (tmp_path / "octets").write_bytes(b"\xe4" * 9)
     (tmp_path / "some.json").write_text('{"a": 1}\n')
     monkeypatch.chdir(tmp_path)
-    told = call(home, "--json", *words)
-    assert told.code == code, told
-    assert said in told.json["error"]["message"]
-    assert cure in told.json["error"]["hint"]
+    outcome = call(home, "--json", *words)
+    assert outcome.code == code, outcome
+    assert message in outcome.json["error"]["message"]
+    assert cure in outcome.json["error"]["hint"]
     for word in ("base64url", "JWE", "JWS", "codec", "float range", "integer range", "hold it flat", "054c:"):
-        assert word not in told.out
+        assert word not in outcome.out
 
 
 def test_a_second_init_that_asks_for_the_same_shows_it(home: Path) -> None:
@@ -91,7 +91,7 @@ def test_a_second_init_that_asks_for_the_same_shows_it(home: Path) -> None:
 
 
 def test_a_kernel_without_can_is_called_that(monkeypatch: pytest.MonkeyPatch) -> None:
-    for number, said, cure in (
+    for number, message, cure in (
         (errno.EAFNOSUPPORT, "This kernel has no CAN support.", "modprobe can_raw"),
         (errno.ENODEV, "There is no CAN interface can7.", "ip -brief link"),
     ):
@@ -100,10 +100,10 @@ def test_a_kernel_without_can_is_called_that(monkeypatch: pytest.MonkeyPatch) ->
             raise OSError(number, "as the system says it")
 
         monkeypatch.setattr(can_bus, "_opened", fails)
-        with pytest.raises(NoReaderError) as told:
+        with pytest.raises(NoReaderError) as caught:
             can_bus.Bus(parse_spec("socketcan:can7"))
-        assert told.value.message == said
-        assert cure in told.value.hint
+        assert caught.value.message == message
+        assert cure in caught.value.hint
 
 
 @pytest.mark.link
@@ -114,13 +114,13 @@ def test_another_board_on_the_reader_is_named(tmp_path: Path) -> None:
     try:
         node = desk.node().start()
         port = NfcPort(desk.links.nfc)
-        with pytest.raises(NoNodeError) as told:
+        with pytest.raises(NoNodeError) as caught:
             port.find(lambda identity: False, seconds=1.5, notice=lambda notice: None)
         port.close()
     finally:
         desk.clear()
-    assert f"Node {node.uuid} is on the reader" in told.value.message
-    assert "flat" not in told.value.hint
+    assert f"Node {node.uuid} is on the reader" in caught.value.message
+    assert "flat" not in caught.value.hint
 
 
 def test_replacing_a_node_without_name_prints_no_none(home: Path) -> None:
@@ -132,8 +132,8 @@ def test_replacing_a_node_without_name_prints_no_none(home: Path) -> None:
     station = Station.open(home, ask=lambda prompt, confirm: PASSPHRASE)
     station.nodes.remember(bytes.fromhex(UUID), channels=1)
     station.close()
-    told = spawn("--home", home, "replace", UUID, UUID[:-1] + "1", "--dry-run", passphrase=PASSPHRASE)
-    assert (told.code, "None" in told.out, "no name or profile" in told.out) == (0, False, True), told
+    outcome = spawn("--home", home, "replace", UUID, UUID[:-1] + "1", "--dry-run", passphrase=PASSPHRASE)
+    assert (outcome.code, "None" in outcome.out, "no name or profile" in outcome.out) == (0, False, True), outcome
 
 
 def test_a_name_that_no_file_can_have_is_called_that_and_is_no_bug(home: Path, tmp_path: Path) -> None:
@@ -156,9 +156,9 @@ def test_a_name_that_no_file_can_have_is_called_that_and_is_no_bug(home: Path, t
         (["log", "--act", "\udcff"], 8),
         (["profile", "new", "thing", "-o", "/dev/full"], 2),  # which can be read without end
     ):
-        told = call(home, "--json", *words)
-        if told.code != code or "bug" in told.out or len(told.out) > 700:
-            wrong.append((words[:3], told.code, told.out[:200]))
+        outcome = call(home, "--json", *words)
+        if outcome.code != code or "bug" in outcome.out or len(outcome.out) > 700:
+            wrong.append((words[:3], outcome.code, outcome.out[:200]))
     assert not wrong
 
 
@@ -172,8 +172,8 @@ def test_a_group_of_any_script_is_made_changed_and_deleted(home: Path) -> None:
         ["delete", name],
         ["delete", "x" * 999],
     ):
-        told = call(home, "--json", "group", *words)
-        assert told.code == 0, told
+        outcome = call(home, "--json", "group", *words)
+        assert outcome.code == 0, outcome
     assert len([path for path in home.iterdir() if path.name.startswith("measuring-")]) == 1
 
 
@@ -190,19 +190,19 @@ def test_a_number_that_is_none_is_no_number_of_anything(home: Path) -> None:
         ["set", UUID, "1", "nan"],
         ["node", "run", "nowhere", "--battery", "nan"],
     ):
-        told = call(home, "--json", *words)
-        assert told.code == 2, told
-        assert "finite" in told.json["error"]["message"], told
+        outcome = call(home, "--json", *words)
+        assert outcome.code == 2, outcome
+        assert "finite" in outcome.json["error"]["message"], outcome
 
 
 def test_a_list_that_breaks_off_is_one_json_object_all_the_same(home: Path, tmp_path: Path) -> None:
     """What was told before stands, the error beside it, and its code is the command's."""
     line = record.line(Record(1.0, "out", "can", "frame", b"\1", "a frame"))
     (tmp_path / "b.trace").write_bytes(record.head() + line + b"{]\n" + line)
-    told = call(home, "--json", "trace", "show", tmp_path / "b.trace")
-    assert told.code == 8
-    assert len(told.json["frames"]) == 1
-    assert told.json["error"]["code"] == "bad-data"
+    outcome = call(home, "--json", "trace", "show", tmp_path / "b.trace")
+    assert outcome.code == 8
+    assert len(outcome.json["frames"]) == 1
+    assert outcome.json["error"]["code"] == "bad-data"
 
 
 def test_people_see_their_own_time_with_its_offset(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -211,9 +211,9 @@ def test_people_see_their_own_time_with_its_offset(home: Path, monkeypatch: pyte
     monkeypatch.setenv("TZ", "Asia/Tokyo")
     time.tzset()
     try:
-        told = call(home, "whitelist", "list").out
-        assert "+09:00" in told
-        assert not re.search(r"\dZ\b", told)
+        output = call(home, "whitelist", "list").out
+        assert "+09:00" in output
+        assert not re.search(r"\dZ\b", output)
         (entry,) = call(home, "--json", "whitelist", "list").json["whitelist"]
         assert entry["added"].endswith("Z")
     finally:

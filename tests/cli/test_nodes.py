@@ -59,8 +59,8 @@ def known(home: Path) -> Path:
 
 def test_json_holds_all_that_is_known_but_no_key(known: Path) -> None:
     outcome = call(known, "--json", "nodes")
-    one, two = outcome.json["nodes"]
-    assert one | {"fingerprint": None, "keys": None, "holders": None} == {
+    first, second = outcome.json["nodes"]
+    assert first | {"fingerprint": None, "keys": None, "holders": None} == {
         "uuid": ONE.hex(),
         "name": "[b]finger[/]",
         "profile": "tactile-finger-sensor",
@@ -89,12 +89,14 @@ def test_json_holds_all_that_is_known_but_no_key(known: Path) -> None:
         "wrapped": None,
         "firmware": None,
     }
-    assert len(one["fingerprint"]) == 64
-    assert {key["key_id"]: key["state"] for key in one["keys"]} == {"ab" * 8: "active", "cd" * 8: "pending"}
-    assert one["holders"][0]["fingerprint"] == STATION
-    assert two["moved_to"] == {"fingerprint": STATION, "handover": "an-id"}
-    assert two["revoked"]["why"] == "lost"
-    assert not any("wrapped" in key for node in (one, two) for key in node["keys"]), "a key, even sealed, stays here"
+    assert len(first["fingerprint"]) == 64
+    assert {key["key_id"]: key["state"] for key in first["keys"]} == {"ab" * 8: "active", "cd" * 8: "pending"}
+    assert first["holders"][0]["fingerprint"] == STATION
+    assert second["moved_to"] == {"fingerprint": STATION, "handover": "an-id"}
+    assert second["revoked"]["why"] == "lost"
+    assert not any("wrapped" in key for node in (first, second) for key in node["keys"]), (
+        "a key, even sealed, stays here"
+    )
 
 
 @pytest.mark.parametrize("text", [ONE.hex(), "0x8D4D", "[b]finger[/]"])
@@ -170,8 +172,8 @@ def test_nodes_are_found_by_every_part(fleet: Path, words: list[str], names: lis
 def test_a_filter_that_nothing_fits_is_not_taken_for_an_empty_store(fleet: Path) -> None:
     """It said that no nodes are known yet, and to tap one."""
     for words in (["--group", "nowhere"], ["--profile", "no-such-type"], ["--since", "2099-01-01"]):
-        said = call(fleet, "nodes", *words)
-        assert (said.code, said.out.startswith("No known node matches.")) == (0, True), said
+        outcome = call(fleet, "nodes", *words)
+        assert (outcome.code, outcome.out.startswith("No known node matches.")) == (0, True), outcome
 
 
 def test_due_counts_days_from_today_and_what_is_overdue(fleet: Path) -> None:
@@ -183,9 +185,9 @@ def test_due_counts_days_from_today_and_what_is_overdue(fleet: Path) -> None:
 
 def test_a_narrow_terminal_drops_columns_and_never_a_digit(fleet: Path) -> None:
     for columns in (80, 60, 40, 24):
-        told = on_terminal(fleet, "nodes", streams=["stdin", "stdout"], columns=columns)
-        assert told.code == 0
-        lines = told.screen.splitlines()
+        outcome = on_terminal(fleet, "nodes", streams=["stdin", "stdout"], columns=columns)
+        assert outcome.code == 0
+        lines = outcome.screen.splitlines()
         assert all(len(line) <= columns for line in lines)
         assert sum(("aa" * 10) in line for line in lines) == 1, columns
         assert ("remarks" in lines[0]) == (columns >= 80), lines[0]
@@ -228,6 +230,6 @@ def test_listing_loads_no_cryptography_and_decodes_no_teds(home: Path) -> None:
 
 def test_a_mistyped_name_is_guessed(fleet: Path) -> None:
     for typed, meant in (("fingr-3", "'finger-3'"), ("IMPORT", "'imported'")):
-        said = call(fleet, "--json", "whitelist", "remove", typed, "--yes").json["error"]
-        assert (said["code"], f"Did you mean {meant}" in said["hint"]) == ("not-found", True), said
+        error = call(fleet, "--json", "whitelist", "remove", typed, "--yes").json["error"]
+        assert (error["code"], f"Did you mean {meant}" in error["hint"]) == ("not-found", True), error
     assert "Did you mean" not in call(fleet, "--json", "group", "create", "x", "zzzz").json["error"]["hint"]

@@ -67,7 +67,7 @@ def failed(number: int, error: TedsProvisionError) -> BoardResult:
 
 
 @pytest.mark.parametrize(
-    ("next_row", "told"),
+    ("next_row", "message"),
     [
         (row(7, name="knee"), ">>> TAP THE BOARD FOR ROW 7  knee"),
         (row(7, name="", uuid=UUID), f">>> TAP ANY BOARD OF THE SHEET, e.g. {UUID.hex()}"),
@@ -76,14 +76,14 @@ def failed(number: int, error: TedsProvisionError) -> BoardResult:
     ],
     ids=["order", "uuid", "label", "done"],
 )
-def test_it_says_what_to_do_now(next_row: SheetRow | None, told: str) -> None:
-    assert told in Terminal(Batch(next_row=next_row)).lines
+def test_it_says_what_to_do_now(next_row: SheetRow | None, message: str) -> None:
+    assert message in Terminal(Batch(next_row=next_row)).lines
 
 
 def test_a_board_that_did_not_pass_is_asked_for_by_its_uuid() -> None:
     """Another one that is held there gets the next free row, whatever the operator took it for."""
-    told = f">>> TAP BOARD {UUID.hex()} AGAIN FOR ROW 7  knee"
-    assert told in Terminal(Batch(next_row=row(7, name="knee"), had=UUID.hex())).lines
+    prompt = f">>> TAP BOARD {UUID.hex()} AGAIN FOR ROW 7  knee"
+    assert prompt in Terminal(Batch(next_row=row(7, name="knee"), had=UUID.hex())).lines
 
 
 def test_while_a_board_is_worked_on_nothing_says_pass_of_the_one_before() -> None:

@@ -36,9 +36,9 @@ def test_a_result_and_its_error_are_one_object(capsys: pytest.CaptureFixture[str
     with pytest.raises(click.exceptions.Exit) as ended:
         app.conclude({"verdict": "unsigned"}, None, NotAuthenticError("Nobody signed it.", hint="Sign it."))
     assert ended.value.exit_code == 4
-    said = json.loads(capsys.readouterr().out)
-    assert said["verdict"] == "unsigned"
-    assert said["error"] == {"code": "not-authentic", "message": "Nobody signed it.", "hint": "Sign it."}
+    record = json.loads(capsys.readouterr().out)
+    assert record["verdict"] == "unsigned"
+    assert record["error"] == {"code": "not-authentic", "message": "Nobody signed it.", "hint": "Sign it."}
 
 
 def test_people_see_the_result_before_the_error(capsys: pytest.CaptureFixture[str]) -> None:
@@ -87,9 +87,9 @@ def test_nothing_that_a_tag_says_steers_the_terminal(capsys: pytest.CaptureFixtu
     app.warn("a\x1b[2Jb")
     app.fail_line(NotAuthenticError("a\x1b[2Jb\r", hint="c\x9bd"))
     app.emit({}, "a\x1b[2Jb\nnext [line]")
-    said = capsys.readouterr()
-    assert said.out == "a?[2Jb\nnext [line]\n"
-    assert said.err == "a?[2Jb?c?\nWarning: a?[2Jb\nError: a?[2Jb?\n  → c?d\n"
+    captured = capsys.readouterr()
+    assert captured.out == "a?[2Jb\nnext [line]\n"
+    assert captured.err == "a?[2Jb?c?\nWarning: a?[2Jb\nError: a?[2Jb?\n  → c?d\n"
 
 
 def test_what_is_waited_for_is_no_markup() -> None:
@@ -119,10 +119,14 @@ def test_an_interrupted_command_says_so_in_json_too(
         raise ended
 
     monkeypatch.setattr("teds_provision.station.station.Station.open", end)
-    said = call(tmp_path, "--json", "nodes")
-    assert (said.code, said.json["error"]["code"]) == (130, "interrupted")
-    told = call(tmp_path, "nodes")
-    assert (told.code, told.out, told.err) == (130, "", "Interrupted. Run the same command again to continue.\n")
+    in_json = call(tmp_path, "--json", "nodes")
+    assert (in_json.code, in_json.json["error"]["code"]) == (130, "interrupted")
+    outcome = call(tmp_path, "nodes")
+    assert (outcome.code, outcome.out, outcome.err) == (
+        130,
+        "",
+        "Interrupted. Run the same command again to continue.\n",
+    )
 
 
 def test_options_are_read_from_environment_and_config_by_the_name_that_people_type(
@@ -145,8 +149,8 @@ def test_json_is_json_whatever_stdout_can_write(tmp_path: Path) -> None:
     environment = clean_environment(PYTHONIOENCODING="ascii")
     name = "fräse \N{GEAR} \U0001f916"
     for words in (["whitelist", "add", "8d4d9da65281f7000000", "--name", name], ["whitelist", "list"]):
-        said = spawn("--home", tmp_path, "--json", *words, passphrase=PASSPHRASE, environment=environment)
-        assert said.json["whitelist"][0]["name"] == name
+        outcome = spawn("--home", tmp_path, "--json", *words, passphrase=PASSPHRASE, environment=environment)
+        assert outcome.json["whitelist"][0]["name"] == name
 
 
 def test_what_is_wrong_with_a_link_is_told_before_anyone_is_asked_for_a_passphrase(tmp_path: Path) -> None:
@@ -203,6 +207,6 @@ def test_a_home_that_takes_no_lock_is_told_as_a_store_that_fails(home: Path, loc
         (home / lock / "kept").touch()
     else:
         (home / lock).symlink_to(home / lock)
-    told = call(home, *words)
-    assert told.code in (2, 7), told
-    assert lock.rstrip("/") in told.err
+    outcome = call(home, *words)
+    assert outcome.code in (2, 7), outcome
+    assert lock.rstrip("/") in outcome.err

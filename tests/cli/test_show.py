@@ -318,8 +318,8 @@ def test_the_other_edition_says_what_it_cannot_hold(show, show_json, image):
     editions = {teds.decode(block.octets).edition for block in read_blocks(out.encode())}
     assert editions == {2024}
     _, shown = show_json(image, "--edition", "2024")
-    said = [finding for entry in shown["teds"] for finding in entry["conversion"]]
-    assert "lost" in {finding["code"] for finding in said}
+    findings = [finding for entry in shown["teds"] for finding in entry["conversion"]]
+    assert "lost" in {finding["code"] for finding in findings}
 
 
 def test_standard_input_is_a_file_too():

@@ -84,9 +84,9 @@ STEERING = "\x1b[31mred\x9b2J\u202etxt\x07"
 def test_cleaned_text_steers_nothing_and_json_still_says_the_same() -> None:
     for clean in (printable(STEERING), sanitize(STEERING)):
         assert clean.isprintable()
-    told = sanitize_json(json.dumps({"name": STEERING}, ensure_ascii=False))
-    assert told.isprintable()
-    assert json.loads(told) == {"name": STEERING}
+    cleaned = sanitize_json(json.dumps({"name": STEERING}, ensure_ascii=False))
+    assert cleaned.isprintable()
+    assert json.loads(cleaned) == {"name": STEERING}
     assert sanitize_json('{"ä": "ö"}') == '{"ä": "ö"}'
     assert sanitize("two\n\tlines") == "two\n\tlines"
 
@@ -98,11 +98,11 @@ def test_a_name_that_steers_terminals_is_cleaned_on_one(home: Path, words: tuple
     with Station.inspect(home) as store:
         store.nodes.restore(NodeRecord(UUID, name=STEERING, profile=STEERING, retired=STEERING))
     environment = clean_environment(TERM="xterm", NO_COLOR="1", COLUMNS="200")
-    told = on_terminal(home, *words, environment=environment)
-    assert told.code == 0
-    assert "red" in told.screen
+    outcome = on_terminal(home, *words, environment=environment)
+    assert outcome.code == 0
+    assert "red" in outcome.screen
     for character in ("\x9b", "\u202e", "\x07", "\x1b[31m"):
-        assert character not in told.screen
+        assert character not in outcome.screen
 
 
 # -- memory ------------------------------------------------------------------------------------------------------------

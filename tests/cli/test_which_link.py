@@ -78,9 +78,9 @@ def test_who_names_a_time_has_the_nodes_collected_for_so_long() -> None:
 def test_measure_takes_the_bus_that_is_kept_beside_a_reader(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TEDS_PROVISION_NFC", "udp:127.0.0.1:9")
     monkeypatch.setenv("TEDS_PROVISION_CAN", "socketcan:can7")
-    told = call(home, "--json", "measure", "8d4d9da65281f7000000", "--timeout", "1")
-    assert "Streaming needs CAN" not in told.out
-    assert told.code == 5
+    outcome = call(home, "--json", "measure", "8d4d9da65281f7000000", "--timeout", "1")
+    assert "Streaming needs CAN" not in outcome.out
+    assert outcome.code == 5
 
 
 def remember(home: Path, uuid: str, **facts: object) -> None:
@@ -100,9 +100,9 @@ def test_a_node_without_a_link_is_told_what_to_name(home: Path, monkeypatch: pyt
     monkeypatch.setattr(reader, "_usb_readers", lambda _path: [])
     monkeypatch.setattr(pcsc_readers, "names_if_any", list)
     for command in ("sample", "mode", "verify", "read"):
-        said = call(home, "--json", command, uuid)
-        assert said.code == 5, said
-        error = said.json["error"]
+        outcome = call(home, "--json", command, uuid)
+        assert outcome.code == 5, outcome
+        error = outcome.json["error"]
         assert f"No link to node {uuid} is named" in error["message"]
         assert all(word in error["hint"] for word in ("--can", "--ble", "--nfc", "config.toml", "CAN bus", "0x21"))
 
@@ -114,8 +114,11 @@ def test_a_link_that_is_named_means_a_node_and_not_a_folder_of_its_name(
     (tmp_path / "hand").mkdir()
     call(home, "whitelist", "add", "8d4d9da65281f7000000", "--fingerprint", "ab" * 32)
     remember(home, "8d4d9da65281f7000000", name="hand")
-    said = call(home, "--json", "verify", "hand", "--via", "can", "--can", free_bus(), "--timeout", "0.5")
-    assert (said.code, "no-node" in said.json["error"]["code"] or "answered" in said.json["error"]["message"]) == (
+    outcome = call(home, "--json", "verify", "hand", "--via", "can", "--can", free_bus(), "--timeout", "0.5")
+    assert (
+        outcome.code,
+        "no-node" in outcome.json["error"]["code"] or "answered" in outcome.json["error"]["message"],
+    ) == (
         5,
         True,
     )
@@ -125,8 +128,8 @@ def test_a_link_that_is_named_means_a_node_and_not_a_folder_of_its_name(
 def test_a_trace_without_a_frame_does_not_make_the_repetition_fail(home: Path, tmp_path: Path) -> None:
     for name in ("one.jsonl", "one.pcapng"):
         for _ in range(2):
-            said = call(home, "--json", "identify", "--nfc", "tty:NONE7:pn532", "--trace", tmp_path / name)
-            assert said.code == 5, said.out
+            outcome = call(home, "--json", "identify", "--nfc", "tty:NONE7:pn532", "--trace", tmp_path / name)
+            assert outcome.code == 5, outcome.out
         assert not (tmp_path / name).exists()
 
 
@@ -145,14 +148,14 @@ def test_a_trace_without_a_frame_does_not_make_the_repetition_fail(home: Path, t
 def test_a_bus_that_cannot_be_opened_says_what_to_install_or_which_keys_there_are(
     home: Path, bus: str, code: int, words: str
 ) -> None:
-    said = call(home, "--json", "identify", "--via", "can", "--can", bus, "--timeout", "0.5")
-    assert (said.code, words in said.json["error"]["hint"]) == (code, True), said.out
+    outcome = call(home, "--json", "identify", "--via", "can", "--can", bus, "--timeout", "0.5")
+    assert (outcome.code, words in outcome.json["error"]["hint"]) == (code, True), outcome.out
 
 
 def test_several_readers_for_a_command_of_one_are_listed(home: Path) -> None:
     words = ("--nfc", "udp:127.0.0.1:9", "--nfc", "usb:072f")
-    said = call(home, "--json", "identify", *words)
-    assert (said.code, "(udp:127.0.0.1:9, usb:072f)" in said.json["error"]["message"]) == (2, True), said.out
+    outcome = call(home, "--json", "identify", *words)
+    assert (outcome.code, "(udp:127.0.0.1:9, usb:072f)" in outcome.json["error"]["message"]) == (2, True), outcome.out
 
 
 def test_a_clock_that_no_datasheet_can_hold_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

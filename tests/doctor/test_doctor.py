@@ -483,11 +483,11 @@ def test_what_waits_for_somebody_is_told(stationed: System) -> None:
         later = deferred(datetime(2099, 1, 1, tzinfo=UTC), "station lost was removed")
         store.keys.put_flags({b"\1" * 10: KeyFlags(rotation="restored"), b"\2" * 10: KeyFlags(rotation=later)})
     found = look(stationed, "nodes")
-    said = [finding.why for finding in found]
-    counts = [why.split()[0] for why in said]
+    reasons = [finding.why for finding in found]
+    counts = [why.split()[0] for why in reasons]
     assert counts == ["3", "2", "1", "1", "1", "1"]
     words = ("expired", "name", "not written", "never verified", "must be rotated", "another holder rotates first")
-    for why, word in zip(said, words, strict=True):
+    for why, word in zip(reasons, words, strict=True):
         assert word in why
     assert found[-2].fix.startswith("Open a session once")
     assert "2099-01-01T00:00:00Z" in found[-1].fix  # a session today would change nothing

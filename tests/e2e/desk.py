@@ -293,11 +293,11 @@ class Station:
 
     def refuses(self, *words: object, code: int) -> dict[str, str]:
         """Run a command with --json that must fail with ``code``; what it says."""
-        said = self.ask(*words, code=code)
-        assert set(said) == {"error"}
-        assert set(said["error"]) == {"code", "message", "hint"}
-        assert said["error"]["message"].endswith((".", "?", "!", ")")), said
-        return dict(said["error"])
+        reply = self.ask(*words, code=code)
+        assert set(reply) == {"error"}
+        assert set(reply["error"]) == {"code", "message", "hint"}
+        assert reply["error"]["message"].endswith((".", "?", "!", ")")), reply
+        return dict(reply["error"])
 
     def provision(self, via: str = "nfc", *more: object, code: int = 0) -> Any:
         """All of it in one, over one of the desk's links."""

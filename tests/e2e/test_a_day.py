@@ -39,8 +39,10 @@ def lines_of(outcome: Outcome) -> list[Any]:
 def on_a_terminal(station: Station, *words: object, answer: str) -> tuple[int, str]:
     """Run a command on a terminal, answer its question; exit code and all that was shown."""
     environment = clean_environment(TERM="xterm")
-    told = on_terminal(station.home, *words, answers=[answer], passphrase=station.passphrase, environment=environment)
-    return told.code, told.screen
+    outcome = on_terminal(
+        station.home, *words, answers=[answer], passphrase=station.passphrase, environment=environment
+    )
+    return outcome.code, outcome.screen
 
 
 # -- what is written is what was asked for -----------------------------------------------------------------------------
@@ -53,14 +55,14 @@ def test_a_trial_build_is_not_written_by_the_next_plain_provision(station: Stati
     station.ask("build", node.uuid, "--profile", ANGLE, "--name", "only a trial")
     assert [draft["stage"] for draft in station.ask("draft", "list")["drafts"]] == ["built"]
     before = node.octets
-    told = station.provision("nfc", code=6)
-    assert told["error"]["code"] == "not-named"
-    assert any("only a trial" in change for change in told["changes"]), told
+    error = station.provision("nfc", code=6)
+    assert error["error"]["code"] == "not-named"
+    assert any("only a trial" in change for change in error["changes"]), error
     assert node.octets == before
-    code, said = on_a_terminal(station, "provision", *links, answer="n")
+    code, output = on_a_terminal(station, "provision", *links, answer="n")
     assert code == 6
-    assert "only a trial" in said
-    assert "Interrupted" not in said
+    assert "only a trial" in output
+    assert "Interrupted" not in output
     assert node.octets == before
     station.ask("draft", "drop", node.uuid)
     ended = results(station.provision("nfc"))
@@ -68,8 +70,8 @@ def test_a_trial_build_is_not_written_by_the_next_plain_provision(station: Stati
     assert set(ended.values()) == {"done", "nothing to do"}
     assert node.octets == before
     station.ask("build", node.uuid, "--profile", ANGLE, "--name", "wanted after all")
-    code, said = on_a_terminal(station, "provision", *links, answer="y")
-    assert code == 0, said
+    code, output = on_a_terminal(station, "provision", *links, answer="y")
+    assert code == 0, output
     assert station.ask("identify", *links)["name"] == "wanted after all"
 
 
@@ -114,8 +116,8 @@ def test_one_name_or_calibration_is_not_given_to_every_board(station: Station, n
     links, file = station.desk.links.over("nfc"), tmp_path / "angle.csv"
     file.write_text(CALIBRATION.format(middle=180))
     for words in (["--name", "same"], ["--calibration", file]):
-        said = station.refuses("provision", "--watch", "-p", ANGLE, "--yes", *words, *links, code=2)
-        assert "--batch" in said["hint"]
+        error = station.refuses("provision", "--watch", "-p", ANGLE, "--yes", *words, *links, code=2)
+        assert "--batch" in error["hint"]
     bus = station.desk.links.over("can")
     assert "--batch" in station.refuses("provision", "--all", "-p", ANGLE, "--name", "same", *bus, code=2)["hint"]
     station.refuses("provision", "-p", ANGLE, "--yes", "--name", "x" * 121, *links, code=2)
@@ -131,8 +133,8 @@ def test_names_by_pattern_and_a_name_that_is_taken(desk: Desk, station: Station)
         node.stop()
     assert names == ["cell 1", "cell 2", "cell 1"]
     nodes[2].start()
-    said = station.provision("nfc", "-p", ANGLE, "--name", "cell 2", code=6)["error"]
-    assert nodes[1].uuid in said["message"]
+    error = station.provision("nfc", "-p", ANGLE, "--name", "cell 2", code=6)["error"]
+    assert nodes[1].uuid in error["message"]
     assert nodes[2].flash["key"] is None
     assert station.provision("nfc", "-p", ANGLE, "--name", "node-{uuid}")["name"] == f"node-{nodes[2].uuid}"
 
@@ -140,8 +142,8 @@ def test_names_by_pattern_and_a_name_that_is_taken(desk: Desk, station: Station)
 def test_a_board_of_another_owner_is_not_whitelisted(desk: Desk, station: Station, node: Node) -> None:
     node.start()
     assert desk.station("rival").provision("nfc", "-p", ANGLE)["verdict"] == "authentic"
-    said = station.provision("nfc", "-p", ANGLE, code=6)["error"]
-    assert "another owner's CA" in said["message"]
+    error = station.provision("nfc", "-p", ANGLE, code=6)["error"]
+    assert "another owner's CA" in error["message"]
     assert station.ask("whitelist", "list")["whitelist"] == []
     (entry,) = [entry for entry in station.ask("log")["entries"] if entry["act"] == "provision"]
     assert (entry["uuid"], entry["outcome"]) == (node.uuid, "refused")
@@ -160,10 +162,10 @@ def test_a_sheet_with_errors_is_8_with_every_line_before_the_first_tap(station: 
         {"profile": ANGLE, "name": "x" * 121},
     ]
     file = sheet(tmp_path / "boards.csv", *rows)
-    said = station.refuses("provision", "--batch", file, "--yes", "--nfc", "tty:nowhere:pn532", code=8)
+    error = station.refuses("provision", "--batch", file, "--yes", "--nfc", "tty:nowhere:pn532", code=8)
     for line in range(2, 8):
         if line != 5:
-            assert f"boards.csv:{line}:" in said["message"], line
+            assert f"boards.csv:{line}:" in error["message"], line
     file.write_text("uuid,nome\n,x\n")
     assert "nome" in station.refuses("provision", "--batch", file, "--nfc", "tty:nowhere:pn532", code=8)["message"]
     station.refuses("provision", "--batch", tmp_path / "none.csv", "--nfc", "tty:nowhere:pn532", code=3)
@@ -251,14 +253,14 @@ def test_no_at_the_question_skips_the_board(station: Station, node: Node, tmp_pa
     node.start()
     file = sheet(tmp_path / "boards.csv", {"profile": ANGLE, "name": "a"})
     words = ["provision", "--batch", file, "--timeout", "10", *station.desk.links.over("nfc")]
-    code, said = on_a_terminal(station, *words, answer="n")
+    code, output = on_a_terminal(station, *words, answer="n")
     assert code == 6
-    assert "1 skipped" in said
-    assert "\a" in said
+    assert "1 skipped" in output
+    assert "\a" in output
     assert node.flash["key"] is None
-    code, said = on_a_terminal(station, *words, answer="y")
-    assert code == 0, said
-    assert "1 passed" in said
+    code, output = on_a_terminal(station, *words, answer="y")
+    assert code == 0, output
+    assert "1 passed" in output
 
 
 # -- a whole bus -------------------------------------------------------------------------------------------------------
@@ -366,5 +368,5 @@ def test_every_board_of_a_sheet_counts_whatever_the_time_out_and_a_corrected_cal
 def test_global_options_stand_anywhere(station: Station) -> None:
     assert station.desk.start("nodes", "--json", "--home", station.home).end().json == {"nodes": []}
     assert station.desk.start("whitelist", "list", f"--home={station.home}", "--json", "-q").end().json
-    said = station.desk.start("nodes", "--home").end()
-    assert (said.code, "--home" in said.err) == (2, True)
+    outcome = station.desk.start("nodes", "--home").end()
+    assert (outcome.code, "--home" in outcome.err) == (2, True)

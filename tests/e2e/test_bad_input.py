@@ -58,8 +58,8 @@ def test_what_does_not_exist_is_3(station: Station, finished: Node, tmp_path: Pa
             ["sign", "00112233445566778899"],
         ):
             code = 6 if words[0] == "sign" else 3
-            said = station.refuses(*words, code=code)
-            assert said["message"], words
+            error = station.refuses(*words, code=code)
+            assert error["message"], words
     assert "Known are" in station.refuses("build", finished.uuid, "--profile", "no-such-type", code=3)["hint"]
 
 
@@ -67,9 +67,9 @@ def test_a_prefix_that_two_nodes_share_is_refused(station: Station) -> None:
     for last in ("01", "02"):
         station.ask("whitelist", "add", "8d4d9da65281f70000" + last)
     with unchanged(station):
-        said = station.refuses("agree", "8d4d", "--nfc", "udp:localhost:1", code=2)
+        error = station.refuses("agree", "8d4d", "--nfc", "udp:localhost:1", code=2)
         for last in ("01", "02"):
-            assert "8d4d9da65281f70000" + last in said["message"] + said["hint"]
+            assert "8d4d9da65281f70000" + last in error["message"] + error["hint"]
 
 
 @pytest.mark.parametrize(
@@ -88,8 +88,8 @@ def test_a_prefix_that_two_nodes_share_is_refused(station: Station) -> None:
 def test_a_wrong_command_line_is_2(station: Station, tmp_path: Path, words: list[str]) -> None:
     station.ask("whitelist", "add", "8d4d9da65281f7000000")
     with unchanged(station):
-        said = station.refuses(*(word.format(tmp=tmp_path) for word in words), code=2)
-    assert said["code"] == "usage"
+        error = station.refuses(*(word.format(tmp=tmp_path) for word in words), code=2)
+    assert error["code"] == "usage"
 
 
 # -- links -------------------------------------------------------------------------------------------------------------
@@ -104,9 +104,9 @@ def test_no_reader_no_bus_and_nobody_there_are_5(station: Station) -> None:
             (links.over("nfc"), "no-node"),
             (links.over("can"), "no-node"),
         ):
-            said = station.refuses("identify", *words, *QUICK, code=5)
-            assert said["code"] == code, words
-            assert said["hint"]
+            error = station.refuses("identify", *words, *QUICK, code=5)
+            assert error["code"] == code, words
+            assert error["hint"]
 
 
 @pytest.mark.nightly(
@@ -132,8 +132,8 @@ def test_a_node_that_talks_nonsense_is_an_error_of_one_line(station: Station, to
     options = {"path": station.desk.links.nfc, "uuid": "8d4d9da65281f7000000", "torn": torn}
     station.desk.start(json.dumps(options), program=ANOTHER_TAG).wait_for("ready")
     with unchanged(station):
-        said = station.refuses("provision", "-p", ANGLE, "--yes", *station.desk.links.over("nfc"), code=5)
-    assert said["code"] == (code or "garbled")
+        error = station.refuses("provision", "-p", ANGLE, "--yes", *station.desk.links.over("nfc"), code=5)
+    assert error["code"] == (code or "garbled")
 
 
 @pytest.mark.nightly(
@@ -165,9 +165,9 @@ def test_a_node_whose_flash_fails_is_refused_by_it_and_stays_as_it_was(station: 
     """No room for the key, or for the datasheet: old state whole, and the same command finishes on a mended board."""
     node.start(program=limited(room))
     before = node.octets
-    said = station.refuses("provision", "-p", ANGLE, "--yes", *station.desk.links.over("nfc"), code=6)
-    assert said["code"] == "node-refused"
-    assert "flash" in said["message"]
+    error = station.refuses("provision", "-p", ANGLE, "--yes", *station.desk.links.over("nfc"), code=6)
+    assert error["code"] == "node-refused"
+    assert "flash" in error["message"]
     assert (node.octets == before) == (room == 100)
     assert node.flash["provisioned"] is False
     node.kill()
@@ -193,8 +193,8 @@ def test_an_image_that_was_tampered_with_is_not_authentic(station: Station, fini
                 changed = [*good["blocks"]]
                 changed[number] = {**block, "teds": bad.hex()}
                 file.write_text(json.dumps({**good, "blocks": changed}))
-                said = station.ask("verify", file, code=4)
-                assert said["verdict"] == "not authentic", (block["access_code"], at)
+                reply = station.ask("verify", file, code=4)
+                assert reply["verdict"] == "not authentic", (block["access_code"], at)
 
 
 @pytest.mark.needs("flash.json")
@@ -212,9 +212,9 @@ def test_a_node_whose_flash_was_tampered_with_is_found_out_and_mended(station: S
     (finished.folder / "flash.json").write_text(json.dumps(document))
     finished.start(can=True)
     for via in ("nfc", "can"):
-        said = station.ask("verify", finished.uuid, *links.over(via), code=4)
-        assert said["verdict"] == "not authentic"
-        assert {check["name"] for check in said["checks"] if check["result"] == "failed"} == {"signed TEDS"}
+        reply = station.ask("verify", finished.uuid, *links.over(via), code=4)
+        assert reply["verdict"] == "not authentic"
+        assert {check["name"] for check in reply["checks"] if check["result"] == "failed"} == {"signed TEDS"}
     done = station.provision("nfc")
     assert done["verdict"] == "authentic"
     assert results(done)["write"] == "done"
@@ -263,8 +263,8 @@ def test_an_older_datasheet_is_not_put_back(station: Station, finished: Node, tm
     station.ask("read", finished.uuid, "--output", old, *links)
     station.provision("nfc", "--name", "renamed")
     with unchanged(station, finished, without=("nodes", "datasheets")):
-        said = station.refuses("write", finished.uuid, "--image", old, *links, code=6)
-    assert "sequence" in said["message"]
+        error = station.refuses("write", finished.uuid, "--image", old, *links, code=6)
+    assert "sequence" in error["message"]
 
 
 @pytest.mark.parametrize(
@@ -282,10 +282,10 @@ def test_a_profile_with_errors_is_8_and_names_file_and_line(
     node.start()
     station.ask("identify", "--add", *station.desk.links.over("nfc"))
     with unchanged(station, node):
-        said = station.refuses("build", node.uuid, "--profile", file, code=8)
-        assert f"{name}:{line}" in said["message"]
-        said = station.refuses("profile", "check", file, code=8)
-        assert f"{name}:{line}" in said["message"]
+        error = station.refuses("build", node.uuid, "--profile", file, code=8)
+        assert f"{name}:{line}" in error["message"]
+        error = station.refuses("profile", "check", file, code=8)
+        assert f"{name}:{line}" in error["message"]
 
 
 @pytest.mark.parametrize(
@@ -299,8 +299,8 @@ def test_a_calibration_with_errors_is_8_and_names_file_and_line(
     file.write_text(text)
     node.start()
     words = ["provision", "--profile", ANGLE, "--calibration", file, "--yes", *station.desk.links.over("nfc")]
-    said = station.refuses(*words, code=8)
-    assert f"angle.csv:{line}" in said["message"]
+    error = station.refuses(*words, code=8)
+    assert f"angle.csv:{line}" in error["message"]
     assert node.flash["provisioned"] is False
     assert node.flash["sequence"] == 0
 
@@ -316,8 +316,8 @@ def test_a_passphrase_that_is_wrong_or_missing_is_7(station: Station, finished: 
         station.passphrase = ""
         assert station.refuses("agree", finished.uuid, *links, code=7)["code"] == "wrong-passphrase"
         station.passphrase = None
-        said = station.refuses("agree", finished.uuid, *links, code=7)
-        assert "--passphrase-fd" in said["hint"]
+        error = station.refuses("agree", finished.uuid, *links, code=7)
+        assert "--passphrase-fd" in error["hint"]
         station.refuses("--passphrase-fd", "99", "agree", finished.uuid, *links, code=2)
         assert station.run("nodes").code == 0
 
@@ -326,9 +326,9 @@ def test_a_keyring_that_is_not_there_is_7(station: Station, finished: Node, desk
     """A station whose keys lie in a keyring, on a machine (or in a session) that has none."""
     with closing(sqlite3.connect(station.home / "store.sqlite3")) as database, database:
         database.execute("UPDATE station SET keystore = 'keyring'")
-    said = station.refuses("provision", "--yes", *desk.links.over("nfc"), code=7)
-    assert said["code"] in ("no-keyring", "vault")
-    assert said["hint"]
+    error = station.refuses("provision", "--yes", *desk.links.over("nfc"), code=7)
+    assert error["code"] in ("no-keyring", "vault")
+    assert error["hint"]
     new = Station(desk, tmp_path / "new", "a good long passphrase")
     assert new.refuses("init", "--keystore", "keyring", code=7)["code"] == "no-keyring"
     chosen = new.ask("init")
@@ -367,9 +367,9 @@ def test_a_second_process_waits_and_goes_on_when_the_store_is_free(station: Stat
 )
 def test_a_second_process_says_at_last_who_holds_the_store(station: Station, finished: Node) -> None:
     with unchanged(station, finished, without=("nodes",)), StoreLock(station.home, command="backup"):
-        said = station.refuses("provision", "--yes", *station.desk.links.over("can"), code=7)
-        assert said["code"] == "store-locked"
-        assert f"pid {os.getpid()} (backup)" in said["message"]
+        error = station.refuses("provision", "--yes", *station.desk.links.over("can"), code=7)
+        assert error["code"] == "store-locked"
+        assert f"pid {os.getpid()} (backup)" in error["message"]
 
 
 def test_a_full_disk_is_7_and_the_same_command_carries_on(station: Station, node: Node) -> None:
@@ -392,8 +392,8 @@ def test_a_full_disk_is_7_and_the_same_command_carries_on(station: Station, node
 def test_results_that_cannot_be_written_are_an_error(station: Station, finished: Node, tmp_path: Path) -> None:
     links = station.desk.links.over("nfc")
     with unchanged(station, finished, without=("nodes", "datasheets", "readings")):
-        said = station.refuses("read", finished.uuid, "--output", tmp_path / "no" / "image.json", *links, code=3)
-        assert str(tmp_path / "no") in said["message"]
+        error = station.refuses("read", finished.uuid, "--output", tmp_path / "no" / "image.json", *links, code=3)
+        assert str(tmp_path / "no") in error["message"]
         outcome = station.run(
             "--json", "read", finished.uuid, "-o", tmp_path / "image.json", *links, program=limited(99)
         )
@@ -406,8 +406,8 @@ def test_a_home_that_cannot_be_used_is_7(desk: Desk, tmp_path: Path) -> None:
     file.write_text("")
     for home in (file / "home", Path("/proc/nowhere")):
         station = Station(desk, home, "a good long passphrase")
-        said = station.refuses("init", "--keystore", "file", code=7)
-        assert said["hint"]
+        error = station.refuses("init", "--keystore", "file", code=7)
+        assert error["hint"]
 
 
 @pytest.mark.parametrize("words", [["nodes"], ["--json", "nodes"], ["--help"]])

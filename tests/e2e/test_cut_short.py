@@ -41,7 +41,7 @@ OTHER_CTRL_C = pytest.mark.nightly(
 Moment = Callable[[Station, Node, Running], bool]
 
 
-def told(step: str) -> Moment:
+def notices(step: str) -> Moment:
     """The station has just said that ``step`` is done: it is in the next one."""
     return lambda station, node, command: f"✓ {step}" in command.err
 
@@ -63,15 +63,15 @@ def sheet_on_node(station: Station, node: Node, command: Running) -> bool:
 
 
 MOMENTS = {
-    "once identified": told("identify"),
-    "in the agreement": told("whitelist"),
+    "once identified": notices("identify"),
+    "in the agreement": notices("whitelist"),
     "key stored, not confirmed": key_pending,
     "key committed, reply under way": key_on_node,
-    "agreed": told("agree"),
-    "built": told("build"),
-    "in the write": told("sign"),
+    "agreed": notices("agree"),
+    "built": notices("build"),
+    "in the write": notices("sign"),
     "datasheet committed": sheet_on_node,
-    "in the verification": told("write"),
+    "in the verification": notices("write"),
 }
 
 

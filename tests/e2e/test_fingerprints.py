@@ -101,8 +101,8 @@ PLAIN = pytest.mark.nightly(
 def test_a_question_takes_the_digits_of_the_key(desk: Desk, answer: str, code: int) -> None:
     station, (node, digits) = desk.station(), made(desk, "node")
     node.start()
-    said = {"whole": digits, "first": digits[:32].upper(), "other": "0" * 32}.get(answer, answer)
-    ended, shown = on_a_terminal(station, "provision", "--profile", ANGLE, *desk.links.over("nfc"), answer=said)
+    typed = {"whole": digits, "first": digits[:32].upper(), "other": "0" * 32}.get(answer, answer)
+    ended, shown = on_a_terminal(station, "provision", "--profile", ANGLE, *desk.links.over("nfc"), answer=typed)
     assert ended == code, shown
     assert digits[:32] in shown
     assert (node.flash["key"] is not None) == (code == 0)

@@ -34,9 +34,9 @@ def test_the_boards_of_a_bus_say_what_runs_on_them_and_which_they_are(desk: Desk
     assert today.process is not None
     identify.wait_for("Asking every node")  # the bus is open, and it listens for three seconds
     today.process.signal(signal.SIGUSR2)
-    told = {line[:20]: line for line in identify.end().out.splitlines()}
-    assert "says it was pressed" in told[today.uuid]
-    assert "pressed" not in told[before.uuid]
+    line_of = {line[:20]: line for line in identify.end().out.splitlines()}
+    assert "says it was pressed" in line_of[today.uuid]
+    assert "pressed" not in line_of[before.uuid]
     found = {node["uuid"]: node for node in station.ask("identify", *over)["nodes"]}
     assert found[today.uuid]["firmware"]["text"] == "virtual/teds-provision"
     assert (found[today.uuid]["firmware"]["from"], found[today.uuid]["firmware"]["state"]) == ("plain", "unjudged")

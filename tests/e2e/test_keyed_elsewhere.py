@@ -23,11 +23,11 @@ REMEDIES = (
 
 def no_step_is_shown_as_done(station: Station, node: Node) -> None:
     """``provision`` refuses: its lines name no step whose effect was not kept, and nothing was kept."""
-    said = station.run("--no-input", "provision", "-p", ANGLE, "--yes", *station.desk.links.over("nfc"))
-    assert said.code == 6, said
-    assert "✓ identify" in said.err
-    assert "whitelist  " not in said.err
-    assert "agree  " not in said.err
+    outcome = station.run("--no-input", "provision", "-p", ANGLE, "--yes", *station.desk.links.over("nfc"))
+    assert outcome.code == 6, outcome
+    assert "✓ identify" in outcome.err
+    assert "whitelist  " not in outcome.err
+    assert "agree  " not in outcome.err
     assert station.ask("whitelist", "list")["whitelist"] == []
     assert station.keys(node.uuid) == []
 
@@ -46,9 +46,9 @@ def test_another_owners_node_comes_by_backup_by_ca_file_by_handover_or_by_a_rese
     assert "another owner's CA" in rival.refuses("agree", node.uuid, "--rotate", "--yes", *links, code=6)["message"]
     rival.ask("identify", "--add", *links)
     for words in (["provision", "-p", ANGLE, "--yes"], ["agree", node.uuid, "--rotate", "--yes"]):
-        said = rival.refuses(*words, *links, code=6)
-        assert "another owner's CA" in said["message"]
-        assert all(word in said["hint"] for word in REMEDIES), said
+        error = rival.refuses(*words, *links, code=6)
+        assert "another owner's CA" in error["message"]
+        assert all(word in error["hint"] for word in REMEDIES), error
     rival.ask("whitelist", "remove", node.uuid, "--yes")
 
     # a lost station's own backup, in an empty home
@@ -63,18 +63,18 @@ def test_another_owners_node_comes_by_backup_by_ca_file_by_handover_or_by_a_rese
     assert again.ask("init", "--ca", owner_ca)["fingerprint"] == made["fingerprint"]
     assert "another CA" in rival.refuses("init", "--ca", owner_ca, code=6)["message"]
     no_step_is_shown_as_done(again, node)
-    said = again.refuses("provision", "-p", ANGLE, "--yes", *links, code=6)
-    assert said["hint"].endswith(f"identify --add, then agree {node.uuid} --rotate --yes")
+    error = again.refuses("provision", "-p", ANGLE, "--yes", *links, code=6)
+    assert error["hint"].endswith(f"identify --add, then agree {node.uuid} --rotate --yes")
     again.ask("identify", "--add", *links)
     again.ask("agree", node.uuid, "--rotate", "--yes", *links)
     assert again.provision("nfc", "-p", ANGLE)["verdict"] == "authentic"
     again.ask("trust", "ca", "sign", _request(desk, "later"), "--output", desk.folder / "later.cert", "--yes")
 
     # its owner hands it over
-    for one, other in ((again, rival), (rival, again)):
+    for first, other in ((again, rival), (rival, again)):
         pem = desk.folder / f"{other.home.name}.pem"
         pem.write_text(other.ask("init")["public_key"])
-        one.ask("trust", "add", other.home.name, pem, "--yes")
+        first.ask("trust", "add", other.home.name, pem, "--yes")
     bundle = desk.folder / "keys.jwe"
     again.ask("export-keys", "--to", "rival", node.uuid, "--output", bundle, "--yes")
     rival.ask("import-keys", bundle, "--yes", *links)

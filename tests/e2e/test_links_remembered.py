@@ -30,18 +30,18 @@ def test_a_node_is_found_where_it_was_met_last_and_the_program_alone_says_who_is
 ) -> None:
     node.start(nfc=False, can=True)
     at = f"can:{desk.links.can}"
-    said = alone(station)
-    assert (said["station"]["name"], said["links"], said["nodes"]) == ("bench", [], [])
-    assert "config set can" in said["next"]
+    events = alone(station)
+    assert (events["station"]["name"], events["links"], events["nodes"]) == ("bench", [], [])
+    assert "config set can" in events["next"]
     station.ask("config", "set", "can", desk.links.can)
-    said = alone(station)
-    assert [(node["uuid"], node["link"], node["whitelisted"]) for node in said["nodes"]] == [(node.uuid, at, False)]
-    assert said["next"].startswith("teds-provision identify --add")
+    events = alone(station)
+    assert [(node["uuid"], node["link"], node["whitelisted"]) for node in events["nodes"]] == [(node.uuid, at, False)]
+    assert events["next"].startswith("teds-provision identify --add")
     station.ask("config", "unset", "can")
     station.provision("can", "--profile", ANGLE, "--name", ARM)
-    said = alone(station)
-    assert [(node["name"], node["verdict"]) for node in said["nodes"]] == [(ARM, "authentic")], "by its last bus"
-    assert shlex.split(said["next"]) == ["teds-provision", "measure", ARM], "as it would be typed"
+    events = alone(station)
+    assert [(node["name"], node["verdict"]) for node in events["nodes"]] == [(ARM, "authentic")], "by its last bus"
+    assert shlex.split(events["next"]) == ["teds-provision", "measure", ARM], "as it would be typed"
     assert station.ask("verify", ARM)["verdict"] == "authentic", "no link is named"
     # the bus that somebody names goes before the one that is remembered, and is remembered from then on
     node.stop()
@@ -58,9 +58,9 @@ def test_a_remembered_bus_keeps_nobody_from_a_tap(desk: Desk, station: Station, 
     station.provision("can", "--profile", ANGLE)
     node.stop()
     node.start()  # it lies on the reader now, and hangs on no bus
-    said = station.refuses("verify", node.uuid, "--nfc", desk.links.nfc, "--can", free_bus(), "--via", "can",
+    error = station.refuses("verify", node.uuid, "--nfc", desk.links.nfc, "--can", free_bus(), "--via", "can",
                            "--timeout", "0.5", code=5)  # fmt: skip
-    assert said["code"] == "no-node"
+    assert error["code"] == "no-node"
     assert station.ask("verify", node.uuid, "--nfc", desk.links.nfc)["verdict"] == "authentic", "a reader is named"
     agreed = station.refuses("agree", node.uuid, "--timeout", "1", code=5)
     assert "reader" in agreed["message"], "a key is agreed on by a tap unless a bus is named"
@@ -68,9 +68,9 @@ def test_a_remembered_bus_keeps_nobody_from_a_tap(desk: Desk, station: Station, 
 
 def test_an_empty_bus_is_told_with_the_time_that_was_listened(station: Station) -> None:
     bus = free_bus()
-    said = station.run("identify", "--can", bus, "--timeout", "1.5")
-    assert f"No node answered on {bus.partition(chr(63))[0]} within 1.5 s" in said.err
-    assert "up to 0 s" not in said.err
-    hint = said.err.partition("→ ")[2]
+    outcome = station.run("identify", "--can", bus, "--timeout", "1.5")
+    assert f"No node answered on {bus.partition(chr(63))[0]} within 1.5 s" in outcome.err
+    assert "up to 0 s" not in outcome.err
+    hint = outcome.err.partition("→ ")[2]
     assert "bit rate" in hint
     assert "identify" not in hint, "that is what was just run"

@@ -29,8 +29,8 @@ def test_several_nodes_on_the_bus_are_listed_and_named(station: Station, bus: li
     assert sorted(node["uuid"] for node in found["nodes"]) == sorted(UUIDS)
     assert len({node["can_address"] for node in found["nodes"]}) == 3
     flashes = [node.octets for node in bus]
-    said = station.refuses("provision", "--profile", ANGLE, "--yes", *links, code=2)
-    assert all(uuid in said["message"] for uuid in UUIDS)
+    error = station.refuses("provision", "--profile", ANGLE, "--yes", *links, code=2)
+    assert all(uuid in error["message"] for uuid in UUIDS)
     assert [node.octets for node in bus] == flashes
 
 
@@ -79,13 +79,13 @@ def test_a_dry_run_plans_every_node_of_the_bus_that_is_meant(station: Station, b
     links = station.desk.links.over("can")
     station.ask("provision", UUIDS[0], "--profile", ANGLE, "--yes", *links)
     station.ask("whitelist", "add", UUIDS[1])
-    said = station.refuses("provision", *links, code=2)["message"]
-    assert said.startswith("3 nodes answer on the bus, 2 of them not finished: ")
+    message = station.refuses("provision", *links, code=2)["message"]
+    assert message.startswith("3 nodes answer on the bus, 2 of them not finished: ")
     flashes, store = [node.octets for node in bus], station.tables()
     done = station.run("--json", "provision", "--all", "--profile", ANGLE, "--dry-run", *links)
-    told = [json.loads(line) for line in done.out.splitlines()]
-    assert (done.code, told.pop()) == (0, {"totals": {"planned": 2, "failed": 0}})  # the first lacks its calibration
-    plans = {item["uuid"]: item["plan"] for item in told}
+    objects = [json.loads(line) for line in done.out.splitlines()]
+    assert (done.code, objects.pop()) == (0, {"totals": {"planned": 2, "failed": 0}})  # the first lacks its calibration
+    plans = {item["uuid"]: item["plan"] for item in objects}
     rest = ["build", "sign", "write", "verify", "check"]
     assert plans == {UUIDS[0]: ["identify", *rest], UUIDS[1]: ["identify", "agree", *rest]}
     sheet = tmp_path / "boards.csv"
@@ -114,8 +114,8 @@ def test_two_owners_race_for_a_new_node_and_one_has_it(desk: Desk, delay: str) -
     won = [outcome.code for outcome in outcomes].index(0)
     assert owners[won].ask("verify", node.uuid, *desk.links.over("can"))["verdict"] == "authentic"
     flash = node.octets
-    said = owners[1 - won].refuses("provision", "--profile", ANGLE, "--yes", *desk.links.over("can"), code=6)
-    assert said["code"] in ("node-refused", "refused")  # the latter where it holds the key of its unconfirmed attempt
+    error = owners[1 - won].refuses("provision", "--profile", ANGLE, "--yes", *desk.links.over("can"), code=6)
+    assert error["code"] in ("node-refused", "refused")  # the latter where it holds the key of its unconfirmed attempt
     assert node.octets == flash
 
 
@@ -158,10 +158,10 @@ def test_a_node_whose_key_was_imported_is_read_and_not_signed_again(
     assert made.err.count("was due again on") == 1, made.err
     assert "Warning: All 3 boards: " in made.err, "once, with the nodes that have it"
 
-    for one, other, name in ((station, rival, "rival"), (rival, station, "bench")):
+    for first, other, name in ((station, rival, "rival"), (rival, station, "bench")):
         key = tmp_path / f"{name}.pem"
         key.write_text(other.ask("init")["public_key"])
-        one.ask("trust", "add", name, key, "--yes")
+        first.ask("trust", "add", name, key, "--yes")
     bundle = tmp_path / "keys.bundle"
     station.ask("export-keys", "--to", "rival", "--all", "--output", bundle, "--yes")
     rival.ask("import-keys", bundle, "--yes")

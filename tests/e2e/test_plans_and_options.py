@@ -38,8 +38,8 @@ def test_a_dry_run_on_a_new_node_changes_nothing(station: Station, node: Node, t
     assert plan["uuid"] == node.uuid
     assert plan["plan"] == ["identify", "whitelist", "agree", "build", "sign", "write", "verify", "check"]
     assert everything(station, node) == before
-    told = station.run("provision", "--profile", ANGLE, "--dry-run", *links.over("nfc"))
-    assert (told.code, node.uuid in told.out) == (0, True)
+    outcome = station.run("provision", "--profile", ANGLE, "--dry-run", *links.over("nfc"))
+    assert (outcome.code, node.uuid in outcome.out) == (0, True)
     station.ask("whitelist", "add", node.uuid, "--dry-run")
     file = tmp_path / "list.csv"
     file.write_text(f"uuid\n{node.uuid}\n")
@@ -89,10 +89,12 @@ def test_a_person_is_asked_on_a_terminal_and_may_say_no(station: Station, node: 
     node.start()
     before = node.octets
     words = ("provision", "--profile", ANGLE, *station.desk.links.over("nfc"))
-    told = on_terminal(station.home, *words, streams=["stdin", "stderr"], answers=["n"], passphrase=station.passphrase)
-    assert node.uuid in told.screen
-    assert told.code == 6
-    assert told.out == ""
+    outcome = on_terminal(
+        station.home, *words, streams=["stdin", "stderr"], answers=["n"], passphrase=station.passphrase
+    )
+    assert node.uuid in outcome.screen
+    assert outcome.code == 6
+    assert outcome.out == ""
     assert node.octets == before
     assert station.ask("whitelist", "list")["whitelist"] == []
 
@@ -119,8 +121,8 @@ def test_options_come_from_variables_and_from_config_toml(station: Station, node
 
 def test_a_config_that_is_no_toml_is_8(station: Station) -> None:
     (station.home / "config.toml").write_text("via = can\n")
-    said = station.refuses("nodes", code=8)
-    assert "config.toml" in said["message"]
+    error = station.refuses("nodes", code=8)
+    assert "config.toml" in error["message"]
 
 
 @pytest.mark.parametrize(

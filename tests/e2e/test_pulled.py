@@ -56,9 +56,9 @@ def pulled_at(watch: Running, field: Field, path: str, frames: int, lines: int) 
     """
     for more in range(0, 40, 2):
         field.put(path, lift_after=frames + more)
-        said = time.monotonic() + SAID
-        while watch.out.count("\n") < lines and not (field.empty and time.monotonic() > said):
-            said = said if field.empty else time.monotonic() + SAID
+        deadline = time.monotonic() + SAID
+        while watch.out.count("\n") < lines and not (field.empty and time.monotonic() > deadline):
+            deadline = deadline if field.empty else time.monotonic() + SAID
             watch.read(0.1)
         if watch.out.count("\n") >= lines:
             break

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.link
 POINTS = ("agree", "build", "write", "half written", "verify")
 
 
-class Pulling(SilentReporter):
+class PullingReporter(SilentReporter):
     """Lifts the board off when the step that is named begins, once."""
 
     def __init__(self, field: Field) -> None:
@@ -54,7 +54,7 @@ class Pulling(SilentReporter):
 
 def pull_at_each(home: Path, field: Field, path: str, lying: list[tuple[str, str]]) -> None:
     station = BaseStation.open(home, ask=lambda prompt, confirm: PASSPHRASE)
-    pulling = Pulling(field)
+    pulling = PullingReporter(field)
     request = ProvisionRequest(order=BuildOrder(ANGLE), watch=True)
     run = BatchRun(station, LinkSettings("nfc", path, timeout=30.0), request, pulling)
     came = run.many(AcceptingOperator())

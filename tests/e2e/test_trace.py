@@ -94,11 +94,11 @@ def test_a_bus_is_written_down_as_wireshark_reads_it(desk: Desk, tmp_path: Path)
 def test_a_file_that_is_there_is_refused_before_anything_is_waited_for(desk: Desk, tmp_path: Path) -> None:
     station, file = desk.station(), tmp_path / "t.trace"
     file.write_text("mine")
-    said = station.refuses("identify", *desk.links.over("nfc"), "--trace", file, code=2)
-    assert "already exists" in said["message"]
+    error = station.refuses("identify", *desk.links.over("nfc"), "--trace", file, code=2)
+    assert "already exists" in error["message"]
     assert file.read_text() == "mine"
-    said = station.refuses("identify", *desk.links.over("nfc"), "--trace", tmp_path / "no" / "t", code=3)
-    assert "folder" in said["message"]
+    error = station.refuses("identify", *desk.links.over("nfc"), "--trace", tmp_path / "no" / "t", code=3)
+    assert "folder" in error["message"]
 
 
 def test_a_full_disk_ends_the_trace_and_not_the_work(desk: Desk, tmp_path: Path) -> None:

@@ -35,8 +35,8 @@ def test_a_known_uuid_with_another_key_is_refused(desk: Desk, station: Station) 
         ["read", UUID, *links],
         ["reset", UUID, "--yes", *links],
     ):
-        said = station.refuses(*words, code=6)
-        assert said["code"] == "other-key", words
+        error = station.refuses(*words, code=6)
+        assert error["code"] == "other-key", words
     assert copy.octets == flash
     assert station.tables(without=("audit", "steps")) == store
     refusals = [entry for entry in station.ask("log", UUID)["entries"] if entry["outcome"] == "other key"]
@@ -46,8 +46,8 @@ def test_a_known_uuid_with_another_key_is_refused(desk: Desk, station: Station) 
 def test_a_whitelist_entry_with_a_fingerprint_takes_that_key_alone(station: Station, node: Node) -> None:
     node.start()
     station.ask("whitelist", "add", node.uuid, "--fingerprint", "ab" * 32)
-    said = station.refuses("provision", "-p", ANGLE, "--yes", *station.desk.links.over("nfc"), code=6)
-    assert said["code"] == "other-key"
+    error = station.refuses("provision", "-p", ANGLE, "--yes", *station.desk.links.over("nfc"), code=6)
+    assert error["code"] == "other-key"
     assert node.flash["key"] is None
 
 
@@ -98,18 +98,18 @@ def test_a_station_of_another_owner_cannot_take_a_node(desk: Desk, via: str) -> 
     node = desk.node().start(nfc=via == "nfc", can=via == "can")
     owner.provision(via, "--profile", ANGLE)
     flash, links = node.octets, desk.links.over(via)
-    said = rival.refuses("provision", "--profile", ANGLE, "--yes", *links, code=6)
-    assert said["code"] in ("node-refused", "refused")  # by the node, or before it is asked: no tap, no pin
-    assert said["hint"]
+    error = rival.refuses("provision", "--profile", ANGLE, "--yes", *links, code=6)
+    assert error["code"] in ("node-refused", "refused")  # by the node, or before it is asked: no tap, no pin
+    assert error["hint"]
     for words in (["agree", node.uuid, "--rotate"], ["write", node.uuid], ["reset", node.uuid, "--yes"]):
         rival.refuses(*words, *links, code=6)  # it never came onto the rival's whitelist
     assert node.octets == flash
     assert rival.keys(node.uuid) == []
-    told = rival.run("verify", node.uuid, *links)
-    assert told.code == 4
-    (line,) = [line for line in told.out.splitlines() if line.startswith("signing station")]
+    outcome = rival.run("verify", node.uuid, *links)
+    assert outcome.code == 4
+    (line,) = [line for line in outcome.out.splitlines() if line.startswith("signing station")]
     assert line.endswith("is neither trusted here nor certified by a trusted CA")
-    assert f"{node.uuid}: not authentic" in told.out.splitlines()
+    assert f"{node.uuid}: not authentic" in outcome.out.splitlines()
     assert owner.ask("verify", node.uuid, *links)["verdict"] == "authentic"
 
 
@@ -145,12 +145,12 @@ def test_a_node_that_is_not_on_the_whitelist_is_not_keyed(station: Station, node
     links = station.desk.links.over("nfc")
     flash = node.octets
     for words in (["agree", node.uuid], ["write", node.uuid], ["sign", node.uuid]):
-        said = station.refuses(*words, *links, code=6)
-        assert said["code"] == "not-whitelisted"
-        assert f"whitelist add {node.uuid}" in said["hint"]
-    said = station.refuses("provision", "--profile", ANGLE, *links, code=6)
-    assert said["code"] == "not-whitelisted"
-    assert "--yes" in said["hint"]
+        error = station.refuses(*words, *links, code=6)
+        assert error["code"] == "not-whitelisted"
+        assert f"whitelist add {node.uuid}" in error["hint"]
+    error = station.refuses("provision", "--profile", ANGLE, *links, code=6)
+    assert error["code"] == "not-whitelisted"
+    assert "--yes" in error["hint"]
     assert node.octets == flash
     assert station.ask("whitelist", "list")["whitelist"] == []
 
@@ -163,6 +163,6 @@ def test_the_datasheet_of_another_owner_is_no_anchor(desk: Desk, station: Statio
     image = rival.ask("read", node.uuid, *desk.links.over("nfc"))
     file = desk.folder / "image.json"
     file.write_text(json.dumps(image))
-    said = station.ask("verify", file, code=4)
-    assert said["verdict"] == "not authentic"
-    assert "signing station" in {check["name"] for check in said["checks"] if check["result"] == "failed"}
+    reply = station.ask("verify", file, code=4)
+    assert reply["verdict"] == "not authentic"
+    assert "signing station" in {check["name"] for check in reply["checks"] if check["result"] == "failed"}

@@ -254,8 +254,8 @@ def test_a_measurement_beside_an_update_loses_nothing(desk: Desk, owner: Owner) 
     station, node = desk.station(), board(desk, owner)
     sensor = desk.node("sensor", type_=ANGLE).start("--source", "ramp:5", nfc=False, can=True)
     over = desk.links.over("can")
-    for one in (node, sensor):
-        station.ask("whitelist", "add", one.uuid)
+    for subject in (node, sensor):
+        station.ask("whitelist", "add", subject.uuid)
     station.run("provision", "--all", *PROVISIONED, "--yes", *over)
     measuring = station.start("--json", "measure", sensor.uuid, "--test-pattern", "--rate", "100", *over)
     measuring.wait_for('"data"')

@@ -71,9 +71,9 @@ def test_one_node_that_fails_does_not_end_the_watch(desk: Desk, station: Station
     assert desk.station("rival").provision("nfc", "--profile", ANGLE)["verdict"] == "authentic"
     sheet = foreign.octets
     watch = station.start("--json", "provision", "--watch", "--yes", "--profile", ANGLE, *desk.links.over("nfc"))
-    (said,) = watch.wait_for_lines(1)
-    assert said["error"]["code"] == "refused"
-    assert "another owner's CA" in said["error"]["message"]
+    (line,) = watch.wait_for_lines(1)
+    assert line["error"]["code"] == "refused"
+    assert "another owner's CA" in line["error"]["message"]
     assert foreign.octets == sheet
     foreign.stop()
     own.start()

@@ -221,8 +221,8 @@ def test_a_fresh_home_needs_only_init(desk: Desk, tmp_path: Path) -> None:
     assert b"another long passphrase" not in everything
     node = desk.node().start()
     assert station.provision("nfc", "--profile", ANGLE)["verdict"] == "authentic"
-    (told,) = station.ask("nodes")["nodes"]
-    assert (told["uuid"], told["verdict"], told["state"]) == (node.uuid, "authentic", "provisioned")
+    (nodes,) = station.ask("nodes")["nodes"]
+    assert (nodes["uuid"], nodes["verdict"], nodes["state"]) == (node.uuid, "authentic", "provisioned")
 
 
 @pytest.mark.needs("its own datasheet")

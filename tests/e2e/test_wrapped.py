@@ -212,8 +212,8 @@ def test_what_does_not_go_together_is_refused(bench: WrappedBench, tmp_path: Pat
         assert bench.station.refuses(*words, code=code)
     changed = tmp_path / "torque.dbc"
     changed.write_text(bench.dbc.read_text().replace("0.01,0", "0.02,0"))
-    said = bench.station.refuses(*run, "--source", f"dbc:{changed}", "--bus", bench.bus, code=6)
-    assert "not the file that the node was made from" in said["message"]
+    error = bench.station.refuses(*run, "--source", f"dbc:{changed}", "--bus", bench.bus, code=6)
+    assert "not the file that the node was made from" in error["message"]
 
 
 def test_a_type_is_made_from_the_same_file(bench: WrappedBench, tmp_path: Path) -> None:

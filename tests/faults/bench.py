@@ -83,9 +83,9 @@ def control(bench: Bench) -> int:
             fault = Fault(cuts + 100, power=True, ignore_fsync=True)  # nothing is cut: done, then the power goes
             desk.run(*act.words, home=act.home, fault=fault.environment(bench.library, desk, act.home))
             put_back(desk.folder / "shadow", desk.folder / act.home)
-            told = desk.run("whitelist", "list") if act is ACTS[0] else desk.run("nodes", UUID)
-            known = UUID in told.stdout and (act is ACTS[0] or '"epoch": 1' in told.stdout)
-            lost += told.returncode != 0 or not known
+            outcome = desk.run("whitelist", "list") if act is ACTS[0] else desk.run("nodes", UUID)
+            known = UUID in outcome.stdout and (act is ACTS[0] or '"epoch": 1' in outcome.stdout)
+            lost += outcome.returncode != 0 or not known
     return lost
 
 
@@ -136,7 +136,7 @@ def run_all(bench: Bench, work: list[Trial], jobs: int, until: float | None) -> 
     lost: Counter[str] = Counter()
     began = time.monotonic()
 
-    def one(trial: Trial) -> None:
+    def run_trial(trial: Trial) -> None:
         if until is not None and time.monotonic() > until:
             return
         try:
@@ -154,7 +154,7 @@ def run_all(bench: Bench, work: list[Trial], jobs: int, until: float | None) -> 
 
     random.Random(2).shuffle(work)
     with ThreadPoolExecutor(jobs + WAITING) as pool:
-        list(pool.map(one, work))
+        list(pool.map(run_trial, work))
     for name in sorted(tried):
         print(f"{name}: tried {tried[name]}, healed {tried[name] - lost[name]}, lost {lost[name]}")
     seconds, all_tried, all_lost = time.monotonic() - began, tried.total(), lost.total()

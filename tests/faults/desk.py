@@ -45,7 +45,7 @@ def own_links() -> Links:
 
 
 @dataclass(frozen=True)
-class Ended:
+class Outcome:
     """How a command ended, and what it said."""
 
     returncode: int
@@ -112,7 +112,7 @@ class Desk:
         seconds: float = 60,
         module: str = "teds_provision",
         until: str = "",
-    ) -> Ended:
+    ) -> Outcome:
         """Run one command of a station of this desk to its end; raises TimeoutExpired.
 
         ``until``: it gets SIGTERM when it has said that, or would have long since.
@@ -141,11 +141,11 @@ class Desk:
             running.close()
 
 
-def ended(running: Child, seconds: float) -> Ended:
+def ended(running: Child, seconds: float) -> Outcome:
     """Wait for the end of a command; raises TimeoutExpired."""
     try:
         code = running.wait(seconds)
-        return Ended(code, running.stdout(), running.stderr())
+        return Outcome(code, running.stdout(), running.stderr())
     finally:
         running.close()
 
@@ -210,8 +210,8 @@ class States:
                 folder / home, name=name, keystore="file", ask=lambda prompt, confirm=False: PASSPHRASE, costs=THROWAWAY
             )
             station.close()
-            told = json.loads(desk.run("init", home=home).stdout)
-            (folder / "files" / f"{name}.pem").write_text(told["public_key"])
+            record = json.loads(desk.run("init", home=home).stdout)
+            (folder / "files" / f"{name}.pem").write_text(record["public_key"])
         words = ["node", "create", str(folder / "flash"), "--uuid", UUID, *hardware]
         if slots:
             key = make_key(folder / "owner.pem")

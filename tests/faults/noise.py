@@ -49,29 +49,29 @@ _WRITE_KEYS = ("rewrap", "passphrase", "merge", "rotate")
 _TAKES = ("reset", "move", "revoke", "decommission")
 
 
-def pair(bench: Bench, one: Act, other: Act) -> str:
+def pair(bench: Bench, command: Act, other: Act) -> str:
     """Two commands at once, then each once more alone: every key opens, the log holds, nothing of either is lost."""
-    with bench.desk(one) as desk, desk.node():
-        both = (one, other)
+    with bench.desk(command) as desk, desk.node():
+        both = (command, other)
         with ThreadPoolExecutor(2) as pool:
             done = list(pool.map(lambda act: desk.run(*act.words, until=act.until, seconds=150), both))
-        said = [f"{act.name} {run.returncode} {run.stdout[-200:]}{run.stderr[-200:]}"
+        failures = [f"{act.name} {run.returncode} {run.stdout[-200:]}{run.stderr[-200:]}"
                 for act, run in zip(both, done, strict=True) if run.buggy or run.returncode not in TOLD]  # fmt: skip
         takes = any(act.name in _TAKES for act in both)
         for act, first in zip(both, done, strict=True):
             again = desk.run(*act.words, until=act.until, seconds=150)
             if again.buggy or again.returncode not in (TOLD if takes or first.returncode else act.ends):
-                said.append(f"{act.name} again {again.returncode} {again.stdout[-200:]}{again.stderr[-200:]}")
+                failures.append(f"{act.name} again {again.returncode} {again.stdout[-200:]}{again.stderr[-200:]}")
         opened = desk.run("vault", "rewrap", "--yes")  # unwraps every key, or fails
         if opened.returncode:
-            said.append(f"not every key opens: {opened.returncode} {opened.stdout[-300:]}{opened.stderr[-200:]}")
+            failures.append(f"not every key opens: {opened.returncode} {opened.stdout[-300:]}{opened.stderr[-200:]}")
         if not json.loads(desk.run("log").stdout or '{"intact": false}')["intact"]:
-            said.append("the audit log does not hold")
+            failures.append("the audit log does not hold")
         if not takes:
             verified = desk.run("verify", UUID, "LINK")
-            if verified.returncode not in (*one.verdicts, *other.verdicts):
-                said.append(f"verify {verified.returncode}: {verified.stdout[-300:]}")
-    return "; ".join(said)
+            if verified.returncode not in (*command.verdicts, *other.verdicts):
+                failures.append(f"verify {verified.returncode}: {verified.stdout[-300:]}")
+    return "; ".join(failures)
 
 
 def pairs(bench: Bench, share: random.Random, *, count: int, jobs: int, until: float | None) -> int:
@@ -86,7 +86,7 @@ def pairs(bench: Bench, share: random.Random, *, count: int, jobs: int, until: f
         itertools.permutations(vault, 2)
     )  # who is first by how much decides: one try in six lost all once
 
-    def one(two: tuple[Act, Act]) -> str | None:
+    def run_pair(two: tuple[Act, Act]) -> str | None:
         if until is not None and time.monotonic() > until:
             return None
         try:
@@ -95,11 +95,11 @@ def pairs(bench: Bench, share: random.Random, *, count: int, jobs: int, until: f
             return f"the trial itself failed: {type(error).__name__}: {error}"
 
     with ThreadPoolExecutor(jobs) as pool:
-        said = list(pool.map(one, chosen))
-    found = [(two, complaint) for two, complaint in zip(chosen, said, strict=True) if complaint]
+        failures = list(pool.map(run_pair, chosen))
+    found = [(two, complaint) for two, complaint in zip(chosen, failures, strict=True) if complaint]
     for (first, second), complaint in found:
         print(f"LOST  {first.name} beside {second.name}: {complaint}", flush=True)
-    tried = sum(complaint is not None for complaint in said)
+    tried = sum(complaint is not None for complaint in failures)
     print(f"two commands at once: {len(every)} pairs, tried {tried} times, lost {len(found)}", flush=True)
     return len(found)
 
@@ -143,6 +143,10 @@ def noisy(bench: Bench, seeds: int, jobs: int) -> int:
             found = list(results)
             lost += sum(bool(complaint) for _, complaint in found)
             tries = ", ".join(str(tries) if tries <= TRIES else f"more than {TRIES}" for tries, _ in found)
-            told = " ".join(f"{kind} {share:.0%}" for kind, share in shares.items())
-            print(f"frames on CAN, {told}: tries {tries}", *(f"LOST {said}" for _, said in found if said), flush=True)
+            description = " ".join(f"{kind} {share:.0%}" for kind, share in shares.items())
+            print(
+                f"frames on CAN, {description}: tries {tries}",
+                *(f"LOST {failure}" for _, failure in found if failure),
+                flush=True,
+            )
     return lost

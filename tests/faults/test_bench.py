@@ -32,6 +32,6 @@ pytestmark = [
 )
 def test_a_cut_or_a_failing_disk_loses_nothing(capsys: pytest.CaptureFixture[str], acts: tuple[str, ...]) -> None:
     code = main(["--quick", "--jobs", "3", *(word for act in acts for word in ("--only", act))])
-    told = capsys.readouterr().out
-    assert code == 0, told
-    assert "lost 0" in told
+    output = capsys.readouterr().out
+    assert code == 0, output
+    assert "lost 0" in output

@@ -25,7 +25,7 @@ from pathlib import Path
 
 from tests.cli.shell import clean_environment
 from tests.faults.acts import UUID, Act
-from tests.faults.desk import Desk, Ended, States, ended
+from tests.faults.desk import Desk, Outcome, States, ended
 from tests.faults.disk import build_library, put_back
 from tests.zygote import Child, Zygote, first_of
 
@@ -155,7 +155,7 @@ class Bench:
 
     def _on_node(self, desk: Desk, act: Act, fault: Fault) -> str:
         """The node meets the fault; it is started anew, and the command runs again."""
-        first: Ended | None = None
+        first: Outcome | None = None
         try:
             with desk.node(fault.environment(self.library, desk, "flash")) as node:
                 command = desk.start(*act.words, "--timeout", "5", home=act.home)
@@ -173,7 +173,7 @@ class Bench:
         with desk.node():
             return self._again(desk, act, first)
 
-    def _end_of(self, command: Child, node: Child) -> Ended:
+    def _end_of(self, command: Child, node: Child) -> Outcome:
         """The end of a command; where its node is gone it does nothing but wait, and others may work meanwhile."""
         if first_of(command, node, HANGS) is command:
             return ended(command, HANGS)
@@ -183,12 +183,12 @@ class Bench:
         finally:
             self._cores.acquire()
 
-    def _again(self, desk: Desk, act: Act, first: Ended | None) -> str:
+    def _again(self, desk: Desk, act: Act, first: Outcome | None) -> str:
         again = desk.run(*act.words, home=act.home, until=act.until, seconds=act.seconds)
         if again.returncode in act.ends:
             return ""
-        said = again.stdout[-400:] + again.stderr[-200:]
-        return f"first {first.returncode if first else 'not begun'}, again {again.returncode}: {said}"
+        output = again.stdout[-400:] + again.stderr[-200:]
+        return f"first {first.returncode if first else 'not begun'}, again {again.returncode}: {output}"
 
     def _proof(self, act: Act, desk: Desk) -> str:
         if not act.proof:
@@ -204,7 +204,7 @@ class Bench:
         return "" if verified.returncode in act.verdicts else f"verify {verified.returncode}: {verified.stdout[-400:]}"
 
 
-def _must_end(act: Act, done: Ended) -> None:
+def _must_end(act: Act, done: Outcome) -> None:
     assert done.returncode in act.ends, f"{act.name} fails without any fault: {done.stdout}{done.stderr}"
 
 

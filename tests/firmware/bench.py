@@ -67,7 +67,7 @@ class Hooks:
         return 0
 
 
-class Acting(MemoryNode):
+class MeasuringMemoryNode(MemoryNode):
     """What a Tim that measures is asked, asked of the node in C."""
 
     def __init__(self, hardware: FakeHardware, *, max_message: int, max_teds: int, **sizes: int) -> None:
@@ -127,8 +127,8 @@ class Acting(MemoryNode):
 
     def next_frame(self, bus: str = "can") -> DataFrame | None:  # type: ignore[override]
         if bus == "ble":
-            said = self.ble_data()
-            return None if said is None else DataFrame(said[0] + 2, 0, said[1])
+            packet = self.ble_data()
+            return None if packet is None else DataFrame(packet[0] + 2, 0, packet[1])
         frame = super().next_frame()
         return None if frame is None else DataFrame((frame[0] >> 13 & 7) | 0xF0, *frame)
 
@@ -180,7 +180,7 @@ class Acting(MemoryNode):
 class CBench(reference.Bench):
     """One node in C; ``limits`` as the reference has them."""
 
-    made: ClassVar[list[Acting]] = []
+    made: ClassVar[list[MeasuringMemoryNode]] = []
 
     @classmethod
     def close_all(cls) -> None:
@@ -195,10 +195,10 @@ class CBench(reference.Bench):
         room = {} if {"sessions", "streams"} & limits.keys() else {"sessions": 8, "streams": 8}
         assert limits.pop("sessions", 2) == limits.pop("streams", 2) == 2
         if not hasattr(self, "tim"):
-            self.tim = Acting(self.hardware, **limits, **room)  # type: ignore[assignment]
+            self.tim = MeasuringMemoryNode(self.hardware, **limits, **room)  # type: ignore[assignment]
             self.made.append(self.tim)  # type: ignore[arg-type]
             self._put: object = None
-        node: Acting = self.tim  # type: ignore[assignment]
+        node: MeasuringMemoryNode = self.tim  # type: ignore[assignment]
         node.slow(slow)
         node.connected.clear()
         node.set_channels()

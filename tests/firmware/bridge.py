@@ -43,7 +43,7 @@ def packets(octets: Iterator[int]) -> Iterator[bytes]:
             escaped = False
 
 
-class Emulated:
+class EmulatedBoard:
     """The image under qemu, on a bus. ``stack`` is the high-water mark, ``node`` sizeof(teds_node), when asked for."""
 
     def __init__(self, image: Path, bus: str, uuid: bytes) -> None:
@@ -110,7 +110,7 @@ class Emulated:
 def main(arguments: list[str]) -> int:
     """Run it until stdin ends; then say what stack it took."""
     image, bus, uuid = arguments
-    emulated = Emulated(Path(image), bus, bytes.fromhex(uuid))
+    emulated = EmulatedBoard(Path(image), bus, bytes.fromhex(uuid))
     try:
         assert emulated.ready.wait(60)
         print("ready", flush=True)

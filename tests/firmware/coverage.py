@@ -36,9 +36,9 @@ def counted(build: Path) -> dict[str, Counts]:
     return found
 
 
-def take(said: dict[str, list[dict[str, object]]], found: dict[str, Counts]) -> None:
+def take(covered: dict[str, list[dict[str, object]]], found: dict[str, Counts]) -> None:
     """Add what gcov says of one object."""
-    for file in said["files"]:
+    for file in covered["files"]:
         path = Path(str(file["file"]))
         if path.parent.name != "src" or path.suffix != ".c":
             continue

@@ -101,19 +101,19 @@ class CDesk(Desk):
     @property
     def flash(self) -> Flash:
         """What it says of itself."""
-        said, blocks = self.node.identity(), self.node.blocks()
-        provisioned = said.state == NodeState.PROVISIONED
+        identity, blocks = self.node.identity(), self.node.blocks()
+        provisioned = identity.state == NodeState.PROVISIONED
         stored = {block: teds for block, teds in blocks.items() if provisioned or block != SECURITY}
         return Flash(
-            said.uuid,
+            identity.uuid,
             NODE.point,
             NODE.sign(b"TEDS1 node key\0" + UUID + NODE.point),
             blocks=stored,
-            epoch=said.epoch,
-            sequence=said.sequence,
+            epoch=identity.epoch,
+            sequence=identity.sequence,
             provisioned=provisioned,
-            can_address=said.can_address,
-            key=bytes(16) if said.state else None,
+            can_address=identity.can_address,
+            key=bytes(16) if identity.state else None,
         )
 
     def shown(self) -> tuple[object, ...]:

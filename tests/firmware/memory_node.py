@@ -93,11 +93,11 @@ class MemoryNode:
 
         def ask(what: bytes, channel: int, argument: int, octets: Any, length: int) -> int:
             given = ctypes.string_at(octets, length) if octets else b""
-            said = hook(what.decode(), channel, argument, given)
-            if isinstance(said, tuple):
-                ctypes.memmove(octets, said[0], length)
-                return int(said[1])
-            return int(said)
+            outcome = hook(what.decode(), channel, argument, given)
+            if isinstance(outcome, tuple):
+                ctypes.memmove(octets, outcome[0], length)
+                return int(outcome[1])
+            return int(outcome)
 
         self._hook = _HOOK(ask)  # kept, too
         self._library.memory_hook_up(self._board, self._hook)
@@ -106,10 +106,10 @@ class MemoryNode:
         """Have its firmware in the test's hands, with packets of at most ``most`` octets; before the start."""
 
         def ask(what: bytes, argument: int, octets: Any, length: int, room: int) -> int:
-            said = hook(what.decode(), argument, ctypes.string_at(octets, length) if octets else b"")
+            outcome = hook(what.decode(), argument, ctypes.string_at(octets, length) if octets else b"")
             if octets:
-                ctypes.memmove(octets, said, min(len(said), room))
-            return len(said)
+                ctypes.memmove(octets, outcome, min(len(outcome), room))
+            return len(outcome)
 
         self._firmware = _FIRMWARE(ask)  # kept, too
         self._library.memory_firmware(self._board, self._firmware, ctypes.c_uint16(most))

@@ -43,11 +43,11 @@ Ask = Callable[..., Iterator[None]]
 """Sends a command, plain or sealed."""
 
 
-class Silent(Exception):
+class NoReplyError(Exception):
     """No reply, and no more repetitions."""
 
 
-class Refused(Exception):
+class RefusalError(Exception):
     def __init__(self, reason: int) -> None:
         super().__init__(f"refusal {reason}")
         self.reason = reason
@@ -136,7 +136,7 @@ class Bus:
     nodes: list[Node] = field(default_factory=list)
     stations: list[Station] = field(default_factory=list)
     flying: list[tuple[int, int, Frame, object]] = field(default_factory=list)
-    told: int = 0
+    frames_sent: int = 0
 
     def __post_init__(self) -> None:
         self.dice = random.Random(self.seed)
@@ -147,7 +147,7 @@ class Bus:
 
     def send(self, frame: Frame, sender: object) -> None:
         """Put a frame on the wire; it takes a quarter of a millisecond."""
-        self.told += 1
+        self.frames_sent += 1
         chance = self.dice.randrange(1000)
         whims = self.whims
         if chance < whims.lost:
@@ -310,7 +310,7 @@ class Station:
                     yield
             if self.bus.now > first + 15 * SECOND or attempt == 2:
                 break
-        raise Silent(frame[:6].hex())
+        raise NoReplyError(frame[:6].hex())
 
 
 def run(bus: Bus, *conversations: Iterator[None]) -> None:
@@ -358,7 +358,7 @@ class Owner:
     def _judge(self, reply: bytes) -> None:
         assert len(reply) == 3 + int.from_bytes(reply[1:3], "big"), reply.hex()
         if not reply[0]:
-            raise Refused(reply[3])
+            raise RefusalError(reply[3])
         self.payload = reply[3:]
 
     def identify(self, ask: Ask | None = None) -> Iterator[None]:
@@ -384,16 +384,16 @@ class Owner:
         yield from self.identify(ask)
         yield from self.read(0, 128, ask)
         security = self.teds
-        said = dict(fields(security[4:-2]))
-        self.point = base64.b64decode(said[101])
-        verify(self.point, b"TEDS1 node key\0" + self.uuid + self.point, base64.b64decode(said[102]))
-        one = Key(self.dice)
-        request = self.key.point + self.certified + self.ca.point + one.point
+        members = dict(fields(security[4:-2]))
+        self.point = base64.b64decode(members[101])
+        verify(self.point, b"TEDS1 node key\0" + self.uuid + self.point, base64.b64decode(members[102]))
+        one_time = Key(self.dice)
+        request = self.key.point + self.certified + self.ca.point + one_time.point
         yield from ask(1, request)
         reply = self.payload
         nonce, epoch, en, tag, signature = reply[:16], reply[16:20], reply[20:85], reply[85:101], reply[101:]
         script = sha(b"TEDS1 transcript\0" + request + nonce + epoch + en + self.uuid + self.point + sha(security))
-        okm = hkdf(one.shared(en) + self.key.shared(en), nonce, b"TEDS1 link key\0" + script, 48)
+        okm = hkdf(one_time.shared(en) + self.key.shared(en), nonce, b"TEDS1 link key\0" + script, 48)
         assert mac(okm[16:], b"node" + script) == tag
         verify(self.point, b"TEDS1 agree\0" + script, signature)
         assert int.from_bytes(epoch, "big") == self.epoch + 1
@@ -404,21 +404,23 @@ class Owner:
         """A session under the newest key that the node knows; the others go."""
         for key in list(self.keys):
             yield from self.plain(3)
-            c, one = self.payload, Key(self.dice)
+            c, one_time = self.payload, Key(self.dice)
             key_id = sha(b"TEDS1 key id\0" + key)[:8]
             try:
-                yield from self.plain(3, key_id + one.point + mac(key, b"station open" + self.uuid + c + one.point))
-            except Refused as refused:
+                yield from self.plain(
+                    3, key_id + one_time.point + mac(key, b"station open" + self.uuid + c + one_time.point)
+                )
+            except RefusalError as refused:
                 if refused.reason == 16:
                     continue
                 raise
             en, tag = self.payload[:65], self.payload[65:]
-            okm = hkdf(one.shared(en), key, b"TEDS1 session\0" + self.uuid + one.point + en, 96)
-            assert mac(okm[32:64], b"node open" + key_id + one.point + en) == tag
+            okm = hkdf(one_time.shared(en), key, b"TEDS1 session\0" + self.uuid + one_time.point + en, 96)
+            assert mac(okm[32:64], b"node open" + key_id + one_time.point + en) == tag
             self.to_node, self.to_station, self.counter = okm[:16], okm[16:32], 0
             self.keys = [key]
             return
-        raise Refused(16)
+        raise RefusalError(16)
 
     def sealed(self, function: int, payload: bytes = b"", *, group: int = 128, channel: int = 0) -> Iterator[None]:
         frame = channel.to_bytes(2, "big") + bytes((group, function)) + len(payload).to_bytes(2, "big") + payload
@@ -441,7 +443,7 @@ class Owner:
         yield from self.sealed(7)
         epoch, sequence = (int.from_bytes(self.payload[at : at + 4], "big") for at in (12, 16))
         yield from self.read(0, 128, self.sealed)
-        said = dict(fields(self.teds[4:-2]))
+        members = dict(fields(self.teds[4:-2]))
         listed = b"".join(
             tuple_of(108, channel.to_bytes(2, "big") + bytes((code,)) + sha(octets))
             for (channel, code), octets in sorted(blocks.items())
@@ -449,7 +451,7 @@ class Owner:
         head = bytes.fromhex("030400800101")
         before = b"".join(tuple_of(number, bytes((value,))) for number, value in ((1, 4), (2, 2), (3, 0), (4, 1)))
         before += tuple_of(5, b"stranger:" + sha(self.ca.point).hex()[:16].encode()) + tuple_of(6, bytes(8))
-        after = tuple_of(101, said[101]) + tuple_of(102, said[102])
+        after = tuple_of(101, members[101]) + tuple_of(102, members[102])
         after += tuple_of(103, base64.b64encode(self.key.point)) + tuple_of(104, base64.b64encode(self.certified))
         after += tuple_of(105, b"\1") + tuple_of(106, (sequence + 1).to_bytes(4, "big"))
         after += tuple_of(107, epoch.to_bytes(4, "big")) + listed + tuple_of(109, b"\2") + tuple_of(110, b"\2")

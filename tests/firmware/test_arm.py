@@ -11,7 +11,7 @@ import pytest
 from tests.bench import PASSPHRASE
 from tests.e2e.desk import Desk, Station
 from tests.firmware import budgets, builds
-from tests.firmware.bridge import Emulated
+from tests.firmware.bridge import EmulatedBoard
 from tests.firmware.budgets import MORE
 from tests.vectors import c_arrays
 
@@ -38,10 +38,10 @@ def arm() -> Path:
 
 def sizes(archive: Path) -> tuple[int, int, int]:
     """Octets of text, data and bss."""
-    told = subprocess.run(
+    outcome = subprocess.run(
         ["arm-none-eabi-size", "-t", str(archive)], capture_output=True, text=True, check=True
     ).stdout.splitlines()[-1]
-    text, data, bss = map(int, told.split()[:3])
+    text, data, bss = map(int, outcome.split()[:3])
     return text, data, bss
 
 
@@ -70,9 +70,9 @@ def counted(arm: Path, cpu: str, image: str) -> dict[tuple[str, str], int]:
     done = subprocess.run(
         [*words, "-kernel", str(arm / f"{cpu}-{image}.elf")], capture_output=True, text=True, check=False, timeout=120
     )
-    said = done.stdout + done.stderr
-    assert "wrong" not in said, said
-    return {(step, what): int(number) for step, what, number in re.findall(r"(\S+) (instructions|stack) (\d+)", said)}
+    stderr = done.stdout + done.stderr
+    assert "wrong" not in stderr, stderr
+    return {(step, what): int(number) for step, what, number in re.findall(r"(\S+) (instructions|stack) (\d+)", stderr)}
 
 
 @pytest.mark.parametrize("cpu", list(budgets.CPUS))
@@ -100,9 +100,9 @@ def test_no_function_of_the_library_calls_itself_or_has_an_array_of_variable_len
         seen: set[str] = set()
         ahead = set(called)
         while ahead:
-            each = ahead.pop()
-            seen.add(each)
-            ahead |= calls.get(each, set()) - seen
+            address = ahead.pop()
+            seen.add(address)
+            ahead |= calls.get(address, set()) - seen
         assert name not in seen, f"{name} calls itself"
     for usage in (arm / "m4-full").glob("*.su"):
         assert "dynamic" not in usage.read_text()
@@ -110,14 +110,14 @@ def test_no_function_of_the_library_calls_itself_or_has_an_array_of_variable_len
 
 def test_the_emulated_node_keeps_every_rule(arm: Path, tmp_path: Path, prepared: Path) -> None:
     desk = Desk(tmp_path, prepared)
-    emulated = Emulated(arm / "m4-node.elf", desk.links.can, desk.new_uuid())
+    emulated = EmulatedBoard(arm / "m4-node.elf", desk.links.can, desk.new_uuid())
     try:
         assert emulated.ready.wait(60)
         station: Station = desk.station()
         assert station.passphrase == PASSPHRASE
-        told = station.run("--json", "node", "check", "--factory", "--yes", *desk.links.over("can")).json
-        assert [rule for rule in told["checks"] if rule["result"] == "failed"] == []
-        assert told["passed"] > 90
+        report = station.run("--json", "node", "check", "--factory", "--yes", *desk.links.over("can")).json
+        assert [rule for rule in report["checks"] if rule["result"] == "failed"] == []
+        assert report["passed"] > 90
         stack, node = emulated.sizes()
         assert stack <= min(budgets.STACK * MORE, budgets.STACK_BOUND)
         assert node <= budgets.NODE * MORE

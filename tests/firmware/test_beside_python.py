@@ -107,7 +107,7 @@ class Twins:
         )
         for number, facts in CHANNELS.items():
             self.c.add_channel(number, int(facts.kind), facts.octets, shortest=facts.shortest)
-        self.said = 0
+        self.compared = 0
         self.restart()
 
     def now(self) -> float:
@@ -145,7 +145,7 @@ class Twins:
         if theirs != mine and frame[3:4] == b"\x04":
             print("C:", self.peek(link, theirs), "Python:", self.peek(link, mine))
         assert theirs.hex() == mine.hex(), f"{frame.hex()} on {link} at {self.hardware.tick}"
-        self.said += 1
+        self.compared += 1
         self.py.reply_left(link)
         self.c.reply_left(link)
         self.frames()
@@ -463,7 +463,7 @@ class Operation:
         return hashlib.sha256(flash.security_teds()).digest()[:16]
 
 
-class Halfway:
+class HalfSentStream:
     """The node in C alone, in the middle of the sixth message of a stream: 20 samples of 1 ms each, 7 frames."""
 
     def __init__(self) -> None:
@@ -498,13 +498,13 @@ class Halfway:
 @pytest.mark.parametrize(("held_up", "lost"), [(19, 0), (41, 0), (65, 0), (180, 0), (400, 18)])
 def test_a_loop_held_up_in_the_middle_of_a_message_loses_none_before_it_sleeps(held_up: int, lost: int) -> None:
     """Two messages' time and 150 ms: that long a station waits for what is late."""
-    node = Halfway()
+    node = HalfSentStream()
     node.twins.hardware.tick += held_up * MS
     assert node.lost_after() == lost
 
 
 def test_of_a_slow_bus_the_newest_message_wins() -> None:
-    node = Halfway()
+    node = HalfSentStream()
     for _ in range(1000):
         node.turn(bus=False)
     assert node.lost_after() == 4
@@ -518,7 +518,7 @@ def test_both_nodes_answer_the_same(seed: int) -> None:
         station.begin_measuring()
     for _ in range(150):
         station.move()
-    assert twins.said > 50
+    assert twins.compared > 50
     assert not twins.c.misused
     blocks = {**twins.flash.blocks, SECURITY: twins.flash.security_teds()}
     assert twins.c.blocks() == blocks

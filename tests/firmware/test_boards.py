@@ -168,9 +168,9 @@ def test_the_sizes_of_kconfig_are_those_that_compile() -> None:
     kconfig = (builds.FIRMWARE / "zephyr" / "Kconfig").read_text()
     cmake = (builds.FIRMWARE / "zephyr" / "CMakeLists.txt").read_text()
     config = (builds.FIRMWARE / "include" / "teds" / "config.h").read_text()
-    said = dict(re.findall(r"(TEDS_\w+)=\$\{CONFIG_(TEDS_NODE_\w+)\}", cmake))
-    assert {"TEDS_MAX_MESSAGE", "TEDS_STAGING", "TEDS_SESSIONS", "TEDS_CHANNELS", "TEDS_STREAMS"} <= said.keys()
-    for name, option in said.items():
+    options = dict(re.findall(r"(TEDS_\w+)=\$\{CONFIG_(TEDS_NODE_\w+)\}", cmake))
+    assert {"TEDS_MAX_MESSAGE", "TEDS_STAGING", "TEDS_SESSIONS", "TEDS_CHANNELS", "TEDS_STREAMS"} <= options.keys()
+    for name, option in options.items():
         found = re.search(rf"config {option}\n\tint .*\n\trange (\d+) (\d+)\n\tdefault (\d+)\n", kconfig)
         assert found is not None, option
         least, most, usual = found.groups()
@@ -219,10 +219,10 @@ def test_kconfig_takes_in_what_psa_is_asked_for() -> None:
 def test_zephyr_is_skipped_with_a_line_where_there_is_no_tree() -> None:
     """`make firmware-zephyr` builds against a tree that is given; without one nothing fails."""
     build = str(builds.FIRMWARE / "zephyr" / "build.sh")
-    for words, said in (([], "no Zephyr tree. Give one"), ([str(builds.FIRMWARE)], "is no Zephyr tree")):
+    for words, message in (([], "no Zephyr tree. Give one"), ([str(builds.FIRMWARE)], "is no Zephyr tree")):
         done = subprocess.run(["sh", build, *words], capture_output=True, text=True, check=True)
         assert done.stdout.startswith("Skipped: ")
-        assert said in done.stdout
+        assert message in done.stdout
 
 
 def test_native_sim_has_the_nodes_partitions_and_its_can() -> None:
@@ -257,7 +257,7 @@ def _pressed(board: Running, bus: Bus) -> int | None:
         board.process.send_signal(signal.SIGUSR2)
         time.sleep(0.1)
     while (frame := bus.receive(1.1)) is not None:  # a second press counts after a second
-        said = Announce.decode(frame.identifier, frame.data)
-        if said is not None and said.pressed:
-            return said.address
+        announce = Announce.decode(frame.identifier, frame.data)
+        if announce is not None and announce.pressed:
+            return announce.address
     return None

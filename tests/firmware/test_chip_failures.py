@@ -83,10 +83,10 @@ def test_a_reply_that_cannot_be_sealed_is_a_plain_11_and_the_session_goes_on() -
 def test_a_first_start_without_chip_makes_no_identity_and_the_next_one_does() -> None:
     desk = CDesk()
     blank = bytes([0xFF]) * len(desk.node.image)
-    for call, said in [(1, _RANDOM), (2, _CRYPTO), (3, _RANDOM)]:  # key, signature of field 102, c of Open
+    for call, message in [(1, _RANDOM), (2, _CRYPTO), (3, _RANDOM)]:  # key, signature of field 102, c of Open
         desk.node.image = blank
         desk.node.chip_fails(call)
-        assert desk.node.start() == said
+        assert desk.node.start() == message
         assert (desk.node.image == blank) == (call < 3)
         desk.node.chip_fails(0)
         assert desk.node.start() == 0

@@ -63,7 +63,7 @@ def built(folder: Path, name: str) -> Path:
     return library
 
 
-class Answering(MemoryNode):
+class AnsweringNode(MemoryNode):
     """Every reply of it is taken at once."""
 
     def handle(self, frame: bytes, *, link: str, **more: Any) -> bytes:
@@ -106,7 +106,7 @@ class Frames:
             board.seconds = max(due, board.seconds + 1e-6)
 
 
-class Board(nodes.Measuring):
+class Board(nodes.MeasuringBoard):
     """A factory node in C on the desk of ``node check``."""
 
     library: Path
@@ -114,7 +114,7 @@ class Board(nodes.Measuring):
 
     def power_on(self) -> None:
         super().power_on()
-        node = Answering(
+        node = AnsweringNode(
             self._draw, lambda: self.seconds, uuid=self.uuid, max_message=2048, max_teds=16384, library=self.library
         )
         node.room = 2049  # FAULT_LIST_LONG
@@ -127,7 +127,7 @@ class Board(nodes.Measuring):
             assert node.start() == 0
         self.tim, self.repetition = node, Repetition()  # type: ignore[assignment]
 
-    def _channels(self, node: Answering) -> None:
+    def _channels(self, node: AnsweringNode) -> None:
         for number, facts in self.hardware.channels.items():
             node.add_channel(number, int(facts.kind), facts.octets)
             node.halts(number, facts.halt or 0)
@@ -199,9 +199,9 @@ def test_a_faulty_node_in_c_is_found_over_its_bus(desk: Desk, node: CNode, name:
     source = faulty_source(desk.folder, ON_THE_BUS[name])
     builds.compile_host(node.program, source)
     node.start()
-    said = desk.station().run("--json", "node", "check", "--factory", "--yes", *desk.links.over("can"))
-    found = {check["rule"]: check for check in said.json["checks"] if check["result"] == "failed"}
-    assert FAULTS[name].rule in found, said
+    outcome = desk.station().run("--json", "node", "check", "--factory", "--yes", *desk.links.over("can"))
+    found = {check["rule"]: check for check in outcome.json["checks"] if check["result"] == "failed"}
+    assert FAULTS[name].rule in found, outcome
     assert FAULTS[name].words in found[FAULTS[name].rule]["detail"]
     assert found[FAULTS[name].rule]["slip"] == FAULTS[name].slip
 

@@ -100,11 +100,11 @@ def test_a_start_that_cannot_read_says_so_and_the_next_one_is_good(desk: CDesk) 
     for number in range(1, desk.node.reads + 1):
         desk.node.image = image
         desk.node.read_fails(number)
-        said = desk.node.start()
-        assert said in (0, _FLASH), f"read {number}"
-        started.add(said)
+        status = desk.node.start()
+        assert status in (0, _FLASH), f"read {number}"
+        started.add(status)
         desk.node.read_fails(0)
-        if said == 0:
+        if status == 0:
             assert desk.shown() == old
             assert address(desk).ok, "the spare slot is erased when it is needed"
             desk.node.image = image

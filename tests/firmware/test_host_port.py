@@ -94,10 +94,10 @@ def test_it_is_provisioned_over_socketcand_though_frames_are_lost_and_doubled(
 ) -> None:
     """Every 150th frame is lost, every 30th comes twice: the station repeats, the node runs nothing twice."""
     hub = Hub()
-    given, told = hub.send, itertools.count(1)
+    given, numbers = hub.send, itertools.count(1)
 
     def send(identifier: int, data: bytes, sender: socket.socket | None = None) -> None:
-        number = next(told)
+        number = next(numbers)
         if number % 150:
             given(identifier, data, sender)
         if number % 30 == 7:
@@ -108,7 +108,7 @@ def test_it_is_provisioned_over_socketcand_though_frames_are_lost_and_doubled(
         node.start(can=hub.spec)
         done = station.ask("provision", "--profile", ANGLE, "--yes", "--via", "can", "--can", hub.spec)
         assert done["verdict"] == "authentic"
-        assert next(told) > 300
+        assert next(numbers) > 300
     finally:
         hub.close()
 
@@ -136,10 +136,10 @@ def test_its_stream_loses_nothing(desk: Desk, station: Station, node: CNode, kin
     links = desk.links.over("can")
     assert station.provision("can", "--profile", ANGLE)["verdict"] == "authentic"
     request = ["--rate", "500", "--duration", "2", "--kind", kind, "--test-pattern"]
-    said = station.run("measure", node.uuid, *request, *links)
-    assert said.code == 0, said
-    counts = re.search(r"(\d+) values in (\d+) messages, lost (\d+), late (\d+), bad (\d+)", said.out + said.err)
-    assert counts is not None, said
+    outcome = station.run("measure", node.uuid, *request, *links)
+    assert outcome.code == 0, outcome
+    counts = re.search(r"(\d+) values in (\d+) messages, lost (\d+), late (\d+), bad (\d+)", outcome.out + outcome.err)
+    assert counts is not None, outcome
     values, messages, lost, late, bad = map(int, counts.groups())
     assert values >= 900
     assert messages >= 20
@@ -224,8 +224,10 @@ def test_a_node_in_c_and_one_in_python_are_measured_at_once(desk: Desk, station:
         assert station.ask("provision", "--profile", ANGLE, "--yes", *where)["verdict"] == "authentic"
     file = desk.folder / "run.csv"
     request = ["--rate", "200", "--duration", "3", "--trigger", "--test-pattern", "--to", file]
-    said = station.run("measure", node.uuid, other.uuid, *request, *links)
-    assert said.code == 0, said
-    counted = re.findall(r"(\d+) values in (\d+) messages, lost (\d+), late (\d+), bad (\d+)", said.out + said.err)
+    outcome = station.run("measure", node.uuid, other.uuid, *request, *links)
+    assert outcome.code == 0, outcome
+    counted = re.findall(
+        r"(\d+) values in (\d+) messages, lost (\d+), late (\d+), bad (\d+)", outcome.out + outcome.err
+    )
     assert sum(int(values) for values, *_ in counted) >= 2 * 500
     assert {tuple(map(int, rest)) for _, _, *rest in counted} == {(0, 0, 0)}

@@ -172,10 +172,10 @@ def test_a_board_shows_which_one_it_is(bench: Bench) -> None:
 
         def pressed() -> bool:
             if (frame := heard.get(0.1)) is not None:
-                said = Announce.decode(frame.identifier, frame.data)
-                assert said is not None
-                seen.append(said)
-            return any(said.pressed for said in seen)
+                announce = Announce.decode(frame.identifier, frame.data)
+                assert announce is not None
+                seen.append(announce)
+            return any(seen_announce.pressed for seen_announce in seen)
 
         until(pressed, seconds=PATIENCE)
     assert bench.exchange(security_command(Function.LOCATE, b"\x3c")).ok

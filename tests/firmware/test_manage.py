@@ -218,7 +218,7 @@ def test_a_pressed_button_is_announced_at_once_and_not_too_often() -> None:
             seen.append(desk.now)
     assert seen[0] == 0
     assert min(after - before for before, after in itertools.pairwise(seen)) >= 1
-    assert all(sum(1 for each in seen if at <= each < at + 60) <= 20 for at in seen)
+    assert all(sum(1 for press in seen if at <= press < at + 60) <= 20 for at in seen)
     assert len(seen) >= 50
 
 

@@ -46,7 +46,7 @@ class Taps:
         self.tag = TnepTag(self.mailbox, TagHandler(self.twins.py), wt_int=4, n_wait=15)
         self.tag.start()
         self.transaction = 0
-        self.told = 0
+        self.writes = 0
         self.activate()
 
     def activate(self) -> None:
@@ -67,7 +67,7 @@ class Taps:
             return b""
         mine = self.mailbox.write(octets)
         assert self.c.nfc_write(octets).hex() == mine.hex(), octets.hex()
-        self.told += 1
+        self.writes += 1
         return mine
 
     def close(self) -> None:
@@ -172,7 +172,7 @@ def test_both_tags_answer_a_random_reader_alike(taps: Callable[[int, int], Taps]
         reader = taps(seed, max_ndef)
         for _ in range(100):
             talk(reader)
-        assert reader.told > 60
+        assert reader.writes > 60
 
 
 @pytest.mark.parametrize("address", [None, bytes.fromhex("c0ffee123456")], ids=["wired", "in the air"])

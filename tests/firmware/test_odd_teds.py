@@ -86,7 +86,7 @@ def test_what_is_canonical_is_so_for_both() -> None:
     assert canonical(good)
     assert canonical_in_c(good)
     places = [(start - 2, end) for _, start, end in security._places(good)]
-    told = set()
+    verdicts = set()
     for number in range(4000):
         block = bytearray(good)
         what = dice.randrange(6)
@@ -108,8 +108,8 @@ def test_what_is_canonical_is_so_for_both() -> None:
             block[at : at + 4] = value
         mine = canonical(bytes(block))
         assert canonical_in_c(bytes(block)) == mine, f"{number}: {block.hex()}"
-        told.add(mine)
-    assert told == {True, False}
+        verdicts.add(mine)
+    assert verdicts == {True, False}
 
 
 @pytest.mark.parametrize(
@@ -224,10 +224,10 @@ def test_a_channel_teds_fits_both_or_neither(what: str) -> None:
     answers = []
     for bench in (Bench(teds={(1, 3): CHANNEL_TEDS[what]}), CBench(teds={(1, 3): CHANNEL_TEDS[what]})):
         bench.open()
-        said = [bench.reason(operate(1))]
-        if said == [None]:
-            said += [bench.reason(subscribe(period=period * MS)) for period in (9, 10, 11, 200_000, 524_289)]
-        answers.append(said)
+        reasons = [bench.reason(operate(1))]
+        if reasons == [None]:
+            reasons += [bench.reason(subscribe(period=period * MS)) for period in (9, 10, 11, 200_000, 524_289)]
+        answers.append(reasons)
     assert answers[0] == answers[1]
 
 

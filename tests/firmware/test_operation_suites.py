@@ -23,7 +23,7 @@ from teds_provision.protocol.operation.commands import (
 from teds_provision.protocol.operation.hardware import ChannelHardware, SessionPort
 from teds_provision.protocol.operation.stream_commands import CLOCK, StreamKind, drive, stop
 from teds_provision.teds.sheet import ChannelKind
-from tests.firmware.bench import Acting, CBench
+from tests.firmware.bench import CBench, MeasuringMemoryNode
 from tests.protocol.operation import (
     test_any_octets,
     test_claims,
@@ -84,7 +84,7 @@ def load_dice(bench: CBench, opens: int, one_time: SoftwareKey) -> None:
     bench.restart()
 
 
-def node(bench: CBench) -> Acting:
+def node(bench: CBench) -> MeasuringMemoryNode:
     return bench.tim  # type: ignore[return-value]
 
 

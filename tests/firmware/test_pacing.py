@@ -72,8 +72,8 @@ def test_it_tells_at_its_end_what_of_an_exchange_was_its_own(desk: Desk, station
     assert station.ask("identify", *desk.links.over("can"))["uuid"] == node.uuid
     assert node.process is not None
     node.process.signal(signal.SIGTERM)
-    _, told = map(json.loads, node.process.end().out.splitlines())
-    assert told["turns"] >= 1
-    assert told["turned"] > 0
-    assert told["chip"] > 0, "Prove is a signature"
-    assert told["flash"] == 0, "nothing is stored"
+    _, usage = map(json.loads, node.process.end().out.splitlines())
+    assert usage["turns"] >= 1
+    assert usage["turned"] > 0
+    assert usage["chip"] > 0, "Prove is a signature"
+    assert usage["flash"] == 0, "nothing is stored"

@@ -12,7 +12,7 @@ from teds_provision.protocol.messages.frames import Command, Function, Reason, R
 from teds_provision.protocol.operation.commands import read_data_set, run_self_test, sample, set_values, write_data_set
 from teds_provision.protocol.operation.stream_commands import stop
 from teds_provision.protocol.wire_agreement import StationAgreement
-from tests.firmware.bench import Acting, CBench
+from tests.firmware.bench import CBench, MeasuringMemoryNode
 from tests.firmware.desk import CDesk
 from tests.protocol.desk import CREDENTIALS, META, NAME, UUID, Desk
 from tests.protocol.operation.bench import MS, Bench
@@ -30,7 +30,7 @@ def closed() -> Iterator[None]:
     CBench.close_all()
 
 
-def node(bench: CBench) -> Acting:
+def node(bench: CBench) -> MeasuringMemoryNode:
     return bench.tim  # type: ignore[return-value]
 
 
@@ -54,8 +54,8 @@ def test_an_actuator_that_cannot_be_set_bears_no_value(word: str) -> None:
 
 def test_a_sensor_that_cannot_be_read_is_not_valid() -> None:
     bench = claimed("s")
-    said = bench.send(sample([1])).payload
-    assert said[8:] == b"\x01\x00\x00"
+    payload = bench.send(sample([1])).payload
+    assert payload[8:] == b"\x01\x00\x00"
 
 
 def test_a_set_point_that_nobody_knows_is_0() -> None:
@@ -93,7 +93,7 @@ def test_a_node_with_an_actuator_claimed_stays_where_it_is(acts: bool) -> None:
 @pytest.mark.parametrize("polled", [False, True], ids=["a command comes first", "its loop does"])
 def test_a_dead_man_that_ran_out_long_ago_is_told(polled: bool) -> None:
     """The loop was held up until its session was over, too: what stopped the actuator was the dead-man, before."""
-    said = []
+    replies = []
     for made in (Bench, CBench):
         bench = made()
         bench.open().operate(4)
@@ -102,9 +102,9 @@ def test_a_dead_man_that_ran_out_long_ago_is_told(polled: bool) -> None:
         if polled:
             bench.tim.poll()
         bench.open()
-        said.append(bench.send(security_command(Function.OPERATION)).payload)
-    assert said[0] == said[1]
-    assert said[1][1 + 3 * 3 + 1] & 0x30 == 0x30
+        replies.append(bench.send(security_command(Function.OPERATION)).payload)
+    assert replies[0] == replies[1]
+    assert replies[1][1 + 3 * 3 + 1] & 0x30 == 0x30
 
 
 def test_what_no_event_sensor_has_seen_is_no_event() -> None:
@@ -138,9 +138,9 @@ SIGNATURES = {
 def test_a_signature_that_cannot_be_is_5(what: str) -> None:
     credentials = Credentials(CREDENTIALS.key, SIGNATURES[what], CREDENTIALS.ca)
     request = StationAgreement(credentials, UUID).request()
-    said = CDesk().plain(request)
-    assert (said.ok, said.reason) == ((True, None) if what == "good" else (False, Reason.BAD_SIGNATURE))
-    assert Desk().plain(request).reason == said.reason
+    reply = CDesk().plain(request)
+    assert (reply.ok, reply.reason) == ((True, None) if what == "good" else (False, Reason.BAD_SIGNATURE))
+    assert Desk().plain(request).reason == reply.reason
 
 
 @pytest.mark.parametrize("inside", [False, True], ids=["plain", "in a session"])
@@ -152,8 +152,8 @@ def test_functions_that_are_none(group: int, inside: bool) -> None:
         desk.agree().open()
         ask = desk.sealed if inside else desk.plain
         functions = (0, 1, 3, 5, 6, 8, 12, 18, 20, 21, 22, 24, 99, 255)
-        said = [ask(Command(0, group, function, b"\x80\0")) for function in functions]
-        reasons.append([reply.reason for reply in said])
+        replies = [ask(Command(0, group, function, b"\x80\0")) for function in functions]
+        reasons.append([reply.reason for reply in replies])
     assert reasons[0] == reasons[1]
 
 
@@ -209,9 +209,9 @@ def test_a_datasheet_that_its_slot_does_not_hold_is_10_and_the_old_one_stays() -
     desk.agree()
     kept: dict[tuple[int, int], bytes] = {}
     for channel in (1, 2):
-        one = {(channel, 130): teds_of(3000, 130)}
-        assert commit_kept(desk, one, kept).ok
-        kept |= one
+        too_long = {(channel, 130): teds_of(3000, 130)}
+        assert commit_kept(desk, too_long, kept).ok
+        kept |= too_long
     before = desk.shown()
     assert commit_kept(desk, {(3, 130): teds_of(3000, 130)}, kept).reason == Reason.TOO_LARGE
     assert desk.shown() == before

@@ -64,14 +64,14 @@ def test_ten_thousand_samples_a_second_are_all_there(desk: Desk, station: Statio
     running = station.start("measure", node.uuid, *request, *links)
     os.sched_setscheduler(running.process.pid, os.SCHED_FIFO, os.sched_param(10))
     dropped = dropped_while(running, desk)
-    said = running.end(SECONDS + 120)
+    outcome = running.end(SECONDS + 120)
     assert node.process is not None
     node.process.signal(signal.SIGTERM)
-    told = json.loads(node.process.end().out.splitlines()[-1])
-    print(f"node: {told['missed']} messages not sent, {told['dropped']} frames dropped by its socket")
+    record = json.loads(node.process.end().out.splitlines()[-1])
+    print(f"node: {record['missed']} messages not sent, {record['dropped']} frames dropped by its socket")
     print(f"sockets: {dropped}")
-    counts = re.search(r"(\d+) values in (\d+) messages, lost (\d+), late (\d+), bad (\d+)", said.out + said.err)
-    assert counts is not None, said
+    counts = re.search(r"(\d+) values in (\d+) messages, lost (\d+), late (\d+), bad (\d+)", outcome.out + outcome.err)
+    assert counts is not None, outcome
     values, _, lost, late, bad = map(int, counts.groups())
     print(counts.group(0))
     assert values >= SECONDS * 9900

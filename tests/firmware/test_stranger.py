@@ -10,7 +10,20 @@ from dataclasses import dataclass, field
 import pytest
 
 from tests.firmware.memory_node import MemoryNode
-from tests.firmware.stranger import MS, NEVER, SECOND, Bus, Frame, Key, Owner, Refused, Silent, Station, Whims, run
+from tests.firmware.stranger import (
+    MS,
+    NEVER,
+    SECOND,
+    Bus,
+    Frame,
+    Key,
+    NoReplyError,
+    Owner,
+    RefusalError,
+    Station,
+    Whims,
+    run,
+)
 from tests.firmware.stranger import meta as meta_of
 from tests.firmware.stranger import name as name_of
 
@@ -118,9 +131,9 @@ def stubborn(owner: Owner, *deeds: Callable[[], Iterator[None]], tries: int = 40
                 yield from deed()
             yield from owner.sealed(5)
             return
-        except Silent:
+        except NoReplyError:
             pass
-        except Refused as refused:
+        except RefusalError as refused:
             if refused.reason not in (2, 7, 12, 17):
                 raise
             if refused.reason == 17:
@@ -134,13 +147,13 @@ def owned(owner: Owner) -> Iterator[None]:
         try:
             yield from owner.agree()
             return
-        except Silent:
+        except NoReplyError:
             try:
                 yield from owner.open()
                 return
-            except (Silent, Refused):
+            except (NoReplyError, RefusalError):
                 continue
-        except Refused as refused:
+        except RefusalError as refused:
             if refused.reason == 3:  # it was heard: the node has a key
                 return
             raise
@@ -179,14 +192,14 @@ def meet(scene: Scene, whims: Whims) -> None:
                 try:
                     yield from ask()
                     answers.append(0)
-                except Silent:
+                except NoReplyError:
                     pass
             for function, payload in ((1, bytes(259)), (4, bytes(40)), (5, b""), (9, bytes(32))):
                 try:
                     yield from third.plain(function, payload)
-                except Refused as refused:
+                except RefusalError as refused:
                     answers.append(refused.reason)
-                except Silent:
+                except NoReplyError:
                     pass
 
     sheets = blocks("first"), blocks("second")
@@ -263,7 +276,7 @@ def tried(deed: Iterator[None], outcome: list[bool]) -> Iterator[None]:
     try:
         yield from deed
         outcome.append(True)
-    except (Silent, Refused):
+    except (NoReplyError, RefusalError):
         outcome.append(False)
 
 
@@ -355,8 +368,8 @@ class Reader:
         self.here = True
         service = b"urn:nfc:xsn:teds-provision:tim"
         assert b"\xd1" not in self.node.nfc_message()[:1]
-        said = self.node.nfc_write(record(0xC1, b"Ts", bytes((len(service),)) + service))
-        assert said == record(0xC1, b"Te", b"\0")
+        reply = self.node.nfc_write(record(0xC1, b"Ts", bytes((len(service),)) + service))
+        assert reply == record(0xC1, b"Te", b"\0")
 
     def piece(self, total: int, offset: int, body: bytes, *, more: bool) -> tuple[int, bytes]:
         """Offset and body of what the tag shows for it; a message may be written twice."""
@@ -381,14 +394,14 @@ class Reader:
         self.bus.now += 5 * MS
         if not self.here or self.dice.random() < 0.08:
             self.tap()
-            raise Silent("lifted")
+            raise NoReplyError("lifted")
         self.transaction = self.transaction + 1 & 0xFFFF
         at, size = 0, self.dice.randrange(60, self.room)
         while True:
             body = frame[at : at + size]
             if self.dice.random() < 0.05:
                 self.tap()
-                raise Silent("lifted")
+                raise NoReplyError("lifted")
             offset, answer = self.piece(len(frame), at, body, more=at + len(body) < len(frame))
             at += len(body)
             if at >= len(frame):
@@ -422,7 +435,7 @@ def test_a_reader_that_jerks_provisions_it_all_the_same(max_ndef: int) -> None:
             try:
                 list(owner.agree())
                 break
-            except Silent:
+            except NoReplyError:
                 continue
         list(stubborn(owner, lambda text=text: owner.write(blocks(text)), lambda text=text: owner.check(blocks(text))))
     assert reader.taps > 3

@@ -35,7 +35,7 @@ PROFILE: Final = "magnetic-angular-position-sensor"
 KEPT: Final = ("flash.bin", "images", "home")
 
 
-class StationKilled(BaseException):
+class StationKilledError(BaseException):
     """The station's process was killed."""
 
 
@@ -141,7 +141,7 @@ def _lost(desk: UpdateDesk) -> None:
 
 
 def _killed(desk: UpdateDesk) -> None:
-    raise StationKilled
+    raise StationKilledError
 
 
 def _node_off(desk: UpdateDesk) -> None:
@@ -177,7 +177,7 @@ def interrupted(desk: UpdateDesk, name: str, at: int) -> bool:
             act(desk)
 
     setattr(desk, when, once)
-    with suppress(StationKilled):
+    with suppress(StationKilledError):
         desk.update()
     desk.before = desk.after = lambda number: None
     desk.resumes()

@@ -50,8 +50,8 @@ class Board(CDesk):
 
     def about(self) -> tuple[bytes, int, bytes, str]:
         """Return the running image's digest, the flags, its version and text."""
-        said = self.plain(Command(0, 128, 21, b""), link="can:f1", tapped=False).payload
-        return said[10:42], said[1], said[2:10], said[42:].decode()
+        payload = self.plain(Command(0, 128, 21, b""), link="can:f1", tapped=False).payload
+        return payload[10:42], payload[1], payload[2:10], payload[42:].decode()
 
     def ask(self, command: tuple[int, int, int], body: bytes = smp.EMPTY) -> Any:
         """Return what the manager answers, or the reason of a refusal."""
@@ -327,7 +327,7 @@ def test_an_image_that_imgtool_signed_starts(text: str, tmp_path: Any) -> None:
     desk = CDesk()
     desk.node.has_images(bytes(key.get_public_bytes()), signed, counter=True)
     desk.restart()
-    said = desk.plain(Command(0, 128, 21, b"")).payload
-    assert said[10:42] == digest_of(signed)
-    assert said[2:10] == bytes([2, 5, 0, 6, 0, 0, 0, 7])
-    assert said[42:].decode() == text
+    payload = desk.plain(Command(0, 128, 21, b"")).payload
+    assert payload[10:42] == digest_of(signed)
+    assert payload[2:10] == bytes([2, 5, 0, 6, 0, 0, 0, 7])
+    assert payload[42:].decode() == text

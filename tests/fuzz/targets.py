@@ -90,9 +90,9 @@ def check_teds(data: bytes) -> None:
         if decoded.verdict == "clean" and not findings:
             assert teds.decode(other).edition == edition
             assert teds.decode(other).verdict == "clean"
-    for one in decoded.fields:
-        teds.unpack_uuid(one.raw)
-        teds.read_key(one.raw)
+    for read_field in decoded.fields:
+        teds.unpack_uuid(read_field.raw)
+        teds.read_key(read_field.raw)
 
 
 def check_sheet(data: bytes) -> None:
@@ -500,18 +500,18 @@ def bundle_seeds() -> Iterable[bytes]:
     from teds_provision.protocol.handover import bundle
     from teds_provision.protocol.keys import fingerprint
 
-    one, other = _key(1), _key(2)
+    first, other = _key(1), _key(2)
     whole = bundle.Bundle(
         id="A" * 22,
-        sender=fingerprint(one.point),
+        sender=fingerprint(first.point),
         to=(fingerprint(other.point),),
         created=NOW,
         expires=NOW + timedelta(days=1),
         mode="copy",
-        ca=one.point,
-        nodes=(bundle.BundledNode(bytes(10), one.point, bytes(16), 1, 5, name="x", teds_sha256="0" * 64),),
+        ca=first.point,
+        nodes=(bundle.BundledNode(bytes(10), first.point, bytes(16), 1, 5, name="x", teds_sha256="0" * 64),),
     )
-    yield b"\0" + bundle.seal_bundle(whole, one, [other.point])
+    yield b"\0" + bundle.seal_bundle(whole, first, [other.point])
     yield b"\1" + bundle.payload_of(whole)
 
 
@@ -782,15 +782,15 @@ def plant_seeds() -> Iterable[bytes]:
         text = kept[name]["jws"].split(".")[1]
         payload = urlsafe_b64decode(text + "=" * (-len(text) % 4))
         yield bytes([first]) + kept[name]["jws"].encode()
-        told = json.loads(payload)
-        if "station" in told:
-            told["station"] = fingerprint(SoftwareKey(3).point)
-        if "point" in told:
-            told["point"] = SoftwareKey(3).point.hex()
-        if "members" in told:
-            told["members"], told["share"] = [], []
-            told["removed"][0]["point"] = SoftwareKey(4).point.hex()
-        yield bytes([_signed(first)]) + json.dumps(told, separators=(",", ":")).encode()
+        record = json.loads(payload)
+        if "station" in record:
+            record["station"] = fingerprint(SoftwareKey(3).point)
+        if "point" in record:
+            record["point"] = SoftwareKey(3).point.hex()
+        if "members" in record:
+            record["members"], record["share"] = [], []
+            record["removed"][0]["point"] = SoftwareKey(4).point.hex()
+        yield bytes([_signed(first)]) + json.dumps(record, separators=(",", ":")).encode()
 
 
 def _signed(kind: int) -> int:

@@ -95,9 +95,9 @@ def test_until_it_is_certified_a_station_does_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("direction", [1, -1])
 def test_they_verify_each_others_datasheets(pair: tuple[Station, Station], direction: int) -> None:
-    one, other = pair[::direction]
+    first, other = pair[::direction]
     board = Board()
-    done = provisioned(one, board)
+    done = provisioned(first, board)
     image = Image(board.uuid, done.image.blocks)
     assert Verification(board.uuid, tuple(verify_image(other, image))).verdict == "authentic"
 
@@ -107,9 +107,9 @@ def test_they_rekey_each_others_nodes_by_tap_where_a_person_says_so(
     pair: tuple[Station, Station], direction: int
 ) -> None:
     """Figure 5 of the paper: whoever holds the present key is locked out, so that somebody is asked before."""
-    one, other = pair[::direction]
+    first, other = pair[::direction]
     board = Board()
-    provisioned(one, board)
+    provisioned(first, board)
     other.pins.put(WhitelistEntry(board.uuid))
     before, asked = board.state, list[str]()
     with talk(board) as node, pytest.raises(PolicyError, match="lock out the current holder"):
@@ -130,16 +130,16 @@ def test_they_rekey_each_others_nodes_by_tap_where_a_person_says_so(
             == 2
         )
     assert len(asked) == 1
-    assert board.state.ca == one.ca
+    assert board.state.ca == first.ca
     assert provisioned(other, board).verified.verdict == "authentic"
 
 
 def test_a_node_that_calls_itself_new_and_shows_a_signed_datasheet_is_not_taken_over(
     pair: tuple[Station, Station],
 ) -> None:
-    one, other = pair
+    first, other = pair
     board = Board()
-    provisioned(one, board)
+    provisioned(first, board)
     other.pins.put(WhitelistEntry(board.uuid))
     before = board.state
     with talk(board) as node:
@@ -150,11 +150,11 @@ def test_a_node_that_calls_itself_new_and_shows_a_signed_datasheet_is_not_taken_
 
 
 def test_who_is_asked_once_is_not_asked_again_when_the_link_fails(pair: tuple[Station, Station]) -> None:
-    one, other = pair
+    first, other = pair
     board, asked = Board(), list[str]()
-    provisioned(one, board)
+    provisioned(first, board)
     other.pins.put(WhitelistEntry(board.uuid))
-    with talk(board, Forgetful(board)) as node:
+    with talk(board, ForgetfulLink(board)) as node:
         who = identify(other, node)
         monkey = node.is_alive
         node.is_alive = lambda: True  # type: ignore[method-assign]
@@ -166,9 +166,9 @@ def test_who_is_asked_once_is_not_asked_again_when_the_link_fails(pair: tuple[St
 def test_the_station_that_was_locked_out_is_told_of_a_tap_elsewhere_and_then_who_signs(
     pair: tuple[Station, Station],
 ) -> None:
-    one, other = pair
+    first, other = pair
     board = Board()
-    provisioned(one, board)
+    provisioned(first, board)
     other.pins.put(WhitelistEntry(board.uuid))
     with talk(board) as node:
         agree(other, node, identify(other, node), rotate=True)
@@ -177,18 +177,18 @@ def test_the_station_that_was_locked_out_is_told_of_a_tap_elsewhere_and_then_who
         "which station did so will show once it signs",
     ):
         with pytest.raises(PolicyError, match=words):
-            session(one, board)
-        assert words in why_unproven(one, board)
+            session(first, board)
+        assert words in why_unproven(first, board)
     assert provisioned(other, board).verified.verdict == "authentic"
     signed = f"signed by station {other.fingerprint[:16]}, which your CA certified"
     with pytest.raises(PolicyError, match=signed):
-        session(one, board)
-    trust(one, other)
-    with pytest.raises(PolicyError, match=f"signed by west \\({other.fingerprint[:16]}\\)") as told:
-        session(one, board)
-    assert "attack" not in told.value.message + (told.value.hint or "")
-    assert "proves nothing" not in told.value.message
-    assert [record.epoch for record in one.keys.keys_of(board.uuid)] == [1], "a hint changes no key"
+        session(first, board)
+    trust(first, other)
+    with pytest.raises(PolicyError, match=f"signed by west \\({other.fingerprint[:16]}\\)") as caught:
+        session(first, board)
+    assert "attack" not in caught.value.message + (caught.value.hint or "")
+    assert "proves nothing" not in caught.value.message
+    assert [record.epoch for record in first.keys.keys_of(board.uuid)] == [1], "a hint changes no key"
 
 
 def why_unproven(station: Station, board: Board) -> str:
@@ -198,7 +198,7 @@ def why_unproven(station: Station, board: Board) -> str:
     return next(check.why for check in verified.checks if check.name == "session")
 
 
-class Forgetful(MemoryLink):
+class ForgetfulLink(MemoryLink):
     """A link that loses the first reply to Request."""
 
     lost = False
@@ -250,20 +250,20 @@ def test_an_image_does_not_use_up_the_sequence_of_a_node_that_the_signer_knows(o
 def test_they_hand_over_once_they_have_each_others_certificate(
     pair: tuple[Station, Station], owner: Station, tmp_path: Path, direction: int
 ) -> None:
-    one, other = pair[::direction]
+    first, other = pair[::direction]
     board = Board()
-    provisioned(one, board)
-    trust(one, other)
-    trust(other, one)
+    provisioned(first, board)
+    trust(first, other)
+    trust(other, first)
     order = ExportOrder((other.name,), None, "move")
     with pytest.raises(PolicyError, match="not certified by the CA"):
-        plan_export(one, order)
+        plan_export(first, order)
     path = tmp_path / "other.cert"
     known = sign_request(owner, read_request(fleet.make_request(other.name, other.vault.identity())))
     path.write_bytes(write_certificate(known))
-    add(one, [candidate(one, other.name, path, "station")])
+    add(first, [candidate(first, other.name, path, "station")])
     bundle = tmp_path / "bundle.jwe"
-    export_bundle(one, plan_export(one, order), bundle)
+    export_bundle(first, plan_export(first, order), bundle)
     plan = plan_import(other, bundle.read_bytes())
     assert isinstance(plan, ImportPlan)
     assert plan.ca_is_known

@@ -20,11 +20,11 @@ from tests.handover.desk import Pair, everything, held, session
 from tests.handover.victim import counted, export, open_station, take
 
 
-class Killed(BaseException):
+class KilledError(BaseException):
     """The process ends here; nothing of ours catches this."""
 
 
-class Prepared:
+class PreparedHandover:
     """Two homes as they were, and what the boards had in flash, to be tried from again and again."""
 
     def __init__(self, folder: Path) -> None:
@@ -55,8 +55,8 @@ class Prepared:
 
 
 @pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Prepared]:
-    yield Prepared(tmp_path_factory.mktemp("handover"))
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PreparedHandover]:
+    yield PreparedHandover(tmp_path_factory.mktemp("handover"))
     forget_vaults()
 
 
@@ -65,12 +65,12 @@ def killed_before(step: int, act: object, station: Station, bundle: Path) -> boo
 
     def at(count: int) -> None:
         if count == step:
-            raise Killed
+            raise KilledError
 
     try:
         with counted(at):
             act(station, bundle)  # type: ignore[operator]
-    except Killed:
+    except KilledError:
         return True
     return False
 
@@ -101,7 +101,7 @@ def carry_on(north: Path, south: Path, bundle: Path, boards: list[Board]) -> Non
     receiver.close()
 
 
-def test_an_export_cut_at_every_write(prepared: Prepared) -> None:
+def test_an_export_cut_at_every_write(prepared: PreparedHandover) -> None:
     step, came = 0, True
     while came:
         step += 1
@@ -114,7 +114,7 @@ def test_an_export_cut_at_every_write(prepared: Prepared) -> None:
     assert step > 10
 
 
-def test_an_import_cut_at_every_write(prepared: Prepared) -> None:
+def test_an_import_cut_at_every_write(prepared: PreparedHandover) -> None:
     step, came = 0, True
     while came:
         step += 1
@@ -141,7 +141,7 @@ def kill(home: Path, act: str, step: int, bundle: Path) -> int:
 
 
 @pytest.mark.parametrize("step", [1, 6, 9, 10, 11, 12])
-def test_an_export_killed_by_the_system(prepared: Prepared, step: int) -> None:
+def test_an_export_killed_by_the_system(prepared: PreparedHandover, step: int) -> None:
     north, south, bundle = prepared.fresh()
     assert kill(north, "export", step, bundle) in (-signal.SIGKILL, 0)
     station = open_station(north)
@@ -151,7 +151,7 @@ def test_an_export_killed_by_the_system(prepared: Prepared, step: int) -> None:
 
 
 @pytest.mark.parametrize("step", [1, 8, 12, 15])
-def test_an_import_killed_by_the_system(prepared: Prepared, step: int) -> None:
+def test_an_import_killed_by_the_system(prepared: PreparedHandover, step: int) -> None:
     _, south, _ = prepared.fresh()
     bundle = prepared.folder / "whole.jwe"
     assert kill(south, "import", step, bundle) == -signal.SIGKILL

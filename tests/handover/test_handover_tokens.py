@@ -39,11 +39,11 @@ def test_copy_move_receipt_and_revocation_with_keys_in_tokens(uris: dict[str, st
     north, south = stations["north"], stations["south"]
     trust(north, south)
     trust(south, north)
-    one, other, lost = boards(3)
-    for board in (one, other, lost):
+    first, other, lost = boards(3)
+    for board in (first, other, lost):
         key_up(north, board)
     revoke(north, lost.uuid, "lost")
-    for mode, board in (("copy", one), ("move", other)):
+    for mode, board in (("copy", first), ("move", other)):
         bundle = tmp_path / f"{mode}.jwe"
         order = ExportOrder(("south",), (board.uuid,), mode)  # type: ignore[arg-type]
         export_bundle(north, plan_export(north, order), bundle)
@@ -52,12 +52,12 @@ def test_copy_move_receipt_and_revocation_with_keys_in_tokens(uris: dict[str, st
         taken = import_bundle(south, plan)
         assert session(south, board) == (2 if mode == "move" else 1)
         assert close(north, taken.receipt).fresh
-    assert session(north, one) == 1
+    assert session(north, first) == 1
     assert held(north, other) == []
     # north's ban travels with the bundles, and counts nowhere but over nodes that north gave (issue 7, L2)
     assert [entry.why for entry in north.policy.revocations()] == ["lost"]
     assert south.policy.revocations() == []
-    assert provisioned(south, one).verified.verdict == "authentic"
+    assert provisioned(south, first).verified.verdict == "authentic"
     for station in stations.values():
         station.close()
 

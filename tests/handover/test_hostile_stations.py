@@ -312,8 +312,8 @@ def test_one_receiver_does_not_close_a_copy_for_two(pair: Pair, west: Station) -
     first = pair.take(path)
     key, stations = pair.south.vault.identity(), {pair.south.fingerprint: pair.south.point}
     assert close(pair.north, first.receipt).row.state == "open"
-    said = open_receipt(first.receipt, stations.get)
-    again = seal_receipt(replace(said, created=said.created + timedelta(hours=1)), key)
+    receipt = open_receipt(first.receipt, stations.get)
+    again = seal_receipt(replace(receipt, created=receipt.created + timedelta(hours=1)), key)
     assert again != first.receipt
     done = close(pair.north, again)
     assert (done.row.state, done.fresh) == ("open", False)
@@ -332,11 +332,13 @@ def test_a_ban_counts_only_from_a_station_with_authority_and_for_the_key_it_name
     trust(west, pair.south)
     now, key = datetime.now(UTC), west.vault.identity()
     pinned = pair.south.pins.pinned(own.uuid)
-    said = (
+    statements = (
         seal_revocation(key, uuid=own.uuid, node=pinned, why="no authority", created=now),
         seal_revocation(key, uuid=bytes(10), node="ab" * 32, why="unknown node", created=now),
     )
-    plan = plan_import(pair.south, forged(west, pair.south, revoked=tuple(revocation.statement for revocation in said)))
+    plan = plan_import(
+        pair.south, forged(west, pair.south, revoked=tuple(revocation.statement for revocation in statements))
+    )
     assert isinstance(plan, ImportPlan)
     assert plan.denied == ()
     assert ["no authority" in why or "is unknown here" in why for _, why in plan.passed_over] == [True, True]
@@ -357,14 +359,14 @@ def test_a_ban_counts_only_from_a_station_with_authority_and_for_the_key_it_name
 def test_a_ban_can_be_lifted_and_the_same_statement_does_not_come_back(pair: Pair) -> None:
     pair.take(pair.export("copy")[0])
     now = datetime.now(UTC)
-    said = seal_revocation(pair.north.vault.identity(), uuid=pair.board.uuid, node=None, why="lost", created=now)
-    taken(pair.south, forged(pair.north, pair.south, revoked=(said.statement,)))
+    statement = seal_revocation(pair.north.vault.identity(), uuid=pair.board.uuid, node=None, why="lost", created=now)
+    taken(pair.south, forged(pair.north, pair.south, revoked=(statement.statement,)))
     with pytest.raises(PolicyError, match="revoked: lost"):
         pair.south.policy.require_whitelisted(pair.board.uuid)
     assert lift(pair.south, pair.board.uuid)
     assert not lift(pair.south, pair.board.uuid)
     pair.south.policy.require_whitelisted(pair.board.uuid)
-    plan = plan_import(pair.south, forged(pair.north, pair.south, revoked=(said.statement,)))
+    plan = plan_import(pair.south, forged(pair.north, pair.south, revoked=(statement.statement,)))
     assert isinstance(plan, ImportPlan)
     assert plan.passed_over[0][1] == "it was lifted here"
     assert [entry.outcome for entry in pair.south.audit_log.entries() if entry.act == "revoke"][-1] == "lifted"

@@ -25,14 +25,14 @@ from tests.handover.desk import Pair, held, node_key_id, provisioned, session, t
 @pytest.mark.parametrize("count", [0, 1, 3, 1001])
 def test_a_handover_is_known_by_the_digest_that_earlier_versions_noted(count: int) -> None:
     nodes = [(number.to_bytes(10, "big"), f"{number:016x}", number) for number in range(count)]
-    said = [
+    parts = [
         "ab" * 32,
         ["cd" * 32, "ef" * 32],
         "copy",
         "04" * 65,
         [[uuid.hex(), key, epoch] for uuid, key, epoch in nodes],
     ]
-    whole = hashlib.sha256(json.dumps(said, separators=(",", ":")).encode()).hexdigest()
+    whole = hashlib.sha256(json.dumps(parts, separators=(",", ":")).encode()).hexdigest()
     assert content_digest("ab" * 32, ["ef" * 32, "cd" * 32], "copy", b"\x04" * 65, nodes) == whole
 
 

@@ -57,7 +57,7 @@ def test_export_and_import_take_less_than_twice_the_memory_of_more_bundle(
 ) -> None:
     north, south = stations
     fill(north, COUNT)
-    took: dict[int, tuple[int, int, int]] = {}
+    seconds: dict[int, tuple[int, int, int]] = {}
     for count in (FEW, COUNT):
         path = tmp_path / f"{count}.jwe"
         nodes = tuple(sorted(uuid_of(number) for number in range(count))) if count == FEW else None
@@ -72,8 +72,8 @@ def test_export_and_import_take_less_than_twice_the_memory_of_more_bundle(
                 import_bundle(south, plan)
 
         export_peak, import_peak = peak_of(export), peak_of(take)
-        took[count] = path.stat().st_size, export_peak, import_peak
-    more, exported, imported = (late - early for early, late in zip(took[FEW], took[COUNT], strict=True))
+        seconds[count] = path.stat().st_size, export_peak, import_peak
+    more, exported, imported = (late - early for early, late in zip(seconds[FEW], seconds[COUNT], strict=True))
     assert exported < 2 * more
     assert imported < 2 * more
     assert not proven_of(south, [uuid_of(number) for number in range(COUNT)])

@@ -72,7 +72,7 @@ def test_a_key_is_found_by_name_fingerprint_or_file(north: Station, keys: Path) 
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("content", "message"),
     [
         (lambda: private(ec.generate_private_key(ec.SECP256R1())).decode(), "private key where a public one"),
         (lambda: public(rsa.generate_private_key(65537, 2048)), "not a P-256 key"),
@@ -82,9 +82,9 @@ def test_a_key_is_found_by_name_fingerprint_or_file(north: Station, keys: Path) 
         (lambda: "", "no public key"),
     ],
 )
-def test_what_is_no_public_p256_key(north: Station, keys: Path, content, says: str) -> None:  # type: ignore[no-untyped-def]
+def test_what_is_no_public_p256_key(north: Station, keys: Path, content, message: str) -> None:  # type: ignore[no-untyped-def]
     (keys / "bad.pem").write_text(content())
-    with pytest.raises(BadDataError, match=says):
+    with pytest.raises(BadDataError, match=message):
         candidate(north, "bad", keys / "bad.pem", "station")
 
 

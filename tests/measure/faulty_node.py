@@ -38,7 +38,7 @@ LATER = 1.5  # seconds of good data before a fault that comes later
 SECOND = 10**9
 
 
-class Faulty(VirtualNode):
+class FaultyNode(VirtualNode):
     """A node whose data frames go through ``bend``, and whose firmware was spoilt by ``spoil``."""
 
     def __init__(self, folder: Path, pulse: RealtimeLoop) -> None:
@@ -63,30 +63,30 @@ def _board(file: FlashFile) -> Board:
 # -- faults of data frames: what leaves, given what should -----------------------------------------------------------
 
 
-def wrong_tag(_node: Faulty, frame: DataFrame, send: Send) -> None:
+def wrong_tag(_node: FaultyNode, frame: DataFrame, send: Send) -> None:
     """Every message is changed in one bit on its way."""
     send(frame._replace(data=frame.data[:8] + bytes([frame.data[8] ^ 1]) + frame.data[9:]))
 
 
-def replayed(_node: Faulty, frame: DataFrame, send: Send) -> None:
+def replayed(_node: FaultyNode, frame: DataFrame, send: Send) -> None:
     """Every message comes twice."""
     send(frame)
     send(frame)
 
 
-def gaps(node: Faulty, frame: DataFrame, send: Send) -> None:
+def gaps(node: FaultyNode, frame: DataFrame, send: Send) -> None:
     """Every fifth message is lost."""
     node.count = getattr(node, "count", 0) + 1
     if node.count % 5:
         send(frame)
 
 
-def held_back(_node: Faulty, frame: DataFrame, send: Send) -> None:
+def held_back(_node: FaultyNode, frame: DataFrame, send: Send) -> None:
     """Every message is a second late."""
     threading.Timer(1.0, send, [frame]).start()
 
 
-def swapped(node: Faulty, frame: DataFrame, send: Send) -> None:
+def swapped(node: FaultyNode, frame: DataFrame, send: Send) -> None:
     """Every second message overtakes the one before."""
     held = node.__dict__.pop("held", None)
     if held is None:
@@ -96,25 +96,25 @@ def swapped(node: Faulty, frame: DataFrame, send: Send) -> None:
     send(held)
 
 
-def junk(_node: Faulty, frame: DataFrame, send: Send) -> None:
+def junk(_node: FaultyNode, frame: DataFrame, send: Send) -> None:
     """Between the messages come frames of random octets, in its own stream and in streams that nobody asked for."""
     for identifier in (frame.identifier, frame.identifier ^ 3 << 11, frame.identifier ^ 5 << 8):
         send(frame._replace(identifier=identifier, data=random.randbytes(random.choice((0, 1, 8, 20, 64)))))
     send(frame)
 
 
-def cut_short(_node: Faulty, frame: DataFrame, send: Send) -> None:
+def cut_short(_node: FaultyNode, frame: DataFrame, send: Send) -> None:
     """Every message lacks its end."""
     send(frame._replace(data=frame.data[:12]))
 
 
-def falls_silent(node: Faulty, frame: DataFrame, send: Send) -> None:
+def falls_silent(node: FaultyNode, frame: DataFrame, send: Send) -> None:
     """Its data stops, its commands are answered."""
     if not node.late:
         send(frame)
 
 
-def forgets(node: Faulty, frame: DataFrame, send: Send) -> None:
+def forgets(node: FaultyNode, frame: DataFrame, send: Send) -> None:
     """It loses its sessions once, as in a restart, and says nothing."""
     send(frame)
     if node.late and not hasattr(node, "forgot"):
@@ -122,7 +122,7 @@ def forgets(node: Faulty, frame: DataFrame, send: Send) -> None:
         threading.Thread(target=lambda: [node.lost(link_name(source)) for source in range(0xF1, 0xF8)]).start()
 
 
-def another_datasheet(node: Faulty, frame: DataFrame, send: Send) -> None:
+def another_datasheet(node: FaultyNode, frame: DataFrame, send: Send) -> None:
     """It loses its sessions, and comes back with a datasheet that nobody signed."""
     send(frame)
     if node.late and not hasattr(node, "forgot"):
@@ -137,29 +137,29 @@ def another_datasheet(node: Faulty, frame: DataFrame, send: Send) -> None:
 # -- faults of the firmware ------------------------------------------------------------------------------------------
 
 
-def too_fast(node: Faulty) -> None:
+def too_fast(node: FaultyNode) -> None:
     """It samples a quarter faster than it was asked to."""
     _at_another_pace(node, 3, 4)
 
 
-def too_slow(node: Faulty) -> None:
+def too_slow(node: FaultyNode) -> None:
     """It samples at half of the rate that it was asked for."""
     _at_another_pace(node, 2, 1)
 
 
-def _at_another_pace(node: Faulty, times: int, over: int) -> None:
+def _at_another_pace(node: FaultyNode, times: int, over: int) -> None:
     """Each period becomes ``times / over`` of what was asked for."""
 
-    class Paced(Stream):
+    class PacedStream(Stream):
         @property
         def next_instant(self) -> int | None:
             due = super().next_instant
             return None if due is None or self.start is None else self.start + (due - self.start) * times // over
 
-    _after_subscribe(node, lambda stream: setattr(stream, "__class__", Paced))
+    _after_subscribe(node, lambda stream: setattr(stream, "__class__", PacedStream))
 
 
-def _after_subscribe(node: Faulty, change: Callable[[Stream], None]) -> None:
+def _after_subscribe(node: FaultyNode, change: Callable[[Stream], None]) -> None:
     real = node.role.subscribe
 
     def subscribe(*words: Any) -> bytes:
@@ -170,48 +170,48 @@ def _after_subscribe(node: Faulty, change: Callable[[Stream], None]) -> None:
     node.role.subscribe = subscribe
 
 
-def _clock(node: Faulty, lie: Callable[[ClockReply], ClockReply]) -> None:
+def _clock(node: FaultyNode, lie: Callable[[ClockReply], ClockReply]) -> None:
     real = node.role.clock
     node.role.clock = lambda *words: lie(ClockReply.decode(real(*words))).encode()
 
 
-def jumping_clock(node: Faulty) -> None:
+def jumping_clock(node: FaultyNode) -> None:
     """Its clock says another time at every question."""
     jumps = itertools.cycle((0, 200_000_000, -150_000_000))
 
-    def lie(told: ClockReply) -> ClockReply:
+    def lie(clock: ClockReply) -> ClockReply:
         jump = next(jumps)
-        return replace(told, received=max(0, told.received + jump), sent=max(0, told.sent + jump))
+        return replace(clock, received=max(0, clock.received + jump), sent=max(0, clock.sent + jump))
 
     _clock(node, lie)
 
 
-def backward_clock(node: Faulty) -> None:
+def backward_clock(node: FaultyNode) -> None:
     """It says that it answered before it was asked."""
-    _clock(node, lambda told: replace(told, received=told.sent, sent=max(0, told.received - 5_000_000)))
+    _clock(node, lambda clock: replace(clock, received=clock.sent, sent=max(0, clock.received - 5_000_000)))
 
 
-def clock_of_tomorrow(node: Faulty) -> None:
+def clock_of_tomorrow(node: FaultyNode) -> None:
     """Its clock is an hour ahead of the ticks of its data."""
-    _clock(node, lambda told: replace(told, received=told.received + 3600 * SECOND, sent=told.sent + 3600 * SECOND))
+    _clock(node, lambda clock: replace(clock, received=clock.received + 3600 * SECOND, sent=clock.sent + 3600 * SECOND))
 
 
-def _subscribed(node: Faulty, lie: Callable[[SubscribeReply], SubscribeReply]) -> None:
+def _subscribed(node: FaultyNode, lie: Callable[[SubscribeReply], SubscribeReply]) -> None:
     real = node.role.subscribe
     node.role.subscribe = lambda *words: lie(SubscribeReply.decode(real(*words))).encode()
 
 
-def wrong_length(node: Faulty) -> None:
+def wrong_length(node: FaultyNode) -> None:
     """It says that its messages have another length than they have to."""
-    _subscribed(node, lambda told: replace(told, length=told.length + 2))
+    _subscribed(node, lambda clock: replace(clock, length=clock.length + 2))
 
 
-def wrong_start(node: Faulty) -> None:
+def wrong_start(node: FaultyNode) -> None:
     """It says that its stream begins in ten seconds."""
-    _subscribed(node, lambda told: replace(told, start=told.start + 10 * SECOND))
+    _subscribed(node, lambda clock: replace(clock, start=clock.start + 10 * SECOND))
 
 
-def refuses_claims(node: Faulty) -> None:
+def refuses_claims(node: FaultyNode) -> None:
     """It says that somebody else has claimed its channels."""
 
     def operate(_inner: Any) -> bytes:
@@ -220,22 +220,22 @@ def refuses_claims(node: Faulty) -> None:
     node.tim._role._commands[EITHER, OPERATE_FUNCTION] = operate  # type: ignore[union-attr]
 
 
-def _reads(node: Faulty, bend: Callable[[RawReading, int], RawReading]) -> None:
+def _reads(node: FaultyNode, bend: Callable[[RawReading, int], RawReading]) -> None:
     real = node.board.read  # type: ignore[union-attr]
     node.board.read = lambda channel, tick: bend(real(channel, tick), tick)  # type: ignore[union-attr,method-assign]
 
 
-def out_of_range(node: Faulty) -> None:
+def out_of_range(node: FaultyNode) -> None:
     """In every second tenth of a second its values are beyond the limits of the datasheet."""
     _reads(node, lambda given, tick: RawReading(b"\xff" * len(given.octets)) if tick // (SECOND // 10) % 2 else given)
 
 
-def not_valid(node: Faulty) -> None:
+def not_valid(node: FaultyNode) -> None:
     """It says of every value that it is not valid."""
     _reads(node, lambda given, _tick: RawReading(given.octets, valid=False))
 
 
-def test_pattern(node: Faulty) -> None:
+def test_pattern(node: FaultyNode) -> None:
     """It sends the test pattern, which nobody asked for."""
 
     def change(stream: Stream) -> None:
@@ -244,7 +244,7 @@ def test_pattern(node: Faulty) -> None:
     _after_subscribe(node, change)
 
 
-def babbles(node: Faulty) -> None:
+def babbles(node: FaultyNode) -> None:
     """Later on its replies are random octets."""
     real = node.request_received
 
@@ -255,7 +255,7 @@ def babbles(node: Faulty) -> None:
     node.request_received = answer  # type: ignore[method-assign]
 
 
-def good(_node: Faulty) -> None:
+def good(_node: FaultyNode) -> None:
     """Nothing is wrong with it."""
 
 
@@ -275,7 +275,7 @@ def main() -> None:
     boards = []
     for word in given:
         fault, _, folder = word.partition("=")
-        node = Faulty(Path(folder), pulse)
+        node = FaultyNode(Path(folder), pulse)
         FAULTS[fault](node) if FAULTS[fault] in SPOILING else None
         server.add(node, measuring=node)
         node.streams_over(_sender(server, node, FAULTS[fault] if FAULTS[fault] in BENDING else None))
@@ -289,7 +289,7 @@ def main() -> None:
     os._exit(0)
 
 
-def _sender(server: CanServer, node: Faulty, bend: Callable[[Faulty, DataFrame, Send], None] | None) -> Send:
+def _sender(server: CanServer, node: FaultyNode, bend: Callable[[FaultyNode, DataFrame, Send], None] | None) -> Send:
     def out(frame: DataFrame) -> None:
         server.send_data(node, frame.identifier, frame.data, fd=frame.fd)
 

@@ -52,7 +52,7 @@ def provisioned(station: Station, folder: Path, type_: str, name: str, uuid: byt
 
 
 @dataclass
-class Placed:
+class HallNode:
     """A node of the hall; ``process`` while it runs."""
 
     hall: Hall
@@ -61,7 +61,7 @@ class Placed:
     process: Running | None = None
     bus: str = ""
 
-    def start(self, *words: object, can: str = "", fault: str = "") -> Placed:
+    def start(self, *words: object, can: str = "", fault: str = "") -> HallNode:
         """Power on: the product's node, or one with a fault."""
         bus = self.bus = can or self.bus or self.hall.can
         if fault:
@@ -95,7 +95,7 @@ class Hall:
 
     folder: Path
     types: dict[str, str] = field(default_factory=lambda: {"a": ANGLE, "g": "gripper"})
-    nodes: dict[str, Placed] = field(default_factory=dict, init=False)
+    nodes: dict[str, HallNode] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         prepared = self.folder / "stations"
@@ -106,7 +106,7 @@ class Hall:
         try:
             for name, type_ in self.types.items():
                 uuid = provisioned(with_keys, self.folder / name, type_, name, self.desk.new_uuid())
-                self.nodes[name] = Placed(self, self.folder / name, uuid)
+                self.nodes[name] = HallNode(self, self.folder / name, uuid)
         finally:
             with_keys.close()
         self.station: Commands = self.desk.station()
@@ -145,8 +145,8 @@ class Hall:
 
     def address(self, name: str) -> int:
         """Where a node is on the bus now: a stranger may have moved it."""
-        told = self.ask("identify", "--via", "can")
-        return int(next(node["can_address"] for node in told["nodes"] if node["uuid"] == self.nodes[name].uuid))
+        reply = self.ask("identify", "--via", "can")
+        return int(next(node["can_address"] for node in reply["nodes"] if node["uuid"] == self.nodes[name].uuid))
 
     def ask(self, *words: object, code: int = 0) -> Any:
         """Another command on the bus, to its end."""

@@ -106,8 +106,8 @@ class Journal:
             if found or (lines and lines[-1]["safe"] and time.monotonic() > end - SHOWN):
                 break
             assert time.monotonic() < end, (f"not in its safe state since {since}", lines[-5:])
-        took = time_of(found[0]) - since if found else 0.0
-        assert took <= self.dead_man + BUSY, f"in its safe state after {took:.3f} s"
+        seconds = time_of(found[0]) - since if found else 0.0
+        assert seconds <= self.dead_man + BUSY, f"in its safe state after {seconds:.3f} s"
 
     def forgets_while_it_hangs(self, publisher: subprocess.Popen[bytes]) -> float:
         """The publisher dies while the node hangs; what it sent meanwhile moves nothing. When the node woke (unix)."""

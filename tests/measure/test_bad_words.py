@@ -48,9 +48,9 @@ def test_what_is_wrong_is_said_and_what_to_do(hall: Hall, tmp_path: Path) -> Non
     wrong = []
     for words, code, text in cases:
         outcome = hall.station.start("--json", *words, "--can", hall.can).end()
-        said = json.dumps(events(outcome.out)[-1:], ensure_ascii=False)
-        if outcome.code != code or text not in said or "Traceback" in outcome.err:
-            wrong.append((words, outcome.code, said))
+        last_event = json.dumps(events(outcome.out)[-1:], ensure_ascii=False)
+        if outcome.code != code or text not in last_event or "Traceback" in outcome.err:
+            wrong.append((words, outcome.code, last_event))
     assert wrong == []
 
 
@@ -70,19 +70,19 @@ def test_a_command_without_a_link_takes_no_address_of_the_service_that_met_the_n
     "words", [("measure", "recover"), ("measure", "recover", "."), ("measure", "recover", "none.mcap")]
 )
 def test_recover_names_what_it_is(hall: Hall, words: tuple[str, ...]) -> None:
-    code, told = {2: (2, "Name exactly one recording"), 3: (3, "none.mcap")}[2 if len(words) == 2 else 3]
-    told = "is a folder" if words[-1] == "." else told
+    code, message = {2: (2, "Name exactly one recording"), 3: (3, "none.mcap")}[2 if len(words) == 2 else 3]
+    message = "is a folder" if words[-1] == "." else message
     outcome = hall.station.start("--json", *words).end()
     assert outcome.code == code
-    assert told in outcome.out
+    assert message in outcome.out
 
 
 def test_a_broker_that_is_not_there_is_told_and_what_it_cost(hall: Hall) -> None:
     place = f"mqtt://127.0.0.1:{free_tcp_port()}"
     lines = hall.measure(hall.nodes["g"].uuid, "--rate", 10, "--duration", 5, "--mqtt", place, code=5)
-    told = next(line for line in lines if line["event"] == "sink")
-    assert (told["state"], told["sink"]) == ("waiting", place)
-    assert "nothing is listening at 127.0.0.1" in told["why"]
+    event = next(line for line in lines if line["event"] == "sink")
+    assert (event["state"], event["sink"]) == ("waiting", place)
+    assert "nothing is listening at 127.0.0.1" in event["why"]
     assert lines[-1]["error"]["code"] == "link"
     assert "accepted nothing: nothing is listening at 127.0.0.1" in lines[-1]["error"]["message"]
     [sink] = lines[-1]["sinks"]

@@ -52,8 +52,8 @@ def test_a_calibration_is_captured_fitted_and_written(hall: Hall, angle: Shaft, 
             "unit": "rad",
         }
     assert [point["value"] for point in done["points"]] == [5, 164, 356.5]  # type: ignore[attr-defined]
-    told = hall.station.ask("calibrate", "fit", file)
-    assert (told["method"], told["rms"]) == ("table", pytest.approx(0, abs=1e-4))
+    reply = hall.station.ask("calibrate", "fit", file)
+    assert (reply["method"], reply["rms"]) == ("table", pytest.approx(0, abs=1e-4))
     assert hall.station.ask("calibrate", "fit", file, "--profile", ANGLE)["channels"][0]["left_out"]["maximum"] < 1
     words = ("provision", "--calibration", file, "--profile", ANGLE, "--name", "angle", "--yes", "--via", "can")
     assert hall.ask(*words)["verdict"] == "authentic"
@@ -65,7 +65,7 @@ def test_a_restless_sensor_and_one_at_the_wrap_of_its_raw_values_give_no_point(
     hall: Hall, angle: Shaft, tmp_path: Path
 ) -> None:
     file = tmp_path / "joint.csv"
-    for far, said in ((5, "wrap of its raw values"), (4000, "not steady")):
+    for far, message in ((5, "wrap of its raw values"), (4000, "not steady")):
         about = 0 if far == 5 else 20_000
         running = hall.station.start(
             *("--json", "calibrate", "capture", "angle", 1, "--reference", 0, "--to", file, "--can", hall.can)
@@ -79,7 +79,7 @@ def test_a_restless_sensor_and_one_at_the_wrap_of_its_raw_values_give_no_point(
                     break
         refused = running.end()
         assert refused.code == 6
-        assert said in refused.json["error"]["message"]
+        assert message in refused.json["error"]["message"]
     assert not file.exists()
 
 

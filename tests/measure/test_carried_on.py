@@ -211,8 +211,8 @@ def test_another_machine_under_our_source_address_is_heard_and_named(hall: Hall)
         assert refused["code"] == "address-conflict"
         assert "source=0xF2" in refused["hint"]
         first.signal(signal.SIGTERM)
-        told = ran(events(first.end().out))
-        return told if told != ["running", "ended"] else None
+        outcome = ran(events(first.end().out))
+        return outcome if outcome != ["running", "ended"] else None
 
     succeeds(3, disturbed)
 
@@ -312,8 +312,8 @@ def test_a_node_whose_key_is_rotated_in_the_middle_is_measured_on(hall: Hall) ->
     assert hall.station.ask("agree", g, "--rotate", "--via", "can", "--can", other)["epoch"] == 2
     until(lambda: (first.read(0.1), first.out.count('"state":"running"') >= 2)[1])
     first.signal(signal.SIGTERM)
-    told = ran(events(first.end().out))
-    assert (told[:3], told[-1]) == (["running", "lost", "running"], "ended")
+    outcome = ran(events(first.end().out))
+    assert (outcome[:3], outcome[-1]) == (["running", "lost", "running"], "ended")
 
 
 def test_a_node_that_is_revoked_in_the_middle_is_measured_no_more(hall: Hall) -> None:

@@ -140,8 +140,8 @@ def test_of_an_exchange_the_link_knows_when_it_left_and_came() -> None:
         exchange_clock(node, clock)  # type: ignore[arg-type]  # what it asks of a conversation
         return clock.exchanges[0]
 
-    told = ask(Link(), 77.000001, 77.000102)
-    assert (told.asked, told.answered) == (77_000_001_000, 77_000_102_000)
+    exchange = ask(Link(), 77.000001, 77.000102)
+    assert (exchange.asked, exchange.answered) == (77_000_001_000, 77_000_102_000)
     for link in (Link(), object()):
         before = time.monotonic_ns()
         own = ask(link, 77.0, 0.0)
@@ -190,20 +190,20 @@ def test_a_lie_moves_no_stamp() -> None:
 def test_a_clock_that_only_ever_lied_is_stamped_by_when_it_said_so() -> None:
     """Nothing was known of it, and its samples were stamped with the time at which the node had started."""
     node, clock = Node(0), ClockMap()
-    one = node.exchange(BOOT + SECOND)
-    clock.exchange(replace(one, sent=one.received - 1))
+    exchange = node.exchange(BOOT + SECOND)
+    clock.exchange(replace(exchange, sent=exchange.received - 1))
     assert "before it received" in clock.lie
     assert not clock.known
-    assert abs(clock.host_of(one.received) - (BOOT + SECOND) / 1e9) < 1
+    assert abs(clock.host_of(exchange.received) - (BOOT + SECOND) / 1e9) < 1
     clock = ClockMap()
-    clock.exchange(replace(one, received=2**64 - 2, sent=2**64 - 1))
+    clock.exchange(replace(exchange, received=2**64 - 2, sent=2**64 - 1))
     assert "centuries" in clock.lie
 
 
 def test_a_delayed_reply_widens_the_bound_and_moves_nothing_beyond_it() -> None:
     node, clock = Node(0), ClockMap()
-    one = node.exchange(BOOT + SECOND)
-    clock.exchange(replace(one, answered=one.answered + SECOND))
+    exchange = node.exchange(BOOT + SECOND)
+    clock.exchange(replace(exchange, answered=exchange.answered + SECOND))
     tick = node.tick(BOOT + SECOND)
     error = abs(float(clock.host(np.array([tick], dtype=np.uint64))[0]) - (BOOT + SECOND) / 1e9)
     assert 0.4 < clock.line(tick, tick)[2] < 0.6
@@ -212,12 +212,18 @@ def test_a_delayed_reply_widens_the_bound_and_moves_nothing_beyond_it() -> None:
 
 def test_a_reply_cannot_have_taken_longer_than_the_exchange() -> None:
     """operation.md section 5: sent - received > d - a lies; its own drift and the steps of its clock are borne."""
-    asked, took, step, drift = BOOT + SECOND, 10_000_000, 1_000, 100
-    most = round(took * (1 + drift / 1e6)) + 2 * step
-    for inside, lies in ((took, False), (most, False), (most + 10, True), (took * 3 // 2, True), (2 * took, True)):
+    asked, seconds, step, drift = BOOT + SECOND, 10_000_000, 1_000, 100
+    most = round(seconds * (1 + drift / 1e6)) + 2 * step
+    for inside, lies in (
+        (seconds, False),
+        (most, False),
+        (most + 10, True),
+        (seconds * 3 // 2, True),
+        (2 * seconds, True),
+    ):
         clock = ClockMap()
-        one = Exchange(asked, asked + took, SECOND, SECOND + inside, step, drift)
-        assert clock.exchange(one) is not lies, inside
+        exchange = Exchange(asked, asked + seconds, SECOND, SECOND + inside, step, drift)
+        assert clock.exchange(exchange) is not lies, inside
         assert ("took longer" in clock.lie) is lies
 
 

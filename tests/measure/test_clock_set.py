@@ -112,9 +112,9 @@ def test_a_clock_that_was_wrong_at_the_start_is_followed_when_it_is_set(
         assert all(str(part) in events(outcome.out)[-1]["files"] for part in parts)
         assert [len(notes(part)) for part in parts] == [1, 2, 1], file
         for part, offset in zip(parts, (-HOUR, 0.0, -10.0), strict=True):
-            told = stamps(part)
-            assert told == sorted(told)
-            assert began + offset - 1 < told[0] <= told[-1] < time.time() + offset + 1, part
+            times = stamps(part)
+            assert times == sorted(times)
+            assert began + offset - 1 < times[0] <= times[-1] < time.time() + offset + 1, part
         joined = [instant - offset for part, offset in zip(parts, (-HOUR, 0.0, -10.0), strict=True)
                   for instant in stamps(part)]  # fmt: skip
         assert np.diff(joined).max() < 0.5, "nothing is lost between the parts"

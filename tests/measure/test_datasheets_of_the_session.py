@@ -104,8 +104,8 @@ def test_raw_values_of_an_unsigned_datasheet_come_only_where_asked_for_and_are_m
     rows = list(csv.DictReader(line for line in text if not line.startswith("#")))
     assert {row["note"] for row in rows} == {"unsigned datasheet"}
     assert any('"unsigned": true' in line for line in text if line.startswith("# channel"))
-    told = [json.loads(line) for line in file.with_suffix(".jsonl").read_text().splitlines()]
-    assert all(line["unsigned"] for line in told if line["event"] in ("channel", "data"))
+    written_events = [json.loads(line) for line in file.with_suffix(".jsonl").read_text().splitlines()]
+    assert all(line["unsigned"] for line in written_events if line["event"] in ("channel", "data"))
     with file.with_suffix(".mcap").open("rb") as recording:
         found = make_reader(recording)
         streams = [channel for channel in found.get_summary().channels.values() if "/stream_" in channel.topic]

@@ -78,15 +78,15 @@ def test_measure_goes_on_when_there_is_room_again(hall: Hall, tmp_path: Path) ->
     until(lambda: all((folder / f"run.{suffix}").stat().st_size > 4000 for suffix in SUFFIXES))
     fill(folder)
 
-    def told(state: str) -> set[str]:
+    def sink_states(state: str) -> set[str]:
         running.read(0.1)
         lines = [line for line in events(running.out) if line["event"] == "sink" and line["state"] == state]
         return {Path(line["sink"]).suffix[1:] for line in lines if "disk" in line["why"]}
 
-    until(lambda: told("waiting") == set(SUFFIXES), "not all three say that the disk is full")
+    until(lambda: sink_states("waiting") == set(SUFFIXES), "not all three say that the disk is full")
     wait_for_data(running, 200)
     (folder / "ballast").unlink()
-    until(lambda: told("running") == set(SUFFIXES), "not all three go on")
+    until(lambda: sink_states("running") == set(SUFFIXES), "not all three go on")
     wait_for_data(running, 200)
     kept = tmp_path / "kept"
     until(lambda: all((folder / f"run.2.{suffix}").stat().st_size > 4000 for suffix in SUFFIXES))

@@ -53,8 +53,8 @@ def test_what_is_not_valid_is_counted_in_every_summary_and_says_why(
     try:
         hall.nodes["a"].start("--source", "ramp:1")
         run, lines = tmp_path / "run.csv", tmp_path / "run.jsonl"
-        told = hall.measure("a", "--rate", 100, "--duration", 2, "--to", run, "--to", lines)
-        (stream,) = told[-1]["nodes"][0]["streams"]
+        summary = hall.measure("a", "--rate", 100, "--duration", 2, "--to", run, "--to", lines)
+        (stream,) = summary[-1]["nodes"][0]["streams"]
         limit = "above its high limit, 180 °"
         assert stream["invalid_why"] == [{"channel": 1, "why": limit, "count": stream["invalid"]}]
         assert stream["invalid"] == sum(text == "" for text in values_of(run)) > 10

@@ -119,10 +119,10 @@ def test_every_row_is_the_definition(sizes: list[tuple[int, bool]], looks: list[
     got: list[tuple[float, float, float]] = []
     index = 0
     for turn, (size, good) in enumerate(sizes):
-        one = block([[index + k] for k in range(size)], valid=[[good]] * size, index=index)
-        samples += zip(one.time.tolist(), one.value[:, 0].tolist(), strict=True)
+        narrow = block([[index + k] for k in range(size)], valid=[[good]] * size, index=index)
+        samples += zip(narrow.time.tolist(), narrow.value[:, 0].tolist(), strict=True)
         index += size + (3 if turn % 3 == 2 else 0)
-        grid.add_block(one)
+        grid.add_block(narrow)
         found = grid.rows(samples[-1][0] + looks[turn % len(looks)])
         if found is not None:
             got += zip(found.time.tolist(), found.value[:, 0].tolist(), found.age[:, 0].tolist(), strict=True)

@@ -178,7 +178,7 @@ def test_a_period_of_the_block_is_one_of_the_nodes_clock_mapped() -> None:
         assert block.time == pytest.approx(WALL.unix(scene.clock.host(block.tick)), abs=1e-6)
 
 
-class Silent:
+class SilentBus:
     """A bus, for the test, on which nothing comes but the frames that it hands over."""
 
     place, lost = "can:x", 0
@@ -205,7 +205,7 @@ class Silent:
 
 def test_what_comes_before_its_stream_is_registered_is_no_loss() -> None:
     """On a busy machine the first message comes before the reply to Subscribe is looked at."""
-    scene, port = Scene(ago=-60, fd=False), Silent()
+    scene, port = Scene(ago=-60, fd=False), SilentBus()
     with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
         frames = frames_of(scene, 3)
         old = replace(frames[0], at=time.monotonic() - 1.0)  # of a stream of the session before
@@ -236,7 +236,7 @@ class Meanwhile(dict[tuple[int, int], Any]):
 @pytest.mark.parametrize("table", ["_streams", "_early"])
 def test_what_comes_while_its_stream_is_registered_is_no_loss(table: str) -> None:
     """It was looked for among the streams before that was one, and among those to come when it was none any more."""
-    scene, port = Scene(ago=-60, fd=False), Silent()
+    scene, port = Scene(ago=-60, fd=False), SilentBus()
     with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
         scene.heard.pieces = hearing.expect(0x21, 0, scene.plan.length)
 
@@ -259,7 +259,7 @@ def frames_of(scene: Scene, messages: int) -> list[Frame]:
     ]
 
 
-class Held(Silent):
+class Held(SilentBus):
     """A bus whose hearing thread has no processor until ``free``."""
 
     def __init__(self) -> None:
@@ -288,7 +288,7 @@ def test_what_came_before_the_end_is_no_loss_however_late_it_is_looked_at() -> N
 
 
 def test_a_message_that_never_came_is_waited_for_no_longer_than_it_may_take() -> None:
-    scene, port = Scene(ago=-60, fd=False), Silent()
+    scene, port = Scene(ago=-60, fd=False), SilentBus()
     with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
         hearing.register(0x21, 0, scene.heard)
         best_of(3, 2 * HEARD_OUT, lambda: timed(lambda: hearing.hear_out(scene.heard, 1)))
@@ -342,7 +342,7 @@ def test_a_message_of_before_its_stream_was_asked_for_is_not_kept_for_it() -> No
 
 
 def test_a_stream_that_is_forgotten_is_taken_no_more_by_its_link() -> None:
-    scene, port = Scene(ago=-60, fd=False), Silent()
+    scene, port = Scene(ago=-60, fd=False), SilentBus()
     with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
         scene.heard.pieces = hearing.expect(0x21, 0, scene.plan.length)
         hearing.register(0x21, 0, scene.heard)

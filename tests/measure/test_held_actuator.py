@@ -83,12 +83,12 @@ def test_a_value_is_abandoned_at_the_end_of_the_dead_man(clock: Clock) -> None:
     assert actuator.require_confirmation() is True
 
 
-@pytest.mark.parametrize(("took", "in_time"), [(0.4, True), (0.41, False)])
+@pytest.mark.parametrize(("seconds", "in_time"), [(0.4, True), (0.41, False)])
 def test_a_value_that_took_longer_than_the_dead_man_moved_nothing_that_is_left(
-    clock: Clock, took: float, in_time: bool
+    clock: Clock, seconds: float, in_time: bool
 ) -> None:
     def slowly() -> None:
-        clock.now += took
+        clock.now += seconds
 
     clock.now = 0.0
     actuator, _ = held(writes=slowly)

@@ -41,7 +41,7 @@ class Control:
 
     def cycle(self, position: float) -> None:
         fields = {"name": ["g"], "position": [position]}
-        self.peer.tell(op="say", topic="/bench/joint_commands", type="sensor_msgs/JointState", fields=fields)
+        self.peer.send(op="publish", topic="/bench/joint_commands", type="sensor_msgs/JointState", fields=fields)
         time.sleep(0.05)
 
     @property

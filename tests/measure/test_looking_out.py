@@ -157,14 +157,14 @@ def test_a_node_that_is_lost_is_looked_for_at_once_while_another_one_is_missing_
 ) -> None:
     """The pause had grown with the absence of the other one, to 30 s."""
     sightings, stop = lookout._presence, threading.Event()
-    [*_, one] = sightings.all()
+    [*_, found] = sightings.all()
 
     def lost() -> float:
-        sightings.add_sighting(replace(one, at=time.monotonic()))
+        sightings.add_sighting(replace(found, at=time.monotonic()))
         asked_before, began = asked(hub)[0], time.monotonic()
-        sightings.search_again(one)
+        sightings.search_again(found)
         with suppress(LinkError):
-            sightings.find(one.uuid, seconds=PATIENCE, stop=stop, fresh=time.monotonic())
+            sightings.find(found.uuid, seconds=PATIENCE, stop=stop, fresh=time.monotonic())
         assert asked(hub)[0] > asked_before
         return time.monotonic() - began
 
@@ -206,23 +206,23 @@ def looked_for(lookout: CanDiscovery) -> Iterator[None]:
 
 
 class Bus:
-    """Answers Identify as it is told to: ``says`` by address."""
+    """Answer Identify from ``answers``, by address."""
 
     place = "can:x"
 
-    def __init__(self, **says: Any) -> None:
-        self.says: dict[int, Any] = {int(name[1:]): what for name, what in says.items()}
+    def __init__(self, **answers: Any) -> None:
+        self.answers: dict[int, Any] = {int(name[1:]): what for name, what in answers.items()}
         self.questions: list[tuple[int, float]] = []
 
     def identify(self, address: int, *, seconds: float, until_announced: bool) -> Identity | None:
         assert until_announced == (seconds < 3.0), "the last question is waited for to its end"
         self.questions.append((address, seconds))
-        said = self.says.get(address)
-        if isinstance(said, list):
-            said = said.pop(0)
-        if isinstance(said, Exception):
-            raise said
-        return said  # type: ignore[no-any-return]
+        answer = self.answers.get(address)
+        if isinstance(answer, list):
+            answer = answer.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer  # type: ignore[no-any-return]
 
 
 def last_heard(uuid: bytes, address: int, ago: float) -> Sighting:

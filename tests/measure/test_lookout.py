@@ -86,10 +86,10 @@ def test_who_asks_a_look_out_that_has_nothing_to_do_waits_for_one_round_alone() 
     began = time.monotonic()
     lookout.discover()
     lookout.discover()
-    took = time.monotonic() - began
+    seconds = time.monotonic() - began
     lookout.close()
     assert air.rounds == 2
-    assert took < lookout.LONGEST / 2
+    assert seconds < lookout.LONGEST / 2
 
 
 def test_what_turned_out_wrong_goes_behind_another_that_says_the_same() -> None:
@@ -171,13 +171,13 @@ def test_only_what_was_seen_since_counts_for_a_node_that_was_lost() -> None:
 
 
 def test_nothing_is_opened_under_an_address_that_two_nodes_have() -> None:
-    told: list[str] = []
-    sightings = Presence(note=told.append)
+    messages: list[str] = []
+    sightings = Presence(note=messages.append)
     sightings.add_sighting(seen(ONE, 7))
     sightings.conflict("can:x", 7, conflict(7))
     with pytest.raises(AddressConflictError):
         find(sightings, ONE)
-    assert told
+    assert messages
 
 
 def test_an_announce_is_told_to_whom_it_concerns_by_address_or_by_uuid() -> None:

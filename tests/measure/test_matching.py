@@ -13,10 +13,10 @@ from teds_provision.measure.sinks.names import Topics
 
 
 def test_an_expression_is_terms_that_must_all_hold() -> None:
-    one = NodeMatch.parse("type:angle-sensor, name:arm-*,group:left,right, angle >= 360 deg, rate >= 1 kHz")
-    assert (one.types, one.names, one.groups) == (("angle-sensor",), ("arm-*",), ("left", "right"))
-    assert one.fits is not None
-    assert [term.text for term in one.fits.terms] == ["angle >= 360 deg", "rate >= 1 kHz"]
+    match = NodeMatch.parse("type:angle-sensor, name:arm-*,group:left,right, angle >= 360 deg, rate >= 1 kHz")
+    assert (match.types, match.names, match.groups) == (("angle-sensor",), ("arm-*",), ("left", "right"))
+    assert match.fits is not None
+    assert [term.text for term in match.fits.terms] == ["angle >= 360 deg", "rate >= 1 kHz"]
     assert NodeMatch.parse("all") == NodeMatch("all")
 
 

@@ -290,9 +290,9 @@ def test_mode_tells_who_claims_what(bench: Bench) -> None:
     running = bench.station.start("--json", "measure", bench.gripper.uuid, "--rate", 20, *bench.can)
     running.wait_for('"event":"data"')
     other = [word + "&source=0xF2" if "udp_multicast" in word else word for word in bench.can]
-    told = bench.station.ask("mode", bench.gripper.uuid, *other)
-    assert told["mode"] == "measurement"
-    by_channel = {channel["channel"]: channel for channel in told["channels"]}
+    reply = bench.station.ask("mode", bench.gripper.uuid, *other)
+    assert reply["mode"] == "measurement"
+    by_channel = {channel["channel"]: channel for channel in reply["channels"]}
     assert "claimed by other" in by_channel[2]["state"]
     assert by_channel[2]["claimant"] == 0xF1
     running.signal(signal.SIGTERM)
@@ -340,10 +340,10 @@ def test_what_a_task_requires_is_judged_before_anything_is_measured(bench: Bench
     file = tmp_path / "task.toml"
     file.write_text('[angle]\nrange = ">= 720 deg"\n')
     lines = bench.measure(bench.angle.uuid, "--duration", 1, "--require", file, code=6)
-    told = lines[-1]
-    assert told["fits"][0]["uuid"] == bench.angle.uuid
-    assert "360" in told["fits"][0]["why"]
-    assert told["error"]["code"] == "refused"
+    refusal = lines[-1]
+    assert refusal["fits"][0]["uuid"] == bench.angle.uuid
+    assert "360" in refusal["fits"][0]["why"]
+    assert refusal["error"]["code"] == "refused"
     assert not data(lines)
 
 

@@ -26,8 +26,8 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
 
 
 def topics(hall: Hall) -> dict[tuple[str, int], str]:
-    told = hall.station.ask("names", "list")
-    return {(name["uuid"], name["channel"]): name["topic"] for name in told["names"]}
+    reply = hall.station.ask("names", "list")
+    return {(name["uuid"], name["channel"]): name["topic"] for name in reply["names"]}
 
 
 def test_topics_are_listed_chosen_and_made_again(hall: Hall) -> None:
@@ -45,8 +45,8 @@ def test_topics_are_listed_chosen_and_made_again(hall: Hall) -> None:
     hall.station.ask("names", "set", g, "grip force", "hand/force")
     assert topics(hall)[g, 3] == "/hand/force"
     hall.station.ask("names", "reset", g, "Grip Force")
-    said = hall.station.refuses("names", "set", g, "torque", "x", code=3)
-    assert said["hint"].startswith("Channels in its datasheet: 1 (opening set point), 2 (opening)")
+    error = hall.station.refuses("names", "set", g, "torque", "x", code=3)
+    assert error["hint"].startswith("Channels in its datasheet: 1 (opening set point), 2 (opening)")
     assert made.items() <= topics(hall).items()
 
 
@@ -79,21 +79,21 @@ def test_a_channel_is_chosen_by_name_wherever_it_is_by_number(hall: Hall, tmp_pa
     assert driven.out.startswith("Channel 1 (opening set point): 0 m\n")
     driven = hall.station.run("set", "g", "opening", 0.05, "--hold", 0, *bus)  # by what it sets
     assert driven.out.startswith("Channel 1 (opening set point): "), driven
-    said = hall.station.refuses("set", "g", "grip force", 5, "--hold", 0, *bus, code=8)
-    assert "Channel 3 (grip force)" in said["message"]
-    assert said["hint"] == "Its actuators: 1 (opening set point)."
-    said = hall.station.refuses("sample", "g", "openning", *bus, code=8)
-    assert "2 (opening), 3 (grip force)" in said["message"]
-    said = hall.station.refuses("set", "g", "1", 99, "--hold", 0, *bus, code=6)
-    assert "channel 1 (opening set point)" in said["message"]
+    error = hall.station.refuses("set", "g", "grip force", 5, "--hold", 0, *bus, code=8)
+    assert "Channel 3 (grip force)" in error["message"]
+    assert error["hint"] == "Its actuators: 1 (opening set point)."
+    error = hall.station.refuses("sample", "g", "openning", *bus, code=8)
+    assert "2 (opening), 3 (grip force)" in error["message"]
+    error = hall.station.refuses("set", "g", "1", 99, "--hold", 0, *bus, code=6)
+    assert "channel 1 (opening set point)" in error["message"]
     hall.station.refuses("measure", "g", "--channel", "torque", "--duration", 1, *bus, code=8)
     ended = hall.station.run("measure", "g", "--channel", "grip force", "--duration", "0.3", "--to", file, *bus)
     assert ended.code == 0, ended
     shown = hall.station.run("record", "show", file, "--channel", "grip force", "--limit", 3)
     assert shown.out.count("grip force") == 3
-    said = hall.station.run("record", "show", file, "--channel", "opening")
-    assert (said.code, said.out) == (3, "")
-    assert "It has 3 (grip force)." in said.err
+    error = hall.station.run("record", "show", file, "--channel", "opening")
+    assert (error.code, error.out) == (3, "")
+    assert "It has 3 (grip force)." in error.err
     g.kill()
 
 

@@ -100,8 +100,8 @@ def test_a_pulled_adapter_is_told_as_itself_before_anything_is_asked_over_it(hal
     finally:
         adapter.pull()
     running.signal(signal.SIGINT)
-    told = [
+    reasons = [
         event["why"] for event in events(running.end().out) if event["event"] == "status" and event["state"] == "lost"
     ]
-    assert "The CAN bus slcan:" in told[0], told
-    assert not any("No message from the node" in why for why in told), told
+    assert "The CAN bus slcan:" in reasons[0], reasons
+    assert not any("No message from the node" in why for why in reasons), reasons

@@ -39,13 +39,13 @@ def shown_in(hall: Hall, unit: str) -> None:
 def test_a_reading_is_shown_in_the_unit_of_the_profile_and_json_stays_si(hall: Hall) -> None:
     for unit, factor in (("degree", 180 / math.pi), ("mrad", 1000.0)):
         shown_in(hall, unit)
-        (one,) = hall.ask("sample", "a")["samples"]
-        assert one["unit"] == "rad"
-        assert one["shown"]["unit"].startswith({"degree": "°", "mrad": "mrad"}[unit])
-        assert one["shown"]["value"] == pytest.approx(one["value"] * factor)
-        assert one["shown"]["uncertainty"] == pytest.approx(one["uncertainty"] * factor)
-        said = hall.station.run("sample", "a", "--can", hall.can)
-        assert f" {one['shown']['unit']} " in said.out.replace("\n", " "), said.out
+        (sample,) = hall.ask("sample", "a")["samples"]
+        assert sample["unit"] == "rad"
+        assert sample["shown"]["unit"].startswith({"degree": "°", "mrad": "mrad"}[unit])
+        assert sample["shown"]["value"] == pytest.approx(sample["value"] * factor)
+        assert sample["shown"]["uncertainty"] == pytest.approx(sample["uncertainty"] * factor)
+        outcome = hall.station.run("sample", "a", "--can", hall.can)
+        assert f" {sample['shown']['unit']} " in outcome.out.replace("\n", " "), outcome.out
 
 
 def test_a_profile_that_is_gone_or_of_another_dimension_changes_nothing(hall: Hall) -> None:
@@ -57,14 +57,14 @@ def test_a_profile_that_is_gone_or_of_another_dimension_changes_nothing(hall: Ha
 
 def test_limits_are_told_in_the_unit_that_was_given(hall: Hall) -> None:
     for unit, words in (("mm", "0 to 110 mm"), ("m", "0 to 0.11 m"), ("cm", "0 to 11 cm")):
-        said = hall.ask("set", "g", "1", "5000", "--unit", unit, "--hold", "0.1", code=6)
-        assert words in said["error"]["message"]
-        assert f"5000 {unit} exceeds the limits" in said["error"]["message"]
+        reply = hall.ask("set", "g", "1", "5000", "--unit", unit, "--hold", "0.1", code=6)
+        assert words in reply["error"]["message"]
+        assert f"5000 {unit} exceeds the limits" in reply["error"]["message"]
 
 
 def test_a_bare_number_of_a_person_is_refused_where_another_unit_is_shown(hall: Hall) -> None:
     words = ["set", "g", "1", "0.05", "--hold", "0.1", "--can", hall.can]
-    said = on_terminal(hall.station.home, *words, passphrase=hall.station.passphrase)
-    assert (said.code, "--unit mm or --unit m" in " ".join(said.screen.split())) == (2, True), said
+    outcome = on_terminal(hall.station.home, *words, passphrase=hall.station.passphrase)
+    assert (outcome.code, "--unit mm or --unit m" in " ".join(outcome.screen.split())) == (2, True), outcome
     applied = hall.station.run("--json", "set", "g", "1", "0.05", "--hold", "0.1", "--can", hall.can)
     assert applied.code == 0, "a program means SI"

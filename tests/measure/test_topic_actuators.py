@@ -42,13 +42,13 @@ class Node:
 
 class Scene:
     def __init__(self, driven: Answer, dead_man: int = 10_000) -> None:
-        self.node, self.messages, self.told, self.applied = Node(driven), list[bytes](), list[str](), list[Block]()
+        self.node, self.messages, self.warnings, self.applied = Node(driven), list[bytes](), list[str](), list[Block]()
         node: Any = self.node
         self.turn = threading.Lock()
         self.actuators = TopicActuators(
             VerifiedSession(node, SHEET, "00" * 32, "g"), self.messages.append, (1,), dead_man=dead_man,
             clock=clock(10**9),
-            turn=self.turn, mapping=threading.Lock(), echo=self.applied.append, notify=self.told.append,
+            turn=self.turn, mapping=threading.Lock(), echo=self.applied.append, notify=self.warnings.append,
         )  # fmt: skip
 
     def give(self, count: int) -> None:
@@ -75,7 +75,7 @@ def test_fast_set_points_go_as_drive_messages() -> None:
     assert scene.node.asked == 1
     assert len(scene.messages) > WATCHED
     assert {len(message) for message in scene.messages} == {LENGTH}
-    assert not scene.told
+    assert not scene.warnings
 
 
 @pytest.mark.parametrize(
@@ -97,8 +97,8 @@ def test_a_node_that_cannot_be_driven_is_moved_by_command_and_that_is_told_once(
     assert scene.node.asked == 1
     assert scene.messages == []
     assert scene.node.values == len(scene.applied) == 3 * WATCHED
-    assert len(scene.told) == 1
-    assert "no Drive messages" in scene.told[0]
+    assert len(scene.warnings) == 1
+    assert "no Drive messages" in scene.warnings[0]
 
 
 def test_a_claim_that_is_gone_says_nothing_about_drive() -> None:
@@ -108,7 +108,7 @@ def test_a_claim_that_is_gone_says_nothing_about_drive() -> None:
     scene.actuators.close()
     assert scene.node.asked == 2
     assert scene.messages
-    assert not scene.told
+    assert not scene.warnings
 
 
 def test_a_set_point_older_than_the_dead_man_moves_nothing_and_is_told() -> None:
@@ -118,8 +118,8 @@ def test_a_set_point_older_than_the_dead_man_moves_nothing_and_is_told() -> None
         until(lambda: len(scene.applied) + scene.actuators.refused > 0)
         if age > 10:
             assert (scene.node.values, scene.applied, scene.messages, scene.actuators.refused) == (0, [], [], 1)
-            assert "10.5" in scene.told[0]
-            assert "dead-man is 10000 ms" in scene.told[0]
+            assert "10.5" in scene.warnings[0]
+            assert "dead-man is 10000 ms" in scene.warnings[0]
             scene.actuators.refused = 0
     scene.actuators.close()
     assert scene.actuators.refused == 0, "a younger one is applied"
@@ -135,7 +135,7 @@ def test_a_set_point_that_grew_old_while_the_node_was_busy_moves_nothing() -> No
     until(lambda: scene.actuators.refused > 0)
     scene.actuators.close()
     assert (scene.node.values, scene.applied, scene.messages) == (0, [], [])
-    assert "s old" in scene.told[0]
+    assert "s old" in scene.warnings[0]
 
 
 def test_a_set_point_beyond_the_limits_moves_nothing_and_is_told() -> None:
@@ -144,4 +144,4 @@ def test_a_set_point_beyond_the_limits_moves_nothing_and_is_told() -> None:
     until(lambda: scene.actuators.refused > 0)
     scene.actuators.close()
     assert (scene.node.values, scene.applied, scene.messages) == (0, [], [])
-    assert scene.told
+    assert scene.warnings

@@ -15,7 +15,7 @@ from teds_provision.measure.node_supervisor import NodeSupervisor
 from teds_provision.measure.request import Events, MeasurementRequest
 from teds_provision.protocol.messages.frames import Reason
 from tests.e2e.desk import ANGLE
-from tests.measure.hall import Hall, Placed, events, of, ran
+from tests.measure.hall import Hall, HallNode, events, of, ran
 from tests.pace import until
 
 pytestmark = pytest.mark.link
@@ -64,7 +64,7 @@ def test_two_boards_with_one_uuid_at_one_address_are_named_and_end_no_other_meas
     beside = hall.begin(b.uuid, "--rate", 20)
     beside.wait_for('"event":"data"')
     shutil.copytree(a.folder, hall.folder / "twin")
-    twin = Placed(hall, hall.folder / "twin", a.uuid).start()
+    twin = HallNode(hall, hall.folder / "twin", a.uuid).start()
     outcome = hall.begin(a.uuid, "--rate", 10, "--duration", 1, "--timeout", 3).end()
     assert outcome.code in (0, 5), outcome
     if outcome.code:
@@ -91,9 +91,9 @@ def test_a_node_without_room_beside_its_other_measurement_is_refused_at_once_and
         events = Events(none, none, none)
         return NodeSupervisor(none, none, uuid, wanted, none, events, none)
 
-    told = supervisor(bytes(10), request)._is_shared(full)
-    assert told is not None
-    assert "is also being measured by pid 7 (measure all)" in told.message
+    excess = supervisor(bytes(10), request)._is_shared(full)
+    assert excess is not None
+    assert "is also being measured by pid 7 (measure all)" in excess.message
     assert supervisor(bytes(10), request)._is_shared(unlike) is None
     assert supervisor(b"another...", request)._is_shared(full) is None
     assert supervisor(bytes(10), replace(request, patient=True))._is_shared(full) is None, "ncap waits for room"

@@ -15,7 +15,7 @@ from teds_provision.teds.calibration.model import from_decoded
 from teds_provision.teds.codec.decode import decode
 from tests.e2e.desk import ANGLE
 from tests.measure import hall as halls
-from tests.measure.hall import Hall, Placed
+from tests.measure.hall import Hall, HallNode
 from tests.ncap.service import Service, verified
 from tests.pace import until
 
@@ -28,7 +28,7 @@ class Shaft:
     """A sensor that is turned by hand: each line of a file is a reading."""
 
     def __init__(self, hall: Hall, name: str) -> None:
-        self.node: Placed = hall.nodes[name]
+        self.node: HallNode = hall.nodes[name]
         self.file = hall.folder / f"{name}.lines"
         self.file.write_text("")
 
@@ -139,7 +139,7 @@ def test_a_sensor_that_turns_is_refused(hall: Hall, angle: Shaft) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "message"),
     [
         (["angle", 2], 8, "no channel 2"),
         (["angle", 1, "--value", "nan"], 2, "finite"),
@@ -147,9 +147,11 @@ def test_a_sensor_that_turns_is_refused(hall: Hall, angle: Shaft) -> None:
         (["nobody", 1], 3, "nobody"),
     ],
 )
-def test_what_cannot_be_meant_is_refused(hall: Hall, angle: Shaft, words: list[object], code: int, said: str) -> None:
+def test_what_cannot_be_meant_is_refused(
+    hall: Hall, angle: Shaft, words: list[object], code: int, message: str
+) -> None:
     del angle
-    assert said in hall.ask("calibrate", "zero", *words, code=code)["error"]["message"]
+    assert message in hall.ask("calibrate", "zero", *words, code=code)["error"]["message"]
 
 
 def test_limits_are_kept_and_the_guard_is_in_force(hall: Hall) -> None:

@@ -92,7 +92,7 @@ class Link:
         """A station that goes leaves the node as it is: a Confirm may still be on its way."""
 
 
-class _Stepwise:
+class _StepwiseStation:
     """A station whose durable steps wait for their turn."""
 
     def __init__(self, station: Station, pause: Callable[[str], None]) -> None:
@@ -150,7 +150,7 @@ class Agreement:
             with desk.talk(self.station, Link(desk.board, NAMES[self.station], self._before, self._after)) as node:
                 entry = station.pins.entry(node.uuid)
                 assert entry is not None
-                stepwise = cast("Station", _Stepwise(station, self._pause))
+                stepwise = cast("Station", _StepwiseStation(station, self._pause))
                 _agree_anew(stepwise, node, entry, desk.ca, read_block(node, SECURITY))
         except CutError:
             pass
@@ -498,22 +498,22 @@ class Desk:
         there = self._number_of(flash.key), flash.epoch, flash.sequence
         assert there == (state.node, state.epoch, state.sequence), "the node's key, epoch and sequence"
         assert self.pending() == state.ram, "the agreement in the node's RAM"
-        for number, (station, said) in enumerate(zip(self.stations, state.stations, strict=True)):
+        for number, (station, model) in enumerate(zip(self.stations, state.stations, strict=True)):
             keys = station.keys.keys_of(self.board.uuid)
             where = f"station {number}"
-            assert self.held(number) == said.held, f"{where}: the keys that it holds"
+            assert self.held(number) == model.held, f"{where}: the keys that it holds"
             present = next((self.numbers[key.key_id] for key in keys if key.state == "active"), 0)
-            assert present == (said.present if said.present in said.held else 0), f"{where}: its active key"
+            assert present == (model.present if model.present in model.held else 0), f"{where}: its active key"
             tombstone = station.policy.tombstone(self.board.uuid)
             gone = next(
                 (n for n, made in enumerate(self.bundles) if tombstone and made.id == tombstone.handover_id), NONE
             )
-            assert gone == said.tombstone, f"{where}: the move by which it gave the node away"
-            assert (station.keys.rotation_due(self.board.uuid) is not None) == said.due, f"{where}: a rotation is due"
-            assert station.keys.holders(self.board.uuid) or not said.shared, f"{where}: who else has the key"
+            assert gone == model.tombstone, f"{where}: the move by which it gave the node away"
+            assert (station.keys.rotation_due(self.board.uuid) is not None) == model.due, f"{where}: a rotation is due"
+            assert station.keys.holders(self.board.uuid) or not model.shared, f"{where}: who else has the key"
             signed = self.signed[number].sequence if number in self.signed else 0
-            assert signed == said.signed, f"{where}: the sequence of the datasheet that it signed"
-            if number in self.sessions and not said.session:
+            assert signed == model.signed, f"{where}: the sequence of the datasheet that it signed"
+            if number in self.sessions and not model.session:
                 assert not self._session_lives(number), f"{where}: its session has ended"
         if thorough:
             self._try_imports(state)
@@ -521,13 +521,13 @@ class Desk:
 
     def _try_imports(self, state: State) -> None:
         for n, bundle in enumerate(self.bundles):
-            for s, said in enumerate(state.stations):
-                if bundle.octets and said.idle and not self._is_double(bundle):
+            for s, model in enumerate(state.stations):
+                if bundle.octets and model.idle and not self._is_double(bundle):
                     assert self._takes(s, bundle) == ((s, n) in state.takes), f"station {s} takes bundle {n} in"
 
     def _try_sessions(self, state: State) -> None:
-        for s, said in enumerate(state.stations):
-            if said.idle:
+        for s, model in enumerate(state.stations):
+            if model.idle:
                 assert self._opens(s) == (s in state.opens), f"station {s} opens a session"
 
     def _is_double(self, bundle: _Bundle) -> bool:

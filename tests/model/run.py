@@ -42,7 +42,7 @@ COUNTEREXAMPLES: Final = {rule: bounds for rules, bounds in _BOUNDS for rule in 
 """Rules whose violations are steps that a trace names, with the bounds within which SPIN finds them soon."""
 
 
-class Replays:
+class ReplayWorkers:
     """Copies of one desk, in processes of their own."""
 
     def __init__(self, folder: Path, pool: ProcessPoolExecutor) -> None:
@@ -124,7 +124,7 @@ def main(arguments: list[str]) -> int:
     minutes = float(arguments[0]) if arguments else 10.0
     with tempfile.TemporaryDirectory() as place, ProcessPoolExecutor(initializer=lower_costs) as pool:
         folder = Path(place)
-        replays = Replays(folder, pool)
+        replays = ReplayWorkers(folder, pool)
         replays.run_counterexamples()
         print(
             f"{replays.traces} of {len(COUNTEREXAMPLES)} counterexamples:"

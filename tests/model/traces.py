@@ -134,15 +134,15 @@ class Program:
 
     def every(self, depth: int, begin: Iterable[Step] = ()) -> list[Trace]:
         """Return every sequence that leads to another state, or there by another step; up to ``depth`` steps."""
-        said = self._run(["-m10000", "-w18"], depth, begin)
-        states = dict(map(_read, _lines(said)))
+        output = self._run(["-m10000", "-w18"], depth, begin)
+        states = dict(map(_read, _lines(output)))
         inner = {steps[:-1] for steps in states}
         return [_trace(steps, states) for steps in states if steps not in inner]
 
     def follow(self, script: Iterable[Step]) -> Trace:
         """Return what the model makes of a script; a step that it does not permit changes nothing."""
-        said = self._run(["-m10000", "-w18"], 0, script)
-        states = dict(map(_read, _lines(said)))
+        output = self._run(["-m10000", "-w18"], 0, script)
+        states = dict(map(_read, _lines(output)))
         return _trace(max(states, key=len), states)
 
     def counterexample(self) -> tuple[Step, ...]:
@@ -152,9 +152,9 @@ class Program:
                 break
         else:
             return ()
-        said = self._run(["-r", "-S"], depth, ())
+        output = self._run(["-r", "-S"], depth, ())
         steps: list[Step] = []
-        for word, text in re.findall(r"^(DID|AIM) (\S+)$", said, re.MULTILINE):
+        for word, text in re.findall(r"^(DID|AIM) (\S+)$", output, re.MULTILINE):
             if word == "DID":
                 number, station = text.split(".")
                 steps.append(Step(Kind(int(number)), int(station)))
@@ -178,8 +178,8 @@ def _call(command: list[str], folder: Path, environment: dict[str, str] | None =
     return done.stdout
 
 
-def _lines(said: str) -> Iterator[str]:
-    return (line for line in said.splitlines() if line.startswith("STATE "))
+def _lines(message: str) -> Iterator[str]:
+    return (line for line in message.splitlines() if line.startswith("STATE "))
 
 
 _Steps = tuple[Step | None, ...]

@@ -37,13 +37,13 @@ class Mutant:
     text: str
     function: str
     line: int
-    told: str
+    description: str
     words: frozenset[str] = frozenset()
     test: str = ""
     rule: str = ""
 
     def __str__(self) -> str:
-        return f"{self.path}:{self.line} {self.function}: {self.told}"
+        return f"{self.path}:{self.line} {self.function}: {self.description}"
 
     def applied(self, source: str) -> str:
         """The module with the change in it."""
@@ -101,12 +101,19 @@ class Module:
         yield from _functions(self.tree, "")
 
     def mutant(
-        self, node: ast.expr | ast.stmt, text: str, function: str, told: str = "", words: frozenset[str] = frozenset()
+        self,
+        node: ast.expr | ast.stmt,
+        text: str,
+        function: str,
+        description: str = "",
+        words: frozenset[str] = frozenset(),
     ) -> Mutant:
         """A mutant that puts ``text`` in the place of a node; ``words`` are those of its function."""
         start, end = self.span(node)
         was = " ".join(self.source[start:end].split())
-        return Mutant(self.name, start, end, text, function, node.lineno, told or f"{was[:90]}  ->  {text}", words)
+        return Mutant(
+            self.name, start, end, text, function, node.lineno, description or f"{was[:90]}  ->  {text}", words
+        )
 
 
 def _functions(node: ast.AST, of: str) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
@@ -142,10 +149,12 @@ def found(pattern: Pattern, where: list[Module]) -> list[Mutant]:
     """The places of a pattern: an expression, or a statement that is one expression; one, where all is well."""
     parsed = ast.parse(pattern.was, mode="eval")
     kind, wanted = type(parsed.body), ast.unparse(parsed)
-    told = f"{pattern.rule}: {pattern.was}  ->  {pattern.now}"
+    description = f"{pattern.rule}: {pattern.was}  ->  {pattern.now}"
     return [
         replace(
-            module.mutant(node, pattern.now, function, told, _words(module, tree)), test=pattern.test, rule=pattern.rule
+            module.mutant(node, pattern.now, function, description, _words(module, tree)),
+            test=pattern.test,
+            rule=pattern.rule,
         )
         for module in where
         if pattern.function.rpartition(".")[2] in module.source
@@ -160,10 +169,10 @@ def found_in_c(pattern: CPattern) -> list[Mutant]:
     """The places of a pattern in the C library; one, where all is well."""
     path = SOURCES_IN_C / pattern.file
     source, name = path.read_text(), path.relative_to(ROOT).as_posix()
-    told = f"{pattern.rule}: {' '.join(pattern.was.split())[:90]}  ->  {pattern.now}"
+    description = f"{pattern.rule}: {' '.join(pattern.was.split())[:90]}  ->  {pattern.now}"
     return [
         Mutant(
-            name, place.start(), place.end(), pattern.now, "", source.count("\n", 0, place.start()) + 1, told,
+            name, place.start(), place.end(), pattern.now, "", source.count("\n", 0, place.start()) + 1, description,
             test=pattern.test, rule=pattern.rule,
         )
         for place in re.finditer(re.escape(pattern.was), source)

@@ -90,17 +90,17 @@ class Copy:
             start_new_session=True, env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}, text=True,
         )  # fmt: skip
         try:
-            said, _ = running.communicate(timeout=seconds)
+            output, _ = running.communicate(timeout=seconds)
         except subprocess.TimeoutExpired:
             with suppress(ProcessLookupError):
                 os.killpg(running.pid, signal.SIGTERM)
             try:
-                said, _ = running.communicate(timeout=20)
+                output, _ = running.communicate(timeout=20)
             except subprocess.TimeoutExpired:
                 os.killpg(running.pid, signal.SIGKILL)
-                said, _ = running.communicate()
-            return None, said
-        return running.returncode, said
+                output, _ = running.communicate()
+            return None, output
+        return running.returncode, output
 
     def put(self, name: str, source: str) -> None:
         """Write a module, so that no compiled form of another text can pass for it."""
@@ -147,10 +147,10 @@ class Bench:
             while not by and code not in (0, None, 5):
                 without = [word for test in self._bad for word in ("--deselect" if "::" in test else "--ignore", test)]
                 copy.put(mutant.path, mutant.applied(source))
-                code, said = copy.run([*without, *files], max(1.0, last - time.monotonic()))
+                code, output = copy.run([*without, *files], max(1.0, last - time.monotonic()))
                 if code in (0, None, 5):
                     break
-                by = (_FAILED.findall(said) or ["(the run itself)"])[-1]
+                by = (_FAILED.findall(output) or ["(the run itself)"])[-1]
                 copy.put(mutant.path, source)
                 if by.startswith("tests/") and not self._is_good(copy, by):
                     by = ""  # it fails by itself: the others shall say

@@ -14,12 +14,12 @@ import sys
 import seccomp
 
 with open(sys.argv[1], encoding="utf-8") as file:
-    told = json.load(file)
+    filters = json.load(file)
 
 more = seccomp.SyscallFilter(seccomp.ALLOW)
-above = max(told["families"])
+above = max(filters["families"])
 for family in range(above):
-    if family not in told["families"]:
+    if family not in filters["families"]:
         more.add_rule(seccomp.ERRNO(errno.EAFNOSUPPORT), "socket", seccomp.Arg(0, seccomp.EQ, family))
 more.add_rule(seccomp.ERRNO(errno.EAFNOSUPPORT), "socket", seccomp.Arg(0, seccomp.GT, above))
 both = mmap.PROT_WRITE | mmap.PROT_EXEC
@@ -27,8 +27,8 @@ more.add_rule(seccomp.ERRNO(errno.EPERM), "mmap", seccomp.Arg(2, seccomp.MASKED_
 more.add_rule(seccomp.ERRNO(errno.EPERM), "mprotect", seccomp.Arg(2, seccomp.MASKED_EQ, mmap.PROT_EXEC, mmap.PROT_EXEC))
 more.load()  # sets no_new_privs, as NoNewPrivileges does
 
-rules = seccomp.SyscallFilter(seccomp.ERRNO(told["errno"]))
-for name in told["calls"]:
+rules = seccomp.SyscallFilter(seccomp.ERRNO(filters["errno"]))
+for name in filters["calls"]:
     try:
         rules.add_rule(seccomp.ALLOW, name)
     except (RuntimeError, ValueError):  # a call of another processor

@@ -37,7 +37,7 @@ class Answer:
         return str(self.json["error"]["code"])
 
 
-class Described(client.Client):
+class CheckedClient(client.Client):
     """A client whose every answer must be what openapi.json says of it."""
 
     def _ask(
@@ -104,7 +104,7 @@ class Service:
 
     def client(self, token: str | None = None) -> client.Client:
         """By the Unix socket, or with a token by TCP; every answer is held against the API's own description."""
-        made = Described(self.url if token else None, token=token, home=self.station.home, timeout=PATIENCE)
+        made = CheckedClient(self.url if token else None, token=token, home=self.station.home, timeout=PATIENCE)
         self.closing.append(made)
         return made
 
@@ -114,14 +114,14 @@ class Service:
 
     def raw(self, method: str, path: str, headers: dict[str, str | None] | None = None, body: Any = None) -> Answer:
         """One request as it is said here; a header that is None is left out (Host too)."""
-        told: dict[str, str | None] = {"Host": f"127.0.0.1:{self.port}", **(headers or {})}
+        sent_headers: dict[str, str | None] = {"Host": f"127.0.0.1:{self.port}", **(headers or {})}
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE)
         try:
             connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
             octets = body.encode() if isinstance(body, str) else body
-            if octets is not None and "Content-Length" not in told and "Transfer-Encoding" not in told:
-                told["Content-Length"] = str(len(octets))
-            for name, value in told.items():
+            if octets is not None and "Content-Length" not in sent_headers and "Transfer-Encoding" not in sent_headers:
+                sent_headers["Content-Length"] = str(len(octets))
+            for name, value in sent_headers.items():
                 if value is not None:
                     connection.putheader(name, value)
             connection.endheaders()

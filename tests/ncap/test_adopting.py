@@ -149,14 +149,14 @@ def test_unverified_ones_are_measured_calibrated_and_everything_says_so(desk: De
 
         asked.provision(node.uuid, adopt=True)  # by the page: it is signed while it is measured
         until(lambda: verdict(asked.node(node.uuid)) == "authentic")
-        until(lambda: ("adopted", "joined") in told(service, node), "it is not measured on")
+        until(lambda: ("adopted", "joined") in events_of(service, node), "it is not measured on")
         after = until(lambda: flowing(asked.node(node.uuid)))
         assert after["channels"][0]["topic"] == "/bench/joint/angle"
         assert not after["unverified"]
         assert after["problem"] is None
         sizes = lambda: {run["id"]: len(run["nodes"]) for run in asked.measurements()}  # noqa: E731
-        until(lambda: sizes() == {"unverified": 0, "adopted": 1}, lambda: (sizes(), told(service, node)))
-    assert told(service, node) == [("unverified", "joined"), ("unverified", "left"), ("adopted", "joined")]
+        until(lambda: sizes() == {"unverified": 0, "adopted": 1}, lambda: (sizes(), events_of(service, node)))
+    assert events_of(service, node) == [("unverified", "joined"), ("unverified", "left"), ("adopted", "joined")]
     service.end()
     texts = {file.name.split("-")[0]: file.read_text() for file in record.glob("*.csv")}
     lines = [line for line in texts["unverified"].splitlines() if node.uuid in line and not line.startswith("#")]
@@ -171,7 +171,7 @@ def flowing(node: dict[str, Any]) -> dict[str, Any] | None:
     return node if last and last["age"] < 1 and last["value"] is not None else None
 
 
-def told(service: Service, node: Node) -> list[tuple[str, str]]:
+def events_of(service: Service, node: Node) -> list[tuple[str, str]]:
     return [(event["id"], event["state"]) for event in events(service, "measurement", node.uuid)]
 
 

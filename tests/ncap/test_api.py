@@ -121,9 +121,9 @@ def test_things_are_described_for_the_web_of_things_and_read_at_their_forms(
     [thing] = [thing for thing in found if thing["id"] == f"urn:teds:{hand}"]
     [form] = next(iter(thing["properties"].values()))["forms"]
     channel = fetched(urljoin(thing["base"], form["href"]), token)
-    assert channel == next(one for one in asked.node(hand)["channels"] if one["number"] == channel["number"]) | {
-        "last": channel["last"]
-    }
+    assert channel == next(
+        listed for listed in asked.node(hand)["channels"] if listed["number"] == channel["number"]
+    ) | {"last": channel["last"]}
     with pytest.raises(HTTPError) as refusal:
         fetched(f"{url}/.well-known/wot", "")
     assert refusal.value.code == 401
@@ -292,11 +292,11 @@ def test_a_measurement_gives_values_freezes_its_nodes_and_ends(service: Service,
     assert asked.request("GET", f"/nodes/{hand}/teds")["verdict"] == "authentic", "reading goes on meanwhile"
 
     def running() -> Any:
-        [one] = asked.request("GET", "/measurements")["measurements"]
-        return one if (one["state"], one["nodes"][0]["state"]) == ("running", "running") else None
+        [entry] = asked.request("GET", "/measurements")["measurements"]
+        return entry if (entry["state"], entry["nodes"][0]["state"]) == ("running", "running") else None
 
-    one = until(running)
-    assert one["rate"] == 50
+    measurement = until(running)
+    assert measurement["rate"] == 50
     until(lambda: asked.request("GET", "/measurements")["measurements"][0]["nodes"][0]["samples"] > 20)
     past = asked.past(hand, 2)
     assert past["count"][-1] > 0
@@ -309,7 +309,7 @@ def test_a_measurement_gives_values_freezes_its_nodes_and_ends(service: Service,
         refused(asked, 422, "usage", "GET", f"/nodes/{hand}/past?{words}")
     assert asked.request("GET", "/measurements")["measurements"] == []
     file = service.station.home / "recordings" / "run.csv"
-    assert [str(file)] == one["files"]
+    assert [str(file)] == measurement["files"]
     assert len([line for line in file.read_text().splitlines() if not line.startswith("#")]) > 10
     refused(asked, 404, "not-found", "DELETE", "/measurements/nothing")
     asked.request("DELETE", "/groups/robot")
@@ -352,8 +352,8 @@ def test_of_requests_at_once_that_measure_one_node_one_is_taken(service: Service
     with ThreadPoolExecutor(4) as pool:
         for body in ({"uuids": [hand]}, {"group": "pair"}) * 5:
             assert sorted(pool.map(ask, callers, [body] * 4)) == [201, 423, 423, 423]
-            [one] = asked.request("GET", "/measurements")["measurements"]
-            asked.end_measurement(one["id"])
+            [measurement] = asked.request("GET", "/measurements")["measurements"]
+            asked.end_measurement(measurement["id"])
 
 
 def test_an_actuator_moves_within_its_limits_and_is_let_go(asked: Client, hand: str) -> None:
@@ -468,8 +468,8 @@ def test_a_running_measurement_follows_its_group_to_a_spare_and_ends_with_its_la
     moved = service.station.ask("replace", old, spare, "--yes")["moved"]
     assert (moved["groups"], moved["measurements"], moved["ended"]) == (["crane"], [made["id"]], [])
     measured(asked, spare)
-    [one] = asked.request("GET", "/measurements")["measurements"]
-    assert (one["id"], one["uuids"]) == (made["id"], [spare])
+    [measurement] = asked.request("GET", "/measurements")["measurements"]
+    assert (measurement["id"], measurement["uuids"]) == (made["id"], [spare])
     assert asked.node(spare)["groups"] == ["crane"]
 
     nowhere = ("--via", "can", "--can", free_bus(), "--timeout", "1")
@@ -576,8 +576,8 @@ def test_the_command_line_sees_what_the_daemon_did_and_the_daemon_what_it_did(
     service.station.ask("group", "create", "made-beside", hand)
     until(lambda: asked.request("GET", "/groups")["groups"])
     until(lambda: asked.node(hand)["groups"] == ["made-beside"])
-    told = service.station.ask("ncap", "status")
-    assert hand in {node["uuid"] for node in told["nodes"]}
+    reply = service.station.ask("ncap", "status")
+    assert hand in {node["uuid"] for node in reply["nodes"]}
     service.station.ask("group", "delete", "made-beside")
 
 

@@ -189,8 +189,8 @@ def test_without_leave_nobody_listens(hall: Hall, master: Master, publishers: Pu
 def test_a_measurement_without_a_dead_man_has_the_daemons(hall: Hall, master: Master) -> None:  # noqa: F811
     master.start()
     with listening(hall, Ros1(master), "--dead-man", 700, dead_man=None) as service, service.client() as asked:
-        [one] = asked.request("GET", "/measurements")["measurements"]
-        assert (one["actuators"], one["dead_man"]) == (True, 700)
+        [measurement] = asked.request("GET", "/measurements")["measurements"]
+        assert (measurement["actuators"], measurement["dead_man"]) == (True, 700)
         status = asked.request("GET", "/status")
         assert (status["actuators"], status["dead_man"]) == (True, 700)
         service.end()

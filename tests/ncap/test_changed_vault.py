@@ -43,7 +43,7 @@ def measured_in_a_new_session(asked: Client, uuid: str) -> dict[str, Any]:
     return dict(until(running))
 
 
-def told(service: Service, event: str) -> list[dict[str, Any]]:
+def events_of(service: Service, event: str) -> list[dict[str, Any]]:
     """Events of one kind that the daemon has printed."""
     assert service.process is not None
     while service.process.read(0.3):
@@ -72,7 +72,7 @@ def test_a_new_passphrase_and_two_new_master_keys_do_not_lock_a_running_ncap(run
     made = virtual(running, name="other")
     assert call(home, "--json", "sample", made, passphrase=NEW).code in (0, 5), "the key that ncap made opens"
     assert asked.status()["vault"] == {"state": "open", "problem": None}
-    assert not told(running, "vault")
+    assert not events_of(running, "vault")
 
 
 def test_an_ncap_that_is_locked_out_says_so_and_returns_to_work_when_unlocked(running: Service) -> None:
@@ -90,7 +90,7 @@ def test_an_ncap_that_is_locked_out_says_so_and_returns_to_work_when_unlocked(ru
         measured_in_a_new_session(asked, hand)
     finally:
         call(home, "lock")
-    until(lambda: [line["state"] for line in told(running, "vault")] == ["locked", "open"])
+    until(lambda: [line["state"] for line in events_of(running, "vault")] == ["locked", "open"])
 
 
 def test_nodes_of_a_locked_ncap_wait_quietly_and_are_measured_again_when_it_is_unlocked(running: Service) -> None:
@@ -105,12 +105,12 @@ def test_nodes_of_a_locked_ncap_wait_quietly_and_are_measured_again_when_it_is_u
         return all(report["state"] == state and why in report["why"] for report in reports)
 
     until(lambda: in_state("waiting", "changed by another command"))
-    before = len(told(running, "node"))
+    before = len(events_of(running, "node"))
     for _ in range(3):  # each answer of a node is a reason to try it again
         asked.discover()
-        told(running, "node")
+        events_of(running, "node")
     assert in_state("waiting", "changed by another command")
-    assert {line["state"] for line in told(running, "node")[before:]} == {"came"}
+    assert {line["state"] for line in events_of(running, "node")[before:]} == {"came"}
     assert all("changed by another command" in asked.node(uuid)["problem"]["message"] for uuid in nodes)
     assert call(home, "ncap", "status").out.count("authentic (of its last session: the vault is locked)") == 2
     try:
@@ -119,7 +119,7 @@ def test_nodes_of_a_locked_ncap_wait_quietly_and_are_measured_again_when_it_is_u
     finally:
         call(home, "lock")
     assert "its last session" not in call(home, "ncap", "status").out
-    until(lambda: [line["state"] for line in told(running, "vault")] == ["locked", "open"])
+    until(lambda: [line["state"] for line in events_of(running, "vault")] == ["locked", "open"])
 
 
 def test_no_one_without_a_key_of_this_store_changes_the_master_keys(running: Service) -> None:

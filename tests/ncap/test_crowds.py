@@ -25,7 +25,7 @@ from tests.strangers.wire import of_spec
 STRANGERS = range(60, 100)
 
 
-class Silence:
+class NoListeners:
     """Nobody listens."""
 
     def event(self, *_words: Any, **_facts: Any) -> None: ...
@@ -35,7 +35,7 @@ class Silence:
 
 def test_nodes_are_listed_by_name_those_that_are_there_first(prepared: Path, tmp_path: Path) -> None:
     shutil.copytree(prepared / "bench", tmp_path / "bench")
-    silence: Any = Silence()
+    silence: Any = NoListeners()
     names = {"a1" * 10: "arm 10", "b2" * 10: "", "c3" * 10: "arm 2", "d4" * 10: "Arm 1", "e5" * 10: "zebra"}
     with Station.inspect(tmp_path / "bench") as station:
         for uuid, name in names.items():
@@ -48,7 +48,7 @@ def test_nodes_are_listed_by_name_those_that_are_there_first(prepared: Path, tmp
 
 def test_nodes_that_left_and_are_not_known_are_forgotten_but_the_latest() -> None:
     nothing: Any = None
-    silence: Any = Silence()
+    silence: Any = NoListeners()
     roster = NodeDirectory(nothing, silence)
     roster.note("a" * 20, "came", present=True, looked=1.0)
     for number in range(5 * MOST_GONE):
@@ -89,14 +89,14 @@ def test_the_count_of_strangers_is_told_now_and_then(hall: Hall) -> None:
     """Each new UUID was a line of the log: with five a second half a million a day."""
     group, port = of_spec(hall.desk.links.can)
     service = Service(hall.desk, hall.station, ("--detection", "whitelist"))
-    said: list[bytes] = []
-    with Attacker(group, port, always_new(STRANGERS, said)):
+    requests: list[bytes] = []
+    with Attacker(group, port, always_new(STRANGERS, requests)):
         asked = service.start(program=PROGRAM).client()
-        until(lambda: len(said) > 2 * len(STRANGERS) and asked.status()["strangers"])
+        until(lambda: len(requests) > 2 * len(STRANGERS) and asked.status()["strangers"])
     assert service.process is not None
     service.end()
-    told = [line for line in events(service.process.out) if line.get("state") == "strangers"]
-    assert 1 <= len(told) < 10, json.dumps(told)
+    notices = [line for line in events(service.process.out) if line.get("state") == "strangers"]
+    assert 1 <= len(notices) < 10, json.dumps(notices)
 
 
 @pytest.mark.link

@@ -18,7 +18,7 @@ from teds_provision.teds.profile import shipped_profiles
 from tests.bench import PASSPHRASE, make_station
 from tests.e2e.desk import Running
 from tests.handover.desk import trust
-from tests.measure.hall import Hall, Placed, events, provisioned
+from tests.measure.hall import Hall, HallNode, events, provisioned
 from tests.measure.test_actuator_safety import Journal, Ros2, time_of
 from tests.ncap.service import Service, unix, verdict, verified
 from tests.pace import until
@@ -65,7 +65,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
     finally:
         crane.close()
         bench.close()
-    hall.nodes["g"] = Placed(hall, hall.folder / "handed", uuid).start()
+    hall.nodes["g"] = HallNode(hall, hall.folder / "handed", uuid).start()
     hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
     yield hall
     hall.close()
@@ -98,15 +98,15 @@ def left_of(service: Running) -> list[dict[str, Any]]:
 
 
 def require_in_time(decided: float) -> None:
-    took = time.time() - decided
-    assert took < LIMIT + SLACK, f"it ended after {took:.2f} s"
+    seconds = time.time() - decided
+    assert seconds < LIMIT + SLACK, f"it ended after {seconds:.2f} s"
 
 
 def require_safe(journal: Journal, decided: float) -> None:
     """Wait until the last state of the actuator is the safe one; its time is the node's."""
     until(lambda: journal.states()[-1]["safe"], lambda: journal.states()[-3:])
-    took = time_of(journal.states()[-1]) - decided
-    assert took < LIMIT, f"in its safe state after {took:.2f} s"
+    seconds = time_of(journal.states()[-1]) - decided
+    assert seconds < LIMIT, f"in its safe state after {seconds:.2f} s"
 
 
 @pytest.mark.parametrize("decision", DECISIONS.values(), ids=DECISIONS)
@@ -241,7 +241,9 @@ def test_a_node_that_was_taken_out_of_service_is_not_tried_for_ever_by_a_frozen_
         asked.request("POST", "/measurements", {"match": "type:gripper", "frozen": True, "rate": 20})
         until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured")
         hall.station.ask("decommission", uuid, "--force", "--yes", "--can", hall.can, "--timeout", 2)
-        [one] = until(lambda: [known for known in asked.measurements() if not known["uuids"]], asked.measurements)
-        assert (one["state"], one["why"]) == ("waiting", "no known node matches")
+        [measurement] = until(
+            lambda: [known for known in asked.measurements() if not known["uuids"]], asked.measurements
+        )
+        assert (measurement["state"], measurement["why"]) == ("waiting", "no known node matches")
         until(lambda: asked.node(uuid)["measuring"] is None, lambda: asked.node(uuid)["measuring"])
     service.end()

@@ -191,20 +191,20 @@ def test_a_read_only_token_learns_no_folder_from_an_error() -> None:
         "The store /home/me/bench/store.sqlite3 cannot be used: the disk is full.", hint="See /api/v1/x."
     )
 
-    def told(*, read_only: bool) -> dict[str, str]:
+    def errors_of(*, read_only: bool) -> dict[str, str]:
         scope = {"type": "http", CALLER: Caller("robot", "script", read_only)}
         return dict(json.loads(bytes(answer_error(Request(scope), error).body))["error"])
 
-    assert "/home/me/bench/" in told(read_only=False)["message"]
-    assert told(read_only=True)["message"] == "The store store.sqlite3 cannot be used: the disk is full."
-    assert told(read_only=True)["hint"] == "See /api/v1/x."
+    assert "/home/me/bench/" in errors_of(read_only=False)["message"]
+    assert errors_of(read_only=True)["message"] == "The store store.sqlite3 cannot be used: the disk is full."
+    assert errors_of(read_only=True)["hint"] == "See /api/v1/x."
 
 
 def test_a_read_only_token_learns_no_folder_from_a_node_or_a_source() -> None:
     message = "The store /home/me/bench/store.sqlite3 cannot be used: the disk is full."
     node = {"name": "a/b", "topic": "/bench/hand", "problem": {"message": message}, "measuring": {"why": message}}
-    told = "The store store.sqlite3 cannot be used: the disk is full."
-    assert for_reader(node) == node | {"problem": {"message": told}, "measuring": {"why": told}}
+    without_folder = "The store store.sqlite3 cannot be used: the disk is full."
+    assert for_reader(node) == node | {"problem": {"message": without_folder}, "measuring": {"why": without_folder}}
     assert for_reader(node | {"problem": None, "measuring": None})["problem"] is None
     assert for_readers(["file:/home/me/day.csv", "unix:/run/me/feed"]) == ["file:day.csv", "unix:feed"]
 

@@ -173,12 +173,16 @@ def test_a_client_that_leaves_too_many_events_is_told_to_ask_anew() -> None:
 
 def test_the_last_value_can_be_told_whatever_the_raw_value_is() -> None:
     live = Live()
-    for raw, told in ((np.array([[2**70]], dtype=object), 2**70), (np.array([[np.nan]]), None), (np.array([[7]]), 7)):
-        one = replace(block(0, 1, 0.01), raw=raw, value=np.array([[np.nan]]), valid=np.array([[False]]))
-        live._put_aside([one])
+    for raw, expected in (
+        (np.array([[2**70]], dtype=object), 2**70),
+        (np.array([[np.nan]]), None),
+        (np.array([[7]]), 7),
+    ):
+        measured = replace(block(0, 1, 0.01), raw=raw, value=np.array([[np.nan]]), valid=np.array([[False]]))
+        live._put_aside([measured])
         last = live.last("ab" * 10, 1)
         assert last is not None
-        assert (last.value, last.raw) == (None, told)
+        assert (last.value, last.raw) == (None, expected)
         json.dumps([last.value, last.raw], allow_nan=False)
 
 

@@ -155,11 +155,11 @@ def test_the_log_has_what_is_measured_and_who_requested_it(hall: Hall) -> None:
         until(lambda: len(entries(asked, uuid)) == 2, "and that of the next run")
         until(lambda: asked.measurements()[0]["nodes"][0]["samples"])
         asked.request("DELETE", f"/measurements/{made}")
-        told = [(entry["outcome"], entry["actor"]) for entry in entries(asked) if entry["uuid"] is None]
+        entries_found = [(entry["outcome"], entry["actor"]) for entry in entries(asked) if entry["uuid"] is None]
         last = entries(asked)[-1]
-    assert [outcome for outcome, _ in told] == ["begun", "paused", "continued", "ended"]
-    assert told[0][1] == "script"
-    assert told[-1][1] != "script", "whoever ended it is another one"
+    assert [outcome for outcome, _ in entries_found] == ["begun", "paused", "continued", "ended"]
+    assert entries_found[0][1] == "script"
+    assert entries_found[-1][1] != "script", "whoever ended it is another one"
     assert {entry["facts"]["owner"] for entry in [last]} == {"api:script"}
     assert last["facts"]["samples"] > 0
     assert last["facts"]["rate"] == 20
@@ -175,7 +175,7 @@ def test_a_measurement_whose_time_is_over_holds_its_nodes_no_longer(hall: Hall) 
         if shown:
             break
         service.kill()
-    assert [(one["id"], one["group"]) for one in shown] == [("brief", "arm")]
+    assert [(entry["id"], entry["group"]) for entry in shown] == [("brief", "arm")]
     until(lambda: not listed(service), "its time is over")
     with service.client() as asked:
         again = asked.request("POST", "/measurements", {"group": "arm", "rate": 20})

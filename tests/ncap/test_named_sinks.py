@@ -70,7 +70,7 @@ def test_brokers_stand_in_config_toml(tmp_path: Path) -> None:
 
 
 def test_readers_see_names_of_files_and_no_users() -> None:
-    told = {
+    facts = {
         "name": "/home/me/records/run.csv",
         "error": "/home/me/records/run.csv cannot be written: the disk is full.",
         "sinks": ["mqtts://arm@broker.lab:8883?password-file=/home/arm/secret", "ros1"],
@@ -78,7 +78,7 @@ def test_readers_see_names_of_files_and_no_users() -> None:
         "unit": "m/s",
         "topic": "/bench/hand/opening",
     }
-    assert for_readers(told) | {"topic": None} == {
+    assert for_readers(facts) | {"topic": None} == {
         "name": "run.csv",
         "error": "run.csv cannot be written: the disk is full.",
         "sinks": ["mqtts://broker.lab:8883", "ros1"],
@@ -89,16 +89,18 @@ def test_readers_see_names_of_files_and_no_users() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("--can", "udp_multicast:239.74.163.2?prot=1"), "'prot'"),
         (("--ble", "hci0?adress=x"), "'adress'"),
         (("--mqtt", "mqtts://host?cafile=/x"), "'cafile'"),
     ],
 )
-def test_words_of_a_link_or_sink_that_nobody_knows_end_the_start(desk: Desk, words: tuple[str, str], told: str) -> None:
+def test_words_of_a_link_or_sink_that_nobody_knows_end_the_start(
+    desk: Desk, words: tuple[str, str], message: str
+) -> None:
     done = desk.station().start("--json", "ncap", "run", *words).end()
-    assert (done.code, told in done.out) == (2, True), done
+    assert (done.code, message in done.out) == (2, True), done
 
 
 @pytest.mark.link

@@ -65,13 +65,13 @@ class Lab:
         """Every line of the daemon until now."""
         return lines_of(self.service)
 
-    def told(self, uuid: str | None = None) -> list[dict[str, Any]]:
+    def events_of(self, uuid: str | None = None) -> list[dict[str, Any]]:
         """Events of measurements that name a node."""
         every = [line for line in self.lines() if line.get("event") == "measurement" and "uuid" in line]
         return [entry for entry in every if uuid in (None, entry["uuid"])]
 
     def states(self, node: Node) -> list[str]:
-        return [entry["state"] for entry in self.told(node.uuid)]
+        return [entry["state"] for entry in self.events_of(node.uuid)]
 
     def comes(self, node: Node, times: int = 1) -> None:
         """Wait until it is measured, for at least the ``times``-th time: a busy machine loses it now and then."""
@@ -80,7 +80,7 @@ class Lab:
             states = self.states(node)
             return states.count("joined") >= times and states[-1] == "joined"
 
-        until(there, lambda: self.told(node.uuid))
+        until(there, lambda: self.events_of(node.uuid))
 
     def report(self, node: Node) -> dict[str, Any]:
         with self.service.client() as asked:
@@ -130,7 +130,7 @@ def test_what_is_there_is_measured_and_what_goes_comes_back(lab: Lab) -> None:
     lab.flows(right)
     right.kill()
     until(lambda: lab.states(right)[-1] == "left")
-    assert lab.told(right.uuid)[-1]["why"]
+    assert lab.events_of(right.uuid)[-1]["why"]
     lab.power(right)
     lab.comes(right, 2)
     lab.flows(right)
@@ -138,8 +138,12 @@ def test_what_is_there_is_measured_and_what_goes_comes_back(lab: Lab) -> None:
     with lab.service.client() as asked:  # the rest of its datasheet is read behind the measurement, and shown as read
         until(lambda: asked.node(right.uuid)["verdict"]["from"] == "session")
     with lab.service.client() as asked:
-        [one] = asked.measurements()
-        assert (one["match"], one["rate"], sorted(one["uuids"])) == ("all", 50, sorted([left.uuid, right.uuid]))
+        [measurement] = asked.measurements()
+        assert (measurement["match"], measurement["rate"], sorted(measurement["uuids"])) == (
+            "all",
+            50,
+            sorted([left.uuid, right.uuid]),
+        )
     lab.service.end()
 
 
@@ -179,7 +183,7 @@ def test_a_node_that_is_carried_to_another_bus_of_the_station_goes_on_there_at_o
         lab.flows(right)
         with lab.service.client() as asked:
             assert str(asked.node(right.uuid)["link"]).startswith(f"can:{bus or lab.desk.links.can}")
-        went, came = map(unix, lab.told(right.uuid)[-2:])
+        went, came = map(unix, lab.events_of(right.uuid)[-2:])
         present = [unix(line) for line in lab.lines() if line.get("state") == "came" and line["uuid"] == right.uuid]
         return max(went, came) - present[-1]
 
@@ -204,7 +208,7 @@ def test_a_node_is_written_while_it_is_matched_and_nobody_else_notices(lab: Lab)
     assert first.end().code == 0
     until(lambda: lab.states(right)[-1] == "joined")
     assert lab.states(right).count("left") in (1, 2), "one gap, or two where the writers came one after the other"
-    assert any(entry["why"] == "let go for provision" for entry in lab.told(right.uuid))
+    assert any(entry["why"] == "let go for provision" for entry in lab.events_of(right.uuid))
     lab.flows(right)
     assert lab.states(left) == ["joined"]
     lab.service.end()
@@ -231,7 +235,7 @@ def test_a_sensor_is_zeroed_while_everybody_is_measured_and_the_gap_is_told(lab:
     assert done["before"] > 0.5, "by whichever calibration it has by now"
     lab.comes(right, 2)
     lab.flows(right)
-    assert [(entry["state"], entry["why"]) for entry in lab.told(right.uuid)] == [
+    assert [(entry["state"], entry["why"]) for entry in lab.events_of(right.uuid)] == [
         ("joined", ""),
         ("left", "let go for calibrate zero"),
         ("joined", ""),
@@ -285,7 +289,7 @@ def test_whom_a_person_revokes_leaves_and_the_others_stay(lab: Lab) -> None:
         lab.comes(node)
     lab.service.station.ask("revoke", third.uuid, "--why", "stolen", "--yes")
     until(lambda: lab.states(third)[-1] == "left")
-    assert "stolen" in lab.told(third.uuid)[-1]["why"]
+    assert "stolen" in lab.events_of(third.uuid)[-1]["why"]
     assert (lab.states(left), lab.states(right)) == (["joined"], ["joined"])
     with lab.service.client() as asked:
         assert third.uuid not in asked.measurements()[0]["uuids"]
@@ -328,7 +332,7 @@ def test_an_expression_on_a_running_station_takes_in_whom_it_means(lab: Lab) -> 
     lab.comes(left)
     station.ask("group", "remove", "arm", left.uuid)
     until(lambda: lab.states(left)[-1] == "left")
-    assert lab.told(left.uuid)[-1]["why"] == "it is not in group arm"
+    assert lab.events_of(left.uuid)[-1]["why"] == "it is not in group arm"
     station.ask("group", "add", "arm", left.uuid, right.uuid)
     lab.comes(left, 2)
     assert lab.states(right) == [], "its name is another one"
@@ -336,13 +340,13 @@ def test_an_expression_on_a_running_station_takes_in_whom_it_means(lab: Lab) -> 
     lab.service.start()
     lab.comes(left)
     with lab.service.client() as asked:
-        [one] = asked.measurements()
-        said = station.refuses("ncap", "measure", "leg", "--stop", code=3)
-        assert said["hint"] == f"Kept: {one['id']} (arm, name:l*)."
-        assert station.ask("ncap", "measure", "arm, name:l*", "--stop") == {"stopped": [one["id"]]}
+        [measurement] = asked.measurements()
+        error = station.refuses("ncap", "measure", "leg", "--stop", code=3)
+        assert error["hint"] == f"Kept: {measurement['id']} (arm, name:l*)."
+        assert station.ask("ncap", "measure", "arm, name:l*", "--stop") == {"stopped": [measurement["id"]]}
         assert station.ask("ncap", "measure", "all", "--stop") == {"stopped": []}
         until(lambda: asked.node(left.uuid)["mode"] == "idle")
-        assert lab.told(left.uuid)[-1]["why"] == "the measurement ended"
+        assert lab.events_of(left.uuid)[-1]["why"] == "the measurement ended"
         assert asked.measurements() == []
     lab.service.end()
     station.ask("group", "delete", "arm")
@@ -350,16 +354,16 @@ def test_an_expression_on_a_running_station_takes_in_whom_it_means(lab: Lab) -> 
 
 def test_a_type_that_nobody_knows_is_told_while_its_measurement_waits(lab: Lab) -> None:
     lab.service.start()
-    said = lab.service.station.run("ncap", "measure", "type:load-cel")
-    assert said.code == 0, "a node of that type may come from another station"
-    assert "no profile and no known node is called 'load-cel'" in said.err
-    assert "Did you mean type:load-cell?" in said.err
-    assert "0 nodes match now." in said.out
-    assert "its type is magnetic-angular-position-sensor, not load-cel." in said.out, said.out
+    outcome = lab.service.station.run("ncap", "measure", "type:load-cel")
+    assert outcome.code == 0, "a node of that type may come from another station"
+    assert "no profile and no known node is called 'load-cel'" in outcome.err
+    assert "Did you mean type:load-cell?" in outcome.err
+    assert "0 nodes match now." in outcome.out
+    assert "its type is magnetic-angular-position-sensor, not load-cel." in outcome.out, outcome.out
     with lab.service.client() as asked:
-        [one] = until(lambda: [measurement for measurement in asked.measurements() if measurement["why"]])
-        assert (one["state"], one["why"]) == ("waiting", "no profile and no known node is called 'load-cel'")
-        asked.end_measurement(one["id"])
+        [entry] = until(lambda: [measurement for measurement in asked.measurements() if measurement["why"]])
+        assert (entry["state"], entry["why"]) == ("waiting", "no profile and no known node is called 'load-cel'")
+        asked.end_measurement(entry["id"])
     assert "load-cell" not in lab.service.station.run("ncap", "measure", "type:load-cell").err
     with lab.service.client() as asked:  # it is kept, and would begin with the service of the next test
         asked.end_measurement(
@@ -399,8 +403,8 @@ def test_one_that_finds_no_room_on_the_bus_waits_until_another_one_leaves(lab: L
         lab.comes(left)
         lab.power(right)
         until(lambda: lab.states(right)[-1:] == ["waiting"])
-        assert lab.told(right.uuid)[-1]["why"] == "no room on the bus"
-        assert lab.told(left.uuid)[-1]["why"] == "", "nobody is slowed"
+        assert lab.events_of(right.uuid)[-1]["why"] == "no room on the bus"
+        assert lab.events_of(left.uuid)[-1]["why"] == "", "nobody is slowed"
         with client.connect(home=lab.service.station.home).released(left.uuid, "write"):
             until(lambda: lab.states(left)[-1] == "left")
             time.sleep(1.0)  # who waits would have joined by now
@@ -428,9 +432,9 @@ def test_one_that_finds_no_room_in_the_budget_of_messages_waits_until_another_on
             asked.request("POST", "/measurements", {"match": "all", "rate": 1000, "scalar_rate": 1000})
         lab.comes(left)
         lab.power(right)
-        until(lambda: lab.states(right)[-1:] == ["waiting"], lambda: lab.told(right.uuid))
-        assert lab.told(right.uuid)[-1]["why"] == "no room in the budget of 5000 messages/s"
-        assert lab.told(left.uuid)[-1]["why"] == "", "nobody is slowed"
+        until(lambda: lab.states(right)[-1:] == ["waiting"], lambda: lab.events_of(right.uuid))
+        assert lab.events_of(right.uuid)[-1]["why"] == "no room in the budget of 5000 messages/s"
+        assert lab.events_of(left.uuid)[-1]["why"] == "", "nobody is slowed"
         left.kill()
         until(lambda: lab.states(right)[-1] == "joined")
         lab.service.end()
@@ -449,9 +453,9 @@ def test_frozen_measures_those_that_were_known_and_lets_none_go(lab: Lab) -> Non
     lab.comes(left)
     lab.comes(right)
     with lab.service.client() as asked:
-        [one] = asked.measurements()
-        assert one["frozen"] is True
-        assert sorted(one["uuids"]) == sorted([left.uuid, right.uuid])
+        [measurement] = asked.measurements()
+        assert measurement["frozen"] is True
+        assert sorted(measurement["uuids"]) == sorted([left.uuid, right.uuid])
     refused = lab.service.station.refuses("address", left.uuid, 77, *lab.desk.links.over("can"), code=6)
     assert "frozen" in refused["message"]
     assert lab.states(left) == ["joined"]

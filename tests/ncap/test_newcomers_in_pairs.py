@@ -46,19 +46,19 @@ def lab(one_lab: Lab) -> Iterator[Lab]:
 
 
 def whys(lab: Lab, node: Node) -> list[tuple[str, str]]:
-    return [(entry["state"], entry["why"]) for entry in lab.told(node.uuid)]
+    return [(entry["state"], entry["why"]) for entry in lab.events_of(node.uuid)]
 
 
 def spoilt(node: Node, block: tuple[int, int]) -> bytes:
     """Change an octet of a TEDS in the flash of a node that is off; gives the flash as it was."""
     before = node.octets
-    told = json.loads(before)
-    for item in told["flash"]["blocks"]:
+    record = json.loads(before)
+    for item in record["flash"]["blocks"]:
         if tuple(item[:2]) == block:
             octets = bytearray.fromhex(item[2])
             octets[len(octets) // 2] ^= 1
             item[2] = octets.hex()
-    (node.folder / "flash.json").write_text(json.dumps(told))
+    (node.folder / "flash.json").write_text(json.dumps(record))
     assert node.octets != before
     return before
 
@@ -180,7 +180,7 @@ def test_who_is_renamed_leaves_or_joins_a_measurement_of_names(lab: Lab) -> None
     lab.service.start("--measure", "name:arm-*", "--rate", 50)
     with lab.service.client() as asked:
         until(lambda: asked.node(right.uuid)["present"] and asked.node(left.uuid)["present"])
-    assert lab.told() == []
+    assert lab.events_of() == []
     words = ["--profile", "magnetic-angular-position-sensor", "--name", "arm-1", "--yes", *over]
     assert station.ask("provision", right.uuid, *words)["verdict"] == "authentic"
     lab.comes(right)
@@ -212,9 +212,15 @@ def test_a_group_that_is_started_by_hand_and_measured_as_it_comes_has_each_node_
         until(lambda: lab.states(right)[-1] == "left")
         by_hand = asked.measure(right.uuid, rate=20)["id"]
         lab.power(right)
-        until(lambda: [entry["id"] for entry in lab.told(right.uuid) if entry["state"] == "joined"] == ["run", by_hand])
+        until(
+            lambda: (
+                [entry["id"] for entry in lab.events_of(right.uuid) if entry["state"] == "joined"] == ["run", by_hand]
+            )
+        )
         asked.end_measurement(by_hand)
-        until(lambda: lab.told(right.uuid)[-1]["state"] == "joined" and lab.told(right.uuid)[-1]["id"] == "run")
+        until(
+            lambda: lab.events_of(right.uuid)[-1]["state"] == "joined" and lab.events_of(right.uuid)[-1]["id"] == "run"
+        )
     assert lab.states(left) == ["joined"]
     lab.service.end()
     station.ask("group", "delete", "both")

@@ -38,21 +38,21 @@ def block(
 
 def ramp(past: History, first: float, seconds: int, *, rate: float = 100.0, start: int = 0) -> None:
     """One channel that counts its samples, a second a block."""
-    each = int(rate)
+    per_second = int(rate)
     for second in range(seconds):
-        at = start + second * each
-        past.block(block(first + second, [[float(at + step)] for step in range(each)], rate=rate, index=at))
+        at = start + second * per_second
+        past.block(block(first + second, [[float(at + step)] for step in range(per_second)], rate=rate, index=at))
 
 
 def test_a_second_has_its_least_its_greatest_and_its_count(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("time.time", lambda: NOW)  # which is when this module was loaded
     past = History()
     ramp(past, NOW - 10, 10)
-    said = past.channel_history(NODE, 1, NOW - 600, NOW, points=3600)
-    assert said["bin"] == 1.0
-    assert said["time"] == [NOW - 10 + second for second in range(10)]
-    assert (said["low"][3], said["high"][3], said["count"][3]) == (300.0, 399.0, 100)
-    assert said["rate"] == pytest.approx(100)
+    history = past.channel_history(NODE, 1, NOW - 600, NOW, points=3600)
+    assert history["bin"] == 1.0
+    assert history["time"] == [NOW - 10 + second for second in range(10)]
+    assert (history["low"][3], history["high"][3], history["count"][3]) == (300.0, 399.0, 100)
+    assert history["rate"] == pytest.approx(100)
     with pytest.raises(NotFoundError):
         past.channel_history(NODE, 2)
 
@@ -76,34 +76,34 @@ def test_gaps_invalid_and_lost_samples_are_told_apart() -> None:
     past.block(block(NOW - 8, [[1.0, 5.0]] * 100, index=0))
     past.block(block(NOW - 5, [[1.0, 5.0]] * 100, index=300, valid=[[False, True]] * 100))  # 200 were lost before it
     past.block(block(NOW - 4, [[1.0, 5.0]] * 100, index=0, run=1))  # begun anew: nothing was lost
-    one, two = (past.channel_history(NODE, number, NOW - 60, NOW) for number in (1, 2))
-    by_second = {at - NOW: place for place, at in enumerate(one["time"]) if one["bin"] == 1.0}
+    first, second = (past.channel_history(NODE, number, NOW - 60, NOW) for number in (1, 2))
+    by_second = {at - NOW: place for place, at in enumerate(first["time"]) if first["bin"] == 1.0}
     if not by_second:  # the minute: in 10 ms
-        one, two = (past.channel_history(NODE, number, NOW - 3000, NOW, points=3600) for number in (1, 2))
-        by_second = {at - NOW: place for place, at in enumerate(one["time"])}
+        first, second = (past.channel_history(NODE, number, NOW - 3000, NOW, points=3600) for number in (1, 2))
+        by_second = {at - NOW: place for place, at in enumerate(first["time"])}
     assert set(by_second) == {-8, -5, -4}, "a bin in which nothing happened is left out"
     at = by_second[-5]
-    assert (one["low"][at], one["high"][at], one["count"][at], one["invalid"][at], one["lost"][at]) == (
+    assert (first["low"][at], first["high"][at], first["count"][at], first["invalid"][at], first["lost"][at]) == (
         None, None, 100, 100, 200,
     )  # fmt: skip
-    assert (two["low"][at], two["invalid"][at]) == (5.0, 0)
-    assert sum(one["lost"]) == 200
+    assert (second["low"][at], second["invalid"][at]) == (5.0, 0)
+    assert sum(first["lost"]) == 200
 
 
 def test_a_clock_that_is_set_back_writes_that_time_anew_and_one_set_forward_leaves_a_gap() -> None:
     past = History()
     ramp(past, NOW - 300, 100)
     past.block(block(NOW - 250, [[7.0]] * 100, run=1))  # put back by 150 s
-    said = past.channel_history(NODE, 1, NOW - 3000, NOW, points=3600)
-    assert said["time"][-1] == NOW - 250
-    assert (said["low"][-1], said["count"][-1]) == (7.0, 100), "what the old clock called that time is gone"
-    assert len(said["time"]) == 51
+    history = past.channel_history(NODE, 1, NOW - 3000, NOW, points=3600)
+    assert history["time"][-1] == NOW - 250
+    assert (history["low"][-1], history["count"][-1]) == (7.0, 100), "what the old clock called that time is gone"
+    assert len(history["time"]) == 51
     past.block(block(NOW - 20, [[8.0]] * 100, run=2))
-    said = past.channel_history(NODE, 1, NOW - 3000, NOW, points=3600)
-    assert (len(said["time"]), said["time"][-1], said["low"][-1]) == (52, NOW - 20, 8.0)
+    history = past.channel_history(NODE, 1, NOW - 3000, NOW, points=3600)
+    assert (len(history["time"]), history["time"][-1], history["low"][-1]) == (52, NOW - 20, 8.0)
     past.block(block(NOW + 2 * HOUR, [[9.0]] * 100, run=3))
-    said = past.channel_history(NODE, 1, NOW, NOW + 3 * HOUR, points=3600)
-    assert said["time"] == [NOW + 2 * HOUR], "an hour is an hour of the clock that is"
+    history = past.channel_history(NODE, 1, NOW, NOW + 3 * HOUR, points=3600)
+    assert history["time"] == [NOW + 2 * HOUR], "an hour is an hour of the clock that is"
     past.block(block(NOW, [[3.0]] * 100, run=4))
     assert past.channel_history(NODE, 1, NOW - HOUR, NOW + 3 * HOUR, points=3600)["time"] == [NOW]
 
@@ -112,16 +112,16 @@ def test_samples_that_come_a_little_late_belong_where_they_are_dated() -> None:
     past = History()
     ramp(past, NOW - 10, 5)
     past.block(block(NOW - 6.5, [[-1.0]], index=500))
-    said = past.channel_history(NODE, 1, NOW - 3000, NOW, points=3600)
-    assert (said["low"][3], said["count"][3], len(said["time"])) == (-1.0, 101, 5)
+    history = past.channel_history(NODE, 1, NOW - 3000, NOW, points=3600)
+    assert (history["low"][3], history["count"][3], len(history["time"])) == (-1.0, 101, 5)
 
 
 def test_the_ring_of_an_hour_forgets_what_is_older() -> None:
     past = History()
     for minute in range(70):
         past.block(block(NOW + 60 * minute, [[float(minute)]]))
-    said = past.channel_history(NODE, 1, NOW, NOW + 4200, points=3600)
-    assert (said["time"][0], len(said["time"])) == (NOW + 60 * 10, 60)
+    history = past.channel_history(NODE, 1, NOW, NOW + 4200, points=3600)
+    assert (history["time"][0], len(history["time"])) == (NOW + 60 * 10, 60)
 
 
 def test_a_channel_takes_less_than_a_hundred_thousand_octets() -> None:
@@ -155,16 +155,16 @@ def test_no_bin_holds_values_of_two_calibrations() -> None:
     past.learn([warm])
     past.block(block(NOW - 5, [[300.0]] * 100, run=3))
     for points in (3600, 3, 1):
-        said = past.channel_history(NODE, 1, NOW - 3000, NOW, points=points)
-        assert (said["low"], said["high"]) == ([1.0, 0.5, 300.0],) * 2, points
-        assert said["segment"] == [0, 1, 2]
-        assert said["segments"] == [{"id": 0, "unit": "rad"}, {"id": 1, "unit": "rad"}, {"id": 2, "unit": "K"}]
-        assert said["count"] == [100, 40, 100], "the second of the change has what came after it"
+        history = past.channel_history(NODE, 1, NOW - 3000, NOW, points=points)
+        assert (history["low"], history["high"]) == ([1.0, 0.5, 300.0],) * 2, points
+        assert history["segment"] == [0, 1, 2]
+        assert history["segments"] == [{"id": 0, "unit": "rad"}, {"id": 1, "unit": "rad"}, {"id": 2, "unit": "K"}]
+        assert history["count"] == [100, 40, 100], "the second of the change has what came after it"
     fine = past.channel_history(NODE, 1, NOW - 7.45, NOW - 6, points=3600)
     assert set(zip(fine["segment"], fine["low"], strict=True)) == {(0, 1.0), (1, 0.5)}
     past.block(block(NOW - 8.5, [[301.0]] * 10, run=4))  # the clock was put back
-    said = past.channel_history(NODE, 1, NOW - 3000, NOW, points=3600)
-    assert (said["low"], said["segment"]) == ([1.0, 301.0], [0, 2]) or said["low"] == [301.0]
+    history = past.channel_history(NODE, 1, NOW - 3000, NOW, points=3600)
+    assert (history["low"], history["segment"]) == ([1.0, 301.0], [0, 2]) or history["low"] == [301.0]
 
 
 def line(zero: float = 0.0, by: str = "") -> Calibration:

@@ -44,12 +44,12 @@ def test_where_all_are_taken_the_one_that_has_most_gives_its_newest_up() -> None
     assert places.acquire("c", leaves("c1"))
     assert sorted(left) == ["a2", "b2"]
     assert not places.acquire("c", leaves("c2")), "two each is an even share"
-    one = leaves("d0")
-    assert places.acquire("d", one)
+    newest = leaves("d0")
+    assert places.acquire("d", newest)
     assert len(left) == 3
-    places.release("d", one)
-    places.release("d", one)
-    assert places.acquire("d", one), "a place that was given back is free"
+    places.release("d", newest)
+    places.release("d", newest)
+    assert places.acquire("d", newest), "a place that was given back is free"
     assert len(left) == 3
 
 
@@ -90,7 +90,7 @@ def test_a_token_that_is_removed_ends_its_open_channel_and_no_other(service: Ser
 
 
 def test_who_may_only_read_is_told_no_paths() -> None:
-    async def told() -> list[list[str]]:
+    async def paths_seen() -> list[list[str]]:
         live = Live()
         every = [live.join(), live.join(reader=True)]
         running = asyncio.create_task(live.run())
@@ -100,7 +100,7 @@ def test_who_may_only_read_is_told_no_paths() -> None:
         running.cancel()
         return found
 
-    writer, reader = asyncio.run(told())
+    writer, reader = asyncio.run(paths_seen())
     assert "/home/me/run.csv cannot" in writer[0]
     assert '"run.csv cannot' in reader[0]
 

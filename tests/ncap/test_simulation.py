@@ -75,7 +75,11 @@ def simulation(service: Service, token: str, name: str = "hand", **headers: str)
 def fed(service: Service, name: str) -> dict[str, Any] | None:
     """Who feeds it, as GET /virtual tells."""
     with service.client() as asked:
-        [found] = [one for one in asked.request("GET", "/virtual")["virtual"] if name in (one["name"], one["uuid"])]
+        [found] = [
+            virtual
+            for virtual in asked.request("GET", "/virtual")["virtual"]
+            if name in (virtual["name"], virtual["uuid"])
+        ]
     return None if found["simulation"] is None else dict(found["simulation"])
 
 

@@ -90,11 +90,11 @@ def test_a_store_that_cannot_be_read_for_a_moment_ends_no_measurement(
 def test_a_bug_in_one_measurement_ends_that_one_alone(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     made = service.measurements.add({"match": "name:x*"})["id"]
     service.measurements.match("all")
-    until(lambda: [service.state(one)[0] for one in (made, "run")] == ["waiting"] * 2)
+    until(lambda: [service.state(identifier)[0] for identifier in (made, "run")] == ["waiting"] * 2)
     again = failing_once(service, RuntimeError("bug"), monkeypatch)
     assert again.wait(10), "the other one looks at the store"
-    until(lambda: "failed" in [service.state(one)[0] for one in (made, "run")])
-    states = {one: service.state(one) for one in (made, "run")}
+    until(lambda: "failed" in [service.state(identifier)[0] for identifier in (made, "run")])
+    states = {identifier: service.state(identifier) for identifier in (made, "run")}
     assert sorted(state for state, _ in states.values()) == ["failed", "waiting"]
     assert [why for state, why in states.values() if state == "failed"] == ["Unexpected RuntimeError."]
 

@@ -183,9 +183,9 @@ def test_kill_loses_a_fifth_of_a_second_at_most_and_a_start_carries_on(lab: Lab)
     # What is on its way takes 20 ms to be gathered and 40 ms to be measured; the rest may be lost.
     best_of(5, 0.2 + 0.1, cut, because="the 0.1 s hold a chain of three threads and two processes")
     with lab.service.client() as asked:
-        [one] = asked.request("GET", "/measurements")["measurements"]
-    assert (one["id"], one["rate"]) == (measurement, 50)
-    assert all(Path(part) != parts / "cut.csv" for part in one["files"])
+        [entry] = asked.request("GET", "/measurements")["measurements"]
+    assert (entry["id"], entry["rate"]) == (measurement, 50)
+    assert all(Path(part) != parts / "cut.csv" for part in entry["files"])
     lab.service.end()
 
 
@@ -202,9 +202,11 @@ def test_a_node_that_starts_anew_is_measured_on(lab: Lab) -> None:
     assert lab.service.process is not None
     lab.service.process.read(0.1)
     states = [json.loads(line) for line in lab.service.process.out.splitlines()]
-    told = [line["state"] for line in states if line.get("event") == "node" and line.get("uuid") == lab.node.uuid]
-    assert "lost" in told
-    assert told[-1] in ("running", "came")
+    states_seen = [
+        line["state"] for line in states if line.get("event") == "node" and line.get("uuid") == lab.node.uuid
+    ]
+    assert "lost" in states_seen
+    assert states_seen[-1] in ("running", "came")
     lab.service.end()
 
 
@@ -241,7 +243,7 @@ def test_the_command_line_works_beside_it_at_the_same_node(lab: Lab) -> None:
     def lost() -> int:
         """How often its session was ended under three commands; a machine that stands still may end it, once."""
         process.read(0.1)
-        told = process.out.rfind("\n") + 1
+        position = process.out.rfind("\n") + 1
         before = lab.flows()["measuring"]
         assert station.ask("verify", lab.node.uuid, *over)["verdict"] == "authentic"
         assert station.ask("read", lab.node.uuid, *over)
@@ -249,7 +251,7 @@ def test_the_command_line_works_beside_it_at_the_same_node(lab: Lab) -> None:
         until(lambda: (node := lab.flows()["measuring"])["state"] == "running" and node["samples"] > before["samples"])
         while process.read(0.1):
             pass
-        lines = [json.loads(line) for line in process.out[told : process.out.rfind("\n") + 1].splitlines()]
+        lines = [json.loads(line) for line in process.out[position : process.out.rfind("\n") + 1].splitlines()]
         return sum(line.get("event") == "node" and line["state"] == "lost" for line in lines)
 
     succeeds(3, lost)
@@ -435,8 +437,8 @@ def test_a_store_that_a_newer_version_brought_forward_ends_the_service_in_words(
     assert outcome.code == 7, outcome
     *events, last = [json.loads(line) for line in outcome.out.splitlines()]
     assert (last["error"]["code"], "newer version" in last["error"]["hint"]) == ("newer-store", True)
-    [told] = [event for event in events if event.get("event") == "store" and event["state"] == "newer"]
-    assert f"has schema {SCHEMA_VERSION + 1}" in told["why"]
+    [event] = [event for event in events if event.get("event") == "store" and event["state"] == "newer"]
+    assert f"has schema {SCHEMA_VERSION + 1}" in event["why"]
     assert "Traceback" not in outcome.err, outcome.err
     assert "no such column" not in outcome.out + outcome.err
     with closing(sqlite3.connect(home / "store.sqlite3", isolation_level=None)) as newer:

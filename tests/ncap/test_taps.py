@@ -43,11 +43,11 @@ def test_a_provisioning_waits_for_the_tap_and_every_step_is_told(desk: Desk) -> 
         assert (asked_for["state"], asked_for["waits_for"]) == ("waiting", "tap")
         node.start()
         following.join(60)
-        told = [event for event in events if event.get("event") == "provision"]
-        assert told[0]["state"] == "waiting"
-        done = [entry["step"] for entry in told if entry.get("result") in ("done", "nothing to do", "skipped")]
+        steps = [event for event in events if event.get("event") == "provision"]
+        assert steps[0]["state"] == "waiting"
+        done = [entry["step"] for entry in steps if entry.get("result") in ("done", "nothing to do", "skipped")]
         assert done == ["identify", "whitelist", "agree", "build", "sign", "write", "verify", "check"]
-        assert told[-1]["state"] == "done", told[-1]
+        assert steps[-1]["state"] == "done", steps[-1]
         tapped = next(event for event in events if event.get("event") == "node" and event["state"] == "tapped")
         assert tapped["uuid"] == node.uuid
         found = asked.node(node.uuid)

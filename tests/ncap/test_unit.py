@@ -61,13 +61,13 @@ def filter_file(tmp_path: Path) -> Path:
         pytest.skip("the Debian package python3-seccomp is not installed (scripts/install-test-packages)")
     [number] = settings("SystemCallErrorNumber")
     [families] = settings("RestrictAddressFamilies")
-    told = {
+    rules = {
         "calls": sorted(allowed()),
         "errno": getattr(errno, number),
         "families": [int(getattr(socket, name, 31)) for name in families.split()],  # 31: AF_BLUETOOTH
     }
     file = tmp_path / "filter.json"
-    file.write_text(json.dumps(told))
+    file.write_text(json.dumps(rules))
     return file
 
 

@@ -114,9 +114,9 @@ def refusal(bench: Bench, image: bytes, *nodes: Node, **more: Any) -> ApiError:
 
 
 def test_a_plan_says_what_happens_to_each_board_and_changes_nothing(bench: Bench) -> None:
-    one, two = bench.boards
+    first, second = bench.boards
     before = [node.octets for node in bench.boards]
-    plan = bench.update(bench.new, one, two, bench.plain, dry_run=True)
+    plan = bench.update(bench.new, first, second, bench.plain, dry_run=True)
     assert (plan["id"], plan["state"], plan["owner"]) == (None, "planned", "ncap")
     assert (plan["image"]["version"], plan["image"]["board"]) == ("1.1.0", "virtual/finger")
     for node in bench.boards:
@@ -127,11 +127,11 @@ def test_a_plan_says_what_happens_to_each_board_and_changes_nothing(bench: Bench
         assert (row["question"], row["error"], row["result"]) == ("", None, None)
     refused = rows(plan)[bench.plain.uuid]
     assert (refused["result"], refused["error"]["code"]) == ("refused", "no-update")
-    other = rows(bench.update(bench.image("1.2.0", board="other/board"), one, dry_run=True))[one.uuid]
+    other = rows(bench.update(bench.image("1.2.0", board="other/board"), first, dry_run=True))[first.uuid]
     assert "names the board 'other/board'" in other["question"]
-    older = rows(bench.update(bench.image("0.9.0"), one, dry_run=True, allow_downgrade=False))[one.uuid]
+    older = rows(bench.update(bench.image("0.9.0"), first, dry_run=True, allow_downgrade=False))[first.uuid]
     assert (older["result"], older["error"]["code"]) == ("refused", "downgrade")
-    allowed = rows(bench.update(bench.image("0.9.0"), one, dry_run=True, allow_downgrade=True))[one.uuid]
+    allowed = rows(bench.update(bench.image("0.9.0"), first, dry_run=True, allow_downgrade=True))[first.uuid]
     assert (allowed["plan"], allowed["error"]) == ("upload", None)
     assert [node.octets for node in bench.boards] == before
     assert not bench.kept
@@ -177,46 +177,46 @@ def test_many_boards_are_updated_and_everything_else_stays(bench: Bench) -> None
 
 
 def test_an_image_for_another_board_needs_a_word_about_that_very_board(bench: Bench) -> None:
-    one, two = bench.boards
+    first, second = bench.boards
     other = bench.image("1.4.0", board="other/board")
-    done = rows(bench.done(other, one, two, other_board=[one.uuid]))
-    assert done[one.uuid]["result"] == "updated"
-    assert (done[two.uuid]["result"], done[two.uuid]["error"]["code"]) == ("refused", "wrong-image")
+    done = rows(bench.done(other, first, second, other_board=[first.uuid]))
+    assert done[first.uuid]["result"] == "updated"
+    assert (done[second.uuid]["result"], done[second.uuid]["error"]["code"]) == ("refused", "wrong-image")
     with bench.service.client() as asked:
         begun = [entry for entry in asked.log() if entry["outcome"] == "begun"][-1]
-    assert begun["facts"]["other_board"] == [one.uuid]
+    assert begun["facts"]["other_board"] == [first.uuid]
     back = bench.image("1.3.1")  # to a board that the other image made another one
     assert (
-        bench.done(back, one, other_board=[one.uuid], allow_downgrade=False)["boards"][0]["error"]["code"]
+        bench.done(back, first, other_board=[first.uuid], allow_downgrade=False)["boards"][0]["error"]["code"]
         == "downgrade"
     )
-    assert bench.done(back, one, other_board=[one.uuid], allow_downgrade=True)["totals"]["updated"] == 1
+    assert bench.done(back, first, other_board=[first.uuid], allow_downgrade=True)["totals"]["updated"] == 1
 
 
 def test_another_owners_image_is_reverted_by_the_boot_loader(bench: Bench) -> None:
-    one = bench.boards[0]
+    board = bench.boards[0]
     rival = bench.image("3.0.0", key=make_key(bench.desk.folder / "rival.pem"))
-    row = rows(bench.done(rival, one))[one.uuid]
+    row = rows(bench.done(rival, board))[board.uuid]
     assert (row["result"], row["error"]["code"]) == ("reverted", "reverted")
-    assert verified(bench.service, one.uuid)["verdict"]["verdict"] == "authentic"
+    assert verified(bench.service, board.uuid)["verdict"]["verdict"] == "authentic"
 
 
 def test_what_is_no_image_and_who_may_not_is_refused(bench: Bench) -> None:
-    one, image = bench.boards[0], bench.image("1.5.0").read_bytes()
+    board, image = bench.boards[0], bench.image("1.5.0").read_bytes()
     for octets in (b"x", image[:-9], image + b"\0", b"\0" * 100_000, b"#!/bin/sh\nreboot\n"):
-        refused = refusal(bench, octets, one)
+        refused = refusal(bench, octets, board)
         assert (refused.status, refused.code) == (422, "bad-data"), octets[:9]
-    assert refusal(bench, b"", one).code == "bad-data"
+    assert refusal(bench, b"", board).code == "bad-data"
     assert refusal(bench, image).status == 422
-    assert refusal(bench, image, one, match="all").status == 422
+    assert refusal(bench, image, board, match="all").status == 422
     assert refusal(bench, image, match="name:nothing*").status == 404
     with bench.service.client() as asked, pytest.raises(ApiError) as unknown:
         asked.update(image, "f" * 20)
     assert unknown.value.status == 404
-    large = refusal(bench, b"\0" * (LARGEST_IMAGE + 1), one)
+    large = refusal(bench, b"\0" * (LARGEST_IMAGE + 1), board)
     assert (large.status, large.code) == (413, "too-large")
     octets = {"Content-Type": "application/octet-stream"}
-    path = f"/api/v1/updates?nodes={one.uuid}"
+    path = f"/api/v1/updates?nodes={board.uuid}"
     assert bench.service.raw("POST", path, octets, image).status == 401
     assert bench.service.raw("POST", path, {**octets, "Authorization": "Bearer x"}, image).status == 401
     reader = {"Authorization": f"Bearer {bench.service.token('reader', '--read-only')}"}
@@ -235,21 +235,21 @@ def test_what_is_no_image_and_who_may_not_is_refused(bench: Bench) -> None:
 
 
 def test_a_script_may_write_a_switch_as_its_language_does(bench: Bench) -> None:
-    one, older = bench.boards[0], bench.image("0.9.0").read_bytes()
+    board, older = bench.boards[0], bench.image("0.9.0").read_bytes()
     headers = {
         "Content-Type": "application/octet-stream",
         "Authorization": f"Bearer {bench.service.token('script')}",
     }
     for word, code in (("False", "downgrade"), ("0", "downgrade"), ("True", None), ("1", None)):
-        path = f"/api/v1/updates?nodes={one.uuid}&dry_run=True&allow_downgrade={word}"
+        path = f"/api/v1/updates?nodes={board.uuid}&dry_run=True&allow_downgrade={word}"
         (row,) = bench.service.raw("POST", path, headers, older).json["boards"]
         assert (row["error"] or {"code": None})["code"] == code, word
 
 
 def test_a_second_update_is_refused_with_who_updates(bench: Bench) -> None:
-    one = bench.boards[0]
-    with paused(one):
-        begun = bench.update(bench.image("1.6.0"), one)
+    board = bench.boards[0]
+    with paused(board):
+        begun = bench.update(bench.image("1.6.0"), board)
         second_is_refused(bench)
     assert bench.ended(begun)["totals"]["updated"] == 1
 
@@ -277,7 +277,7 @@ def test_no_further_board_is_begun_after_a_cancel(bench: Bench) -> None:
     assert [(row["state"], row["result"]) for row in done["boards"]] == [("ended", "updated"), ("skipped", None)]
 
 
-def told(bench: Bench, node: Node) -> list[str]:
+def events_of(bench: Bench, node: Node) -> list[str]:
     """What the service said of the measurement of a node, in order."""
     process = bench.service.process
     assert process is not None
@@ -307,27 +307,27 @@ def measured(bench: Bench) -> Iterator[Callable[[Node], dict[str, Any]]]:
 
 
 def test_the_measurement_of_a_board_pauses_and_that_of_another_one_does_not(bench: Bench) -> None:
-    one, two = bench.boards
+    first, second = bench.boards
     with measured(bench) as report:
-        before = {node.uuid: len(told(bench, node)) for node in bench.boards}
+        before = {node.uuid: len(events_of(bench, node)) for node in bench.boards}
         image = bench.image("1.8.0", octets=8_000)
-        assert rows(bench.update(image, one, dry_run=True))[one.uuid]["interrupts"]
-        assert rows(bench.done(image, one))[one.uuid]["result"] == "updated"
-        until(lambda: report(one)["state"] == "running")
-        until(lambda: told(bench, one)[before[one.uuid] :][-1:] == ["joined"], lambda: told(bench, one))
-        assert "let go for update" in told(bench, one)[before[one.uuid] :]
-        assert "let go for update" not in told(bench, two)[before[two.uuid] :]
+        assert rows(bench.update(image, first, dry_run=True))[first.uuid]["interrupts"]
+        assert rows(bench.done(image, first))[first.uuid]["result"] == "updated"
+        until(lambda: report(first)["state"] == "running")
+        until(lambda: events_of(bench, first)[before[first.uuid] :][-1:] == ["joined"], lambda: events_of(bench, first))
+        assert "let go for update" in events_of(bench, first)[before[first.uuid] :]
+        assert "let go for update" not in events_of(bench, second)[before[second.uuid] :]
 
 
 @pytest.mark.nightly("tests/e2e/test_update.py::test_a_measurement_beside_an_update_loses_nothing")
 @pytest.mark.realtime
 def test_no_value_of_a_measured_board_is_lost_beside_an_update(bench: Bench) -> None:
-    one, two = bench.boards
+    first, second = bench.boards
     with measured(bench) as report:
-        before, image = report(two), bench.image(f"4.0.{time.monotonic_ns() // 10**9 % 10_000}", octets=8_000)
-        with nothing_lost(two, lambda: report(two)):
-            assert rows(bench.done(image, one))[one.uuid]["result"] == "updated"
-        assert report(two)["samples"] > before["samples"]
+        before, image = report(second), bench.image(f"4.0.{time.monotonic_ns() // 10**9 % 10_000}", octets=8_000)
+        with nothing_lost(second, lambda: report(second)):
+            assert rows(bench.done(image, first))[first.uuid]["result"] == "updated"
+        assert report(second)["samples"] > before["samples"]
 
 
 def test_a_board_whose_actuator_is_in_use_is_refused(bench: Bench) -> None:

@@ -30,7 +30,7 @@ from tests.pace import until
 from tests.provisioning.test_firmware import FirmwareBoard
 
 
-class Silence:
+class NoListeners:
     """Nobody listens."""
 
     def event(self, *_words: Any, **_facts: Any) -> None: ...
@@ -50,7 +50,7 @@ def test_the_firmware_of_a_board_without_a_key_here_is_shown_as_unverified_and_n
         "unjudged",
     )
     assert station.firmware_reports.get(stranger.uuid) is None
-    directory = NodeDirectory(station, Silence())  # type: ignore[arg-type]
+    directory = NodeDirectory(station, NoListeners())  # type: ignore[arg-type]
     directory.note(stranger.uuid.hex(), "verified", firmware=found.firmware)
     assert directory.node(stranger.uuid.hex())["firmware"] == found.firmware
     station.close()
@@ -69,7 +69,7 @@ def sighting(number: int) -> Any:
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> LinkWatch:
     nothing: Any = None
-    silence: Any = Silence()
+    silence: Any = NoListeners()
     monkeypatch.setattr(link_watch, "is_listed", lambda _station, _uuid: False)
     roster = NodeDirectory(nothing, silence)
     monkeypatch.setattr(roster, "refresh", lambda _uuids=None: None)
@@ -148,16 +148,16 @@ def test_whoever_makes_up_uuids_fills_no_more_than_the_limit(watch: LinkWatch, m
 def test_what_was_looked_at_while_others_took_its_place_leaves(
     watch: LinkWatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one = sighting(7)
+    sighted = sighting(7)
 
     def serve(contact: Any) -> None:
-        with watch._node_locks.hold(one.uuid.hex(), "it is looked at"):
-            watch._gone(one.uuid.hex())
-        watch._directory.note(one.uuid.hex(), "problem")
+        with watch._node_locks.hold(sighted.uuid.hex(), "it is looked at"):
+            watch._gone(sighted.uuid.hex())
+        watch._directory.note(sighted.uuid.hex(), "problem")
 
     monkeypatch.setattr(watch, "_serve", serve)
     watch._for_strangers = SimpleNamespace(submit=lambda work, contact: work(contact))  # type: ignore[assignment]
-    watch.on_sighting(one)
+    watch.on_sighting(sighted)
     assert present(watch) == 0
 
 
@@ -167,10 +167,10 @@ def test_a_clock_that_is_set_keeps_no_node_from_being_looked_at_again(
 ) -> None:
     looked: list[str] = []
     watch._for_strangers = SimpleNamespace(submit=lambda _work, contact: looked.append(contact.identity.uuid.hex()))  # type: ignore[assignment]
-    one = sighting(3)
-    watch.on_sighting(one)
+    sighted = sighting(3)
+    watch.on_sighting(sighted)
     watch._pending.clear()
-    watch._directory.note(one.uuid.hex(), "problem", problem={"code": "link", "message": "It fell silent."})
+    watch._directory.note(sighted.uuid.hex(), "problem", problem={"code": "link", "message": "It fell silent."})
     watch.on_sighting(sighting(3))
     assert len(looked) == 1, "not at once"
     now = time.time() + set_by
@@ -182,11 +182,11 @@ def test_a_clock_that_is_set_keeps_no_node_from_being_looked_at_again(
 def test_what_a_link_reports_is_published_once_and_what_belongs_to_a_retry_is_not(
     watch: LinkWatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[str] = []
-    monkeypatch.setattr(watch._live, "event", lambda _kind, **facts: told.append(facts["text"]), raising=False)
+    messages: list[str] = []
+    monkeypatch.setattr(watch._live, "event", lambda _kind, **facts: messages.append(facts["text"]), raising=False)
     for kind, text in (("foreign-tag", "a card"), ("foreign-tag", "a card"), ("retry", "again"), ("conflict", "two")):
         watch._notice(Notice(kind, text))
-    assert told == ["a card", "two"]
+    assert messages == ["a card", "two"]
 
 
 def test_a_reader_is_lent_again_while_it_is_being_opened(reader: LinkWatch, monkeypatch: pytest.MonkeyPatch) -> None:

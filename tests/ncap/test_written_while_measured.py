@@ -46,7 +46,7 @@ def lab(one_lab: Lab) -> Iterator[Lab]:
     one_lab.tidy()
 
 
-def told(lab: Lab) -> list[dict[str, Any]]:
+def events_of(lab: Lab) -> list[dict[str, Any]]:
     """What the daemon said of the node being measured, in order."""
     process = lab.service.process
     assert process is not None
@@ -57,7 +57,7 @@ def told(lab: Lab) -> list[dict[str, Any]]:
 
 
 def states(lab: Lab) -> list[str]:
-    return [entry["state"] for entry in told(lab)]
+    return [entry["state"] for entry in events_of(lab)]
 
 
 def calibrated(lab: Lab, most: float) -> Path:
@@ -76,8 +76,8 @@ def test_a_node_is_provisioned_while_it_is_measured_and_the_gap_is_told(lab: Lab
     assert done["verdict"] == "authentic"
     until(lambda: states(lab)[-1:] == ["joined"])
     assert states(lab) == ["joined", "left", "joined"]
-    assert told(lab)[1]["why"] == "let go for provision"
-    assert told(lab)[1]["id"] == measurement
+    assert events_of(lab)[1]["why"] == "let go for provision"
+    assert events_of(lab)[1]["id"] == measurement
     lab.flows()
     lab.service.end()
     lines = [json.loads(line) for line in (lab.service.station.home / "recordings/gap.jsonl").read_text().splitlines()]
@@ -99,7 +99,7 @@ def test_write_and_address_have_the_node_let_go_too(lab: Lab) -> None:
         until(lambda: states(lab)[-1] == "joined", "it is measured at its new address")
         lab.flows()
         assert lab.state()["address"] == other
-        left, joined = told(lab)[-2:]
+        left, joined = events_of(lab)[-2:]
         return unix(joined) - unix(left)
 
     best_of(3, 8.0, moved)  # not when its old address was given up, 10 s later

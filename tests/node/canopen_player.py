@@ -24,14 +24,14 @@ def main() -> None:
     node.tpdo.read(from_od=True)
     print(json.dumps({"ready": True}), flush=True)
     for line in sys.stdin:
-        told = json.loads(line)
+        record = json.loads(line)
         node.tpdo[1].stop()
-        if "temperature" in told:
-            node.sdo[0x6000][2].raw = told["temperature"]
-        if "torque" in told:
-            node.sdo[0x6000][1].raw = told["torque"]
-            node.tpdo[1][0].raw = told["torque"]
-        if not told.get("silent"):
+        if "temperature" in record:
+            node.sdo[0x6000][2].raw = record["temperature"]
+        if "torque" in record:
+            node.sdo[0x6000][1].raw = record["torque"]
+            node.tpdo[1][0].raw = record["torque"]
+        if not record.get("silent"):
             node.tpdo[1].start(0.05)
         print(json.dumps({"done": True}), flush=True)
 

@@ -25,8 +25,8 @@ def main() -> None:
                 line = sys.stdin.readline()
                 if not line:
                     return
-                told = json.loads(line)
-                every, frames, due = told["every"], told["frames"], time.monotonic()
+                record = json.loads(line)
+                every, frames, due = record["every"], record["frames"], time.monotonic()
                 print(json.dumps({"sent": sent}), flush=True)
             for identifier, data in frames:
                 octets = bytes.fromhex(data)

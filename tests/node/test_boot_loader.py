@@ -162,7 +162,7 @@ def test_damaged_boot_state_is_named(folder: Path) -> None:
             ImageSlots(folder)
 
 
-class _PowerCut(Exception):
+class _PowerCutError(Exception):
     """The power went."""
 
 
@@ -179,7 +179,7 @@ def test_power_that_fails_at_any_step_leaves_the_old_image_or_the_new_one(
         nonlocal left
         left -= 1
         if left < 0:
-            raise _PowerCut
+            raise _PowerCutError
 
     def cut_state(path: Path, octets: bytes) -> None:
         spend()
@@ -188,7 +188,7 @@ def test_power_that_fails_at_any_step_leaves_the_old_image_or_the_new_one(
     def cut_write(slots: ImageSlots, at: int, octets: bytes) -> None:
         try:
             spend()
-        except _PowerCut:
+        except _PowerCutError:
             write(slots, at, octets[: len(octets) // 2])
             raise
         write(slots, at, octets)
@@ -210,7 +210,7 @@ def test_power_that_fails_at_any_step_leaves_the_old_image_or_the_new_one(
         slots, left = started(node), cut
         try:
             update(slots)
-        except _PowerCut:
+        except _PowerCutError:
             assert cut < steps
         left = 100
         back = started(node)

@@ -27,7 +27,7 @@ IDENTIFY = b"\x00\x00\x80\x07\x00\x00"
 COUNT = b"\x00\x00\x01\x7f\x00\x00"
 
 
-class Stranger:
+class RawStation:
     """A station made of raw frames, at ``source``."""
 
     def __init__(self, spec: str, source: int = 0xF1) -> None:
@@ -83,27 +83,27 @@ def server(hub: Hub, node: EchoNode) -> Iterator[CanServer]:
 
 
 @pytest.fixture
-def station(hub: Hub, server: CanServer) -> Iterator[Stranger]:
-    station = Stranger(hub.spec)
+def station(hub: Hub, server: CanServer) -> Iterator[RawStation]:
+    station = RawStation(hub.spec)
     yield station
     station.bus.close()
 
 
-def test_answers_a_functional_identify_from_its_own_address(station: Stranger, node: EchoNode) -> None:
+def test_answers_a_functional_identify_from_its_own_address(station: RawStation, node: EchoNode) -> None:
     station.everyone("0742000080070000")
     assert station.ask(0x21, b"") == [b"\x42\x01\x00\x17" + node.identify()]
     assert node.seen == []
 
 
 @pytest.mark.parametrize("octets", ["0742000101010000", "06420000800700", "0842000080070000", "1042000080070000", "07"])
-def test_answers_nothing_else_that_is_asked_of_everyone(station: Stranger, node: EchoNode, octets: str) -> None:
+def test_answers_nothing_else_that_is_asked_of_everyone(station: RawStation, node: EchoNode, octets: str) -> None:
     station.everyone(octets)
     assert station.silence(0x21) == []
     assert node.seen == []
 
 
 def test_an_equal_repetition_is_not_run_again_even_after_a_functional_identify(
-    station: Stranger, node: EchoNode
+    station: RawStation, node: EchoNode
 ) -> None:
     assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
     station.everyone("0742000080070000")
@@ -115,7 +115,7 @@ def test_an_equal_repetition_is_not_run_again_even_after_a_functional_identify(
 
 
 def test_a_repetition_that_comes_while_the_first_is_still_being_run_gets_the_same_reply_once_more(
-    station: Stranger, node: EchoNode
+    station: RawStation, node: EchoNode
 ) -> None:
     node.free.clear()
     pair = Pair(station.source, 0x21, station.bus.send)
@@ -127,11 +127,11 @@ def test_a_repetition_that_comes_while_the_first_is_still_being_run_gets_the_sam
 
 
 def test_a_strangers_questions_end_no_session_and_take_no_stored_reply(
-    hub: Hub, station: Stranger, node: EchoNode
+    hub: Hub, station: RawStation, node: EchoNode
 ) -> None:
     assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
     for source in range(0xF2, 0xF8):
-        other = Stranger(hub.spec, source)
+        other = RawStation(hub.spec, source)
         try:
             assert other.ask(0x21, b"\x01" + IDENTIFY) == [b"\x01\x01\x00\x17" + node.identify()]
             other.everyone("0742000080070000")
@@ -142,8 +142,8 @@ def test_a_strangers_questions_end_no_session_and_take_no_stored_reply(
     assert node.runs == 1
 
 
-def test_lines_do_not_share_a_stored_reply(hub: Hub, station: Stranger, node: EchoNode) -> None:
-    other = Stranger(hub.spec, 0xF7)
+def test_lines_do_not_share_a_stored_reply(hub: Hub, station: RawStation, node: EchoNode) -> None:
+    other = RawStation(hub.spec, 0xF7)
     try:
         assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
         assert other.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x02"]
@@ -153,16 +153,16 @@ def test_lines_do_not_share_a_stored_reply(hub: Hub, station: Stranger, node: Ec
 
 
 @pytest.mark.parametrize("body", [b"\x01", b"\x01\x00\x00\x80\x07\x00"])
-def test_what_is_too_short_for_a_command_gets_a_reply_all_the_same(station: Stranger, body: bytes) -> None:
+def test_what_is_too_short_for_a_command_gets_a_reply_all_the_same(station: RawStation, body: bytes) -> None:
     (reply,) = station.ask(0x21, body)
     assert reply[:1] == b"\x01"
 
 
-def test_a_command_of_bad_form_gets_what_the_node_says_of_it(station: Stranger) -> None:
+def test_a_command_of_bad_form_gets_what_the_node_says_of_it(station: RawStation) -> None:
     assert station.ask(0x21, b"\x05\x00\x00\x01\x03\x00\x09abc") == [b"\x05cba"]
 
 
-def test_other_addresses_are_not_its_own(station: Stranger, node: EchoNode) -> None:
+def test_other_addresses_are_not_its_own(station: RawStation, node: EchoNode) -> None:
     assert station.silence(0x22, b"\x01" + IDENTIFY) == []
     assert station.ask(0x21, b"\x02\x00\x00\x80\x0a\x00\x01\x22") == [b"\x02\x01\x00\x00"]
     assert len(station.ask(0x22, b"\x01" + IDENTIFY)) == 1
@@ -170,14 +170,14 @@ def test_other_addresses_are_not_its_own(station: Stranger, node: EchoNode) -> N
 
 
 def test_a_station_outside_f1_to_f7_is_not_heard(hub: Hub, server: CanServer, node: EchoNode) -> None:
-    outsider = Stranger(hub.spec, 0xF8)
+    outsider = RawStation(hub.spec, 0xF8)
     try:
         assert outsider.silence(0x21, b"\x01" + IDENTIFY) == []
     finally:
         outsider.bus.close()
 
 
-def test_an_overlong_message_is_told_off_and_the_line_goes_on(station: Stranger) -> None:
+def test_an_overlong_message_is_told_off_and_the_line_goes_on(station: RawStation) -> None:
     station.bus.send(Frame(physical_id(0x21, 0xF1), bytes.fromhex("1000000010000000")))
     assert wait_for(lambda: bool(station.silence(0x21, seconds=0.1) or station.frames))
     assert [frame.data for frame in station.frames] == [bytes.fromhex("05000000010acccc")], (
@@ -186,7 +186,7 @@ def test_an_overlong_message_is_told_off_and_the_line_goes_on(station: Stranger)
     assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
 
 
-def test_garbage_on_the_line_does_no_harm(station: Stranger) -> None:
+def test_garbage_on_the_line_does_no_harm(station: RawStation) -> None:
     for octets in ("", "00", "ff", "30", "37ffff", "2199", "1005010203040506", "4f00000000000000", "0f010203"):
         station.bus.send(Frame(physical_id(0x21, 0xF1), bytes.fromhex(octets)))
     station.bus.send(Frame(0x18DA21F1, single(b"\x09" + COUNT)))
@@ -196,7 +196,7 @@ def test_garbage_on_the_line_does_no_harm(station: Stranger) -> None:
 def test_stopping_ends_the_sessions(hub: Hub, node: EchoNode) -> None:
     server = CanServer(hub.spec, node)
     server.start()
-    station = Stranger(hub.spec)
+    station = RawStation(hub.spec)
     assert len(station.ask(0x21, b"\x09" + COUNT)) == 1
     server.stop()
     station.bus.close()
@@ -236,7 +236,7 @@ def test_announces_itself_once_after_its_start(hub: Hub, server: CanServer, node
 
 
 def test_moves_away_from_a_smaller_crc_and_ends_the_sessions_there(
-    station: Stranger, server: CanServer, node: EchoNode, hub: Hub
+    station: RawStation, server: CanServer, node: EchoNode, hub: Hub
 ) -> None:
     assert len(station.ask(0x21, b"\x09" + COUNT)) == 1
     station.bus.send(Frame(0x18DAF122, b"\x30\x00\x00"))  # somebody at 0x22 is heard
@@ -248,14 +248,14 @@ def test_moves_away_from_a_smaller_crc_and_ends_the_sessions_there(
     assert station.silence(0x21, b"\x0b" + COUNT) == []
 
 
-def test_stays_before_a_greater_crc_and_says_so(station: Stranger, hub: Hub, node: EchoNode) -> None:
+def test_stays_before_a_greater_crc_and_says_so(station: RawStation, hub: Hub, node: EchoNode) -> None:
     assert wait_for(lambda: len(announces(hub)) == 1)
     station.bus.send(Frame(0x1CFF0021, Announce(0x21, 0, zlib.crc32(node.uuid) + 1).encode()))
     assert wait_for(lambda: len(announces(hub)) == 3)  # its own, the stranger's, its own again
     assert node.address == 0x21
 
 
-def test_stays_with_an_actuator_claimed(station: Stranger, hub: Hub, node: EchoNode) -> None:
+def test_stays_with_an_actuator_claimed(station: RawStation, hub: Hub, node: EchoNode) -> None:
     node.pinned = True
     station.bus.send(Frame(0x1CFF0021, Announce(0x21, 0, zlib.crc32(node.uuid) - 1).encode()))
     assert wait_for(lambda: len(announces(hub)) >= 2)
@@ -263,15 +263,15 @@ def test_stays_with_an_actuator_claimed(station: Stranger, hub: Hub, node: EchoN
 
 
 def test_an_equal_crc_is_told_to_a_person(hub: Hub, node: EchoNode) -> None:
-    told: list[str] = []
-    server = CanServer(hub.spec, node, notify=told.append)
+    messages: list[str] = []
+    server = CanServer(hub.spec, node, notify=messages.append)
     server.start()
-    stranger = Stranger(hub.spec)
+    stranger = RawStation(hub.spec)
     try:
         for _ in range(2):
             stranger.bus.send(Frame(0x1CFF0021, Announce(0x21, 0, zlib.crc32(node.uuid)).encode()))
-        assert wait_for(lambda: len(told) == 1)
-        assert node.uuid.hex() in told[0]
+        assert wait_for(lambda: len(messages) == 1)
+        assert node.uuid.hex() in messages[0]
         assert node.address == 0x21
     finally:
         server.stop()
@@ -299,7 +299,7 @@ def test_200_nodes_in_one_process_answer_everyone_and_keep_to_few_threads(hub: H
         server.add(node)
     before = threading.active_count()
     server.start()
-    stranger = Stranger(hub.spec)
+    stranger = RawStation(hub.spec)
     try:
         pairs = {node.address: Pair(0xF1, node.address, stranger.bus.send) for node in nodes}
         answers: dict[int, bytes] = {}
@@ -324,7 +324,7 @@ def test_200_nodes_in_one_process_answer_everyone_and_keep_to_few_threads(hub: H
         stranger.bus.close()
 
 
-class Listening(EchoNode):
+class TriggerListener(EchoNode):
     """A node that notes at which tick it heard a trigger."""
 
     def __init__(self, address: int) -> None:
@@ -347,11 +347,11 @@ class Listening(EchoNode):
 
 def test_a_trigger_is_timed_while_a_data_frame_of_the_node_is_still_on_the_wire(hub: Hub) -> None:
     """The tick of a trigger is that of its end within 100 µs (operation.md section 5), whatever the node sends."""
-    node = Listening(0x21)
+    node = TriggerListener(0x21)
     server = CanServer(f"{hub.spec}&pace=1&bitrate=200")  # a frame of 8 octets takes 0.65 s
     server.add(node, measuring=node)
     server.start()
-    stranger = Stranger(hub.spec)
+    stranger = RawStation(hub.spec)
     try:
         assert stranger.ask(0x21, b"\x09" + COUNT)
         ends: list[int] = []
@@ -372,7 +372,7 @@ def test_a_trigger_is_timed_while_a_data_frame_of_the_node_is_still_on_the_wire(
         stranger.bus.close()
 
 
-def test_a_lost_flow_control_costs_the_next_request_nothing(station: Stranger, server: CanServer) -> None:
+def test_a_lost_flow_control_costs_the_next_request_nothing(station: RawStation, server: CanServer) -> None:
     """The node waits for a flow control that never comes; the same request again gets the whole stored reply."""
     request = b"\x05\x00\x00\x01\x03\x00\x1e" + bytes(30)
     pair = Pair(0xF1, 0x21, station.bus.send)
@@ -393,7 +393,7 @@ def test_comes_back_from_a_lost_bus_silent_and_announces_again(node: EchoNode) -
     hub = Hub(port=free_tcp_port())  # not one that the system may deal out to others while it is closed
     server = CanServer(hub.spec, node)
     server.start()
-    stranger = Stranger(hub.spec)
+    stranger = RawStation(hub.spec)
     assert len(stranger.ask(0x21, b"\x09" + COUNT)) == 1
     stranger.bus.close()
     port = hub.port
@@ -408,7 +408,7 @@ def test_comes_back_from_a_lost_bus_silent_and_announces_again(node: EchoNode) -
 
 
 def test_a_question_to_everyone_in_a_station_s_own_name_costs_its_reply_nothing(
-    hub: Hub, station: Stranger, server: CanServer
+    hub: Hub, station: RawStation, server: CanServer
 ) -> None:
     """A stranger asks everyone from this address while the reply waits for its flow control, and before it leaves."""
     request = b"\x05\x00\x00\x01\x03\x00\x1e" + bytes(30)
@@ -431,7 +431,7 @@ def test_a_question_to_everyone_in_a_station_s_own_name_costs_its_reply_nothing(
 
 
 def test_forged_announces_move_it_three_times_at_once_and_then_later(
-    station: Stranger, hub: Hub, node: EchoNode, server: CanServer
+    station: RawStation, hub: Hub, node: EchoNode, server: CanServer
 ) -> None:
     for moves in range(1, 4):
         station.bus.send(Frame(0x1CFF0000 | node.address, Announce(node.address, 0, 0).encode()))
@@ -442,7 +442,7 @@ def test_forged_announces_move_it_three_times_at_once_and_then_later(
     assert time.monotonic() - asked >= 1.0
 
 
-def test_a_repetition_that_meets_the_reply_costs_neither(station: Stranger, server: CanServer) -> None:
+def test_a_repetition_that_meets_the_reply_costs_neither(station: RawStation, server: CanServer) -> None:
     """The first frame of the reply and that of the repeated request cross on the bus."""
     request = b"\x05\x00\x00\x01\x03\x00\x1e" + bytes(30)
     pair = Pair(0xF1, 0x21, station.bus.send)
@@ -462,7 +462,7 @@ def test_a_repetition_that_meets_the_reply_costs_neither(station: Stranger, serv
 
 
 def test_a_pressed_button_is_announced_at_once_and_claims_nothing(
-    station: Stranger, server: CanServer, node: EchoNode, hub: Hub
+    station: RawStation, server: CanServer, node: EchoNode, hub: Hub
 ) -> None:
     assert wait_for(lambda: len(announces(hub)) == 1)
     for _ in range(3):

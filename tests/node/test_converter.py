@@ -80,8 +80,8 @@ def test_a_turned_scale_gives_the_sample_of_the_same_angle_quickly(zero: float, 
 def test_raw_numbers_are_rounded_and_kept_within_the_sample(channel: tuple[Sheet, Converter]) -> None:
     _, converter = channel
     most = int(converter.form.raw_range[1])  # type: ignore[index]
-    told = [converter.octets(Reading(raw=raw)) for raw in (-5.0, 7.6, 1e9)]
-    assert [int.from_bytes(octets, "big") for octets in told] == [0, 8, most]
+    encoded = [converter.octets(Reading(raw=raw)) for raw in (-5.0, 7.6, 1e9)]
+    assert [int.from_bytes(octets, "big") for octets in encoded] == [0, 8, most]
 
 
 def test_floats_carry_si_values() -> None:

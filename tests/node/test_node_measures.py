@@ -234,9 +234,9 @@ def test_an_actuator_shows_what_it_is_told_and_goes_safe_by_its_dead_man(scene: 
     station.operate(1, dead_man=400)
     station.send(set_values([(1, half)]))
     assert wait_for(lambda: len(actuator_lines(process)) == 3)
-    told, safe = actuator_lines(process)[1:]
-    assert (told["name"], told["safe"]) == ("opening set point", False)
-    assert told["value"] == pytest.approx((converter.low + converter.high) / 2, rel=1e-3)
+    driven, safe = actuator_lines(process)[1:]
+    assert (driven["name"], driven["safe"]) == ("opening set point", False)
+    assert driven["value"] == pytest.approx((converter.low + converter.high) / 2, rel=1e-3)
     assert (safe["safe"], safe["value"]) == (True, converter.low)
     state = station.states().channels[1][0]
     assert state & ChannelState.SAFE
@@ -348,7 +348,7 @@ def test_values_on_demand_over_nfc_and_a_battery_that_the_field_charges(scene: S
     port = NfcPort(path)
     try:
         process.wait_for_lines(1)
-        contact = port.find(lambda identity: True, seconds=20, notice=lambda told: None)
+        contact = port.find(lambda identity: True, seconds=20, notice=lambda reply: None)
         line = SealedLine(contact.link, contact.identity.uuid)
         line.operate()
         assert SampleReply.decode(line.send(sample([1])), 2).valid

@@ -62,7 +62,7 @@ def test_a_wake_during_a_beat_is_not_lost() -> None:
     pulse = RealtimeLoop()
     again = threading.Event()
 
-    class Waking(Node):
+    class WakingNode(Node):
         def beat(self) -> float | None:
             if len(self.beats) == 0:
                 pulse.wake(self)
@@ -70,7 +70,7 @@ def test_a_wake_during_a_beat_is_not_lost() -> None:
                 again.set()
             return super().beat()
 
-    node = Waking(lambda n: 3600.0)
+    node = WakingNode(lambda n: 3600.0)
     pulse.start()
     try:
         pulse.wake(node)

@@ -90,8 +90,8 @@ def test_every_source_of_the_contract_is_there() -> None:
 def test_a_file_is_played_back_and_nothing_is_valid_behind_it(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     path.write_text("# made by hand\nt,angle,raw:force\n10,1.5,7\n10.5,,8\n11,3,\n")
-    told: list[str] = []
-    source = make_source(f"file:{path}", PLACES, told.append)
+    messages: list[str] = []
+    source = make_source(f"file:{path}", PLACES, messages.append)
     assert [source.at(1, seconds) for seconds in (0.0, 0.4, 0.6, 1.2)] == [
         Reading(value=1.5),
         Reading(value=1.5),
@@ -101,7 +101,7 @@ def test_a_file_is_played_back_and_nothing_is_valid_behind_it(tmp_path: Path) ->
     assert source.at(2, 0.7) == Reading(raw=8.0)
     assert source.at(3, 0.0) is None
     assert [source.at(1, 1.6), source.at(1, 99.0)] == [None, None]
-    assert len(told) == 1
+    assert len(messages) == 1
 
 
 @pytest.mark.parametrize(
@@ -126,8 +126,8 @@ def test_a_bad_file_is_told_with_its_line(tmp_path: Path, text: str, place: str)
         make_source(f"file:{path}", PLACES, print)
 
 
-def lines(told: list[str], *, needs_time: bool = True) -> tuple[LineSource, Clock]:
-    source, clock = LineSource(PLACES, told.append, needs_time=needs_time), Clock()
+def lines(messages: list[str], *, needs_time: bool = True) -> tuple[LineSource, Clock]:
+    source, clock = LineSource(PLACES, messages.append, needs_time=needs_time), Clock()
     source.begin(clock)
     return source, clock
 
@@ -162,11 +162,11 @@ def test_lines_set_values_and_drive_the_clock() -> None:
     ],
 )
 def test_a_line_that_is_none_changes_nothing_and_is_counted(line: bytes) -> None:
-    told: list[str] = []
-    source, clock = lines(told)
+    messages: list[str] = []
+    source, clock = lines(messages)
     source.feed_line(b'{"t": 1, "value": {"angle": 1}}')
     source.feed_line(line)
-    assert (source.dropped, len(told), clock.seconds) == (1, 1, 1.0)
+    assert (source.dropped, len(messages), clock.seconds) == (1, 1, 1.0)
     assert source.at(1, 1.0) == Reading(value=1.0)
     source.feed_line(b'{"t": 1, "value": {"angle": 2}}')
     assert source.at(1, 1.0) == Reading(value=2.0)
@@ -247,9 +247,9 @@ def wait_for(what: Callable[[], object]) -> bool:
 
 def test_standard_input_ends_and_the_node_stays() -> None:
     reading, writing = os.pipe()
-    told: list[str] = []
+    messages: list[str] = []
     with os.fdopen(reading, "rb") as stream:
-        source, clock = StandardInput(PLACES, told.append, stream), Clock()
+        source, clock = StandardInput(PLACES, messages.append, stream), Clock()
         source.start(clock)
         os.write(writing, b'{"t": 1, "value": {"angle": 1}}\n{"t": 2, "val')
         assert wait_for(lambda: source.at(1, 1.0) == Reading(value=1.0))
@@ -258,13 +258,13 @@ def test_standard_input_ends_and_the_node_stays() -> None:
         assert clock.ended.wait(60)
         assert clock.steps == [1.0, 2.0]
         assert source.at(1, 2.0) is None
-        assert "end" in told[0]
+        assert "end" in messages[0]
         source.stop()
 
 
 def test_simulations_come_and_go_at_a_unix_socket(tmp_path: Path) -> None:
-    path, told, clock = tmp_path / "hand.sock", [], Clock()
-    source = make_source(f"unix:{path}", PLACES, told.append)
+    path, messages, clock = tmp_path / "hand.sock", [], Clock()
+    source = make_source(f"unix:{path}", PLACES, messages.append)
     source.start(clock)
     try:
         assert path.stat().st_mode & 0o777 == 0o600
@@ -306,9 +306,9 @@ sys.exit(3)
 
 
 def test_a_program_gives_values_is_told_what_actuators_do_and_may_end(tmp_path: Path) -> None:
-    path, told, clock = tmp_path / "hand.py", [], Clock()
+    path, messages, clock = tmp_path / "hand.py", [], Clock()
     path.write_text(PROGRAM)
-    source = make_source(f"exec:{sys.executable} {path}", PLACES, told.append)
+    source = make_source(f"exec:{sys.executable} {path}", PLACES, messages.append)
     source.start(clock)
     assert wait_for(lambda: source.at(1, 0.0) == Reading(value=1.0))
     source.acted({"gripper": 7.5})
@@ -316,7 +316,7 @@ def test_a_program_gives_values_is_told_what_actuators_do_and_may_end(tmp_path: 
     source.acted({"gripper": 0.0})
     assert clock.ended.wait(60)
     assert source.at(1, 0.0) is None
-    assert "ended with 3" in told[0]
+    assert "ended with 3" in messages[0]
     source.stop()
     with pytest.raises(NotFoundError):
         make_source("exec:/no/such/program", PLACES, print).start(clock)

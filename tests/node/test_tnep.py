@@ -49,7 +49,7 @@ class Desk:
         assert service is not None
         return Poller(self.mailbox, service)
 
-    def say(self, octets: bytes) -> tuple[message.NdefRecord, ...]:
+    def exchange(self, octets: bytes) -> tuple[message.NdefRecord, ...]:
         """Write one message and return the answer to it."""
         self.mailbox.write(octets)
         until = time.monotonic() + 5
@@ -73,23 +73,23 @@ def test_the_initial_message_offers_the_service_and_says_who_it_is(desk: Desk) -
 
 
 def test_a_frame_before_the_selection_is_a_protocol_error(desk: Desk) -> None:
-    assert tnep.status_of(desk.say(request(Piece(1, 4, 0, b"abcd")))) == tnep.PROTOCOL_ERROR
+    assert tnep.status_of(desk.exchange(request(Piece(1, 4, 0, b"abcd")))) == tnep.PROTOCOL_ERROR
     assert desk.handler.frames == []
 
 
 def test_a_message_that_is_nonsense_is_refused(desk: Desk) -> None:
-    assert tnep.status_of(desk.say(select())) == tnep.SUCCESS
+    assert tnep.status_of(desk.exchange(select())) == tnep.SUCCESS
     torn = bytearray(request(Piece(1, 4, 0, b"abcd")))
     torn[-1] ^= 1
     for nonsense in (bytes(torn), b"\xff\xff\xff", request(Piece(1, 4, 0, b"abcd", answer=True))):
-        assert tnep.status_of(desk.say(nonsense)) == tnep.GARBLED_REQUEST
+        assert tnep.status_of(desk.exchange(nonsense)) == tnep.GARBLED_REQUEST
     assert desk.handler.frames == []
 
 
 def test_selecting_another_service_gives_the_initial_message(desk: Desk) -> None:
     for uri in (b"urn:nfc:sn:handover", b""):
-        desk.say(select())
-        assert tnep.our_service(desk.say(message.encode([tnep.select(uri)]))) is not None
+        desk.exchange(select())
+        assert tnep.our_service(desk.exchange(message.encode([tnep.select(uri)]))) is not None
 
 
 def test_a_repeated_frame_is_not_run_again_until_the_field_was_gone(desk: Desk) -> None:
@@ -107,7 +107,7 @@ def test_a_repeated_frame_is_not_run_again_until_the_field_was_gone(desk: Desk) 
 
 
 def test_an_answer_that_is_ready_after_the_field_was_gone_is_not_put(desk: Desk) -> None:
-    desk.say(select())
+    desk.exchange(select())
     desk.handler.go.clear()
     desk.mailbox.write(request(Piece(1, 4, 0, b"abcd")))
     assert desk.mailbox.read() == b""  # more time, please
@@ -126,7 +126,7 @@ def test_no_message_upsets_the_node(messages: list[bytes]) -> None:
     desk = Desk(120)
     try:
         for octets in messages:
-            desk.say(octets)
+            desk.exchange(octets)
         desk.tag.activated()
         assert desk.tag.ready(5)
         assert desk.poller().transact(1, b"abcd")[4:] == b"abcd"
@@ -183,7 +183,7 @@ def test_a_battery_stands_first_in_the_initial_message_and_the_service_is_found(
 
 def test_a_charging_reader_that_writes_its_power_disturbs_nobody(desk: Desk) -> None:
     before = desk.mailbox.read()
-    assert desk.say(message.encode([message.NdefRecord(message.WELL_KNOWN, b"WLCINF", bytes(6))])) == message.decode(
-        before
-    )
-    assert tnep.status_of(desk.say(select())) == tnep.SUCCESS
+    assert desk.exchange(
+        message.encode([message.NdefRecord(message.WELL_KNOWN, b"WLCINF", bytes(6))])
+    ) == message.decode(before)
+    assert tnep.status_of(desk.exchange(select())) == tnep.SUCCESS

@@ -47,8 +47,8 @@ MISSING = Reading(missing=True)
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A\n'
 
 
-def reader(message: str, told: list[str] | None = None) -> MessageReader:
-    return MessageReader(dbc_message.read(DBC, message), (told if told is not None else []).append)
+def reader(message: str, messages: list[str] | None = None) -> MessageReader:
+    return MessageReader(dbc_message.read(DBC, message), (messages if messages is not None else []).append)
 
 
 def written(folder: Path, signals: str, more: str = "") -> DbcMessage:
@@ -162,8 +162,8 @@ def test_multiplexed_signals_come_in_turns_and_are_late_by_their_own_period() ->
 
 
 def test_a_j1939_message_is_matched_by_its_group_from_one_address() -> None:
-    told: list[str] = []
-    shaft = reader("Shaft", told)
+    messages: list[str] = []
+    shaft = reader("Shaft", messages)
     assert shaft.message.key == (pgn_of(0x18FEF121), True, True)
     assert pgn_of(0x18EA2133) == pgn_of(0x18EA0033) == 0xEA00
     shaft.handle(SensorFrame(0x18FEF121, True, bytes.fromhex("4038c8ffffffffff"), 5.0))
@@ -171,7 +171,7 @@ def test_a_j1939_message_is_matched_by_its_group_from_one_address() -> None:
     assert speed.channel.value(0x3840) == 1800
     assert speed.at(5.0)[0] is not None
     shaft.handle(SensorFrame(0x18FEF122, True, bytes.fromhex("0000ffffffffffff"), 5.01))
-    assert told == ["Shaft also comes from the source address 0x22; only 0x21 is read."]
+    assert messages == ["Shaft also comes from the source address 0x22; only 0x21 is read."]
     assert load.last is not None
     assert load.last.raw == 0xC8
     shaft.handle(SensorFrame(0x18FEF121, True, bytes.fromhex("fffffeffffffffff"), 5.02))
@@ -198,12 +198,12 @@ def test_reasons_and_their_order() -> None:
 
 
 def test_a_frame_that_cannot_be_decoded_is_counted_and_changes_nothing() -> None:
-    told: list[str] = []
-    supply = reader("Supply", told)
+    messages: list[str] = []
+    supply = reader("Supply", messages)
     supply.handle(SensorFrame(292, False, bytes.fromhex("05"), 1.0))
     supply.handle(SensorFrame(292, False, bytes.fromhex("0500000000000000"), 1.0))
-    assert (supply.frames, supply.bad, len(told)) == (0, 2, 1)
-    assert "Supply cannot be decoded" in told[0]
+    assert (supply.frames, supply.bad, len(messages)) == (0, 2, 1)
+    assert "Supply cannot be decoded" in messages[0]
     assert all(part.last is None for part in supply.values)
 
 
@@ -331,9 +331,9 @@ def test_a_certificate_of_a_wrapped_sensor_corrects_what_its_frames_indicate() -
 
 @pytest.mark.link
 def test_a_bus_that_is_lost_makes_values_invalid_and_is_opened_again() -> None:
-    told: list[str] = []
+    messages: list[str] = []
     torque, bus = reader("Torque"), free_bus()
-    running = CanReader(parse_spec(bus), [torque], told.append)
+    running = CanReader(parse_spec(bus), [torque], messages.append)
     running.start()
     group, port = bus.removeprefix("udp_multicast:").split("?port=")
     frame = can.Message(arbitration_id=291, is_extended_id=False, data=bytes(8))
@@ -349,8 +349,8 @@ def test_a_bus_that_is_lost_makes_values_invalid_and_is_opened_again() -> None:
             until(arrives)
             assert running._bus is not None
             running._bus._bus.shutdown()  # as an adapter that is pulled out
-            until(lambda: bool(told))
-            assert "invalid until the bus is back" in told[0]
+            until(lambda: bool(messages))
+            assert "invalid until the bus is back" in messages[0]
             assert "cannot be read" in torque.values[0].at(time.monotonic() + 10)[1]
             until(arrives)
             assert "cannot be read" not in torque.values[0].at(time.monotonic() + 10)[1]

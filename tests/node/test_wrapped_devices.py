@@ -67,7 +67,7 @@ class Device:
         assert self.process.stdout is not None
         return json.loads(self.process.stdout.readline())
 
-    def tell(self, **what: object) -> None:
+    def send(self, **what: object) -> None:
         assert self.process.stdin is not None
         self.process.stdin.write(json.dumps(what) + "\n")
         self.process.stdin.flush()
@@ -116,38 +116,38 @@ def test_an_eds_gives_channels_with_range_factor_and_period() -> None:
 
 @pytest.mark.link
 def test_pdos_are_mapped_as_the_device_says_and_the_rest_is_asked_for(bus: str, device: Device) -> None:
-    told: list[str] = []
-    reader = DeviceReader(EDS, 5, told.append)
+    messages: list[str] = []
+    reader = DeviceReader(EDS, 5, messages.append)
     torque, temperature = reader.values
-    running = CanopenReader(parse_spec(bus), [reader], told.append)
+    running = CanopenReader(parse_spec(bus), [reader], messages.append)
     running.start()
     try:
-        device.tell(torque=1234, temperature=36.5)
+        device.send(torque=1234, temperature=36.5)
         until(lambda: shown(torque) == pytest.approx(123.4))
         until(lambda: shown(temperature) == pytest.approx(36.5))
-        device.tell(torque=-2001)
+        device.send(torque=-2001)
         until(lambda: shown(torque) == "-200.1 N·m is outside -200 to 200 N·m")
-        device.tell(silent=True)
+        device.send(silent=True)
         until(lambda: shown(torque) == "no PDO for 1500 ms, 3 periods of 500 ms")
         assert shown(temperature) == pytest.approx(36.5)
-        assert told == []
+        assert messages == []
     finally:
         running.stop()
 
 
 @pytest.mark.link
 def test_a_device_that_is_not_there_is_looked_for_until_it_comes(bus: str) -> None:
-    told: list[str] = []
-    reader = DeviceReader(EDS, 5, told.append)
-    running = CanopenReader(parse_spec(bus), [reader], told.append)
+    messages: list[str] = []
+    reader = DeviceReader(EDS, 5, messages.append)
+    running = CanopenReader(parse_spec(bus), [reader], messages.append)
     running.start()
     try:
-        until(lambda: bool(told))
-        assert told[0].startswith("CANopen device 5: its PDO mapping cannot be read")
+        until(lambda: bool(messages))
+        assert messages[0].startswith("CANopen device 5: its PDO mapping cannot be read")
         assert "cannot be read" in str(shown(reader.values[0]))
         late = Device(bus)
         try:
-            late.tell(torque=10)
+            late.send(torque=10)
             until(lambda: shown(reader.values[0]) == pytest.approx(1.0))
         finally:
             late.close()
@@ -296,15 +296,15 @@ def test_a_buffer_that_may_not_be_used_is_left_alone(sysfs: Callable[..., Path],
     (tmp_path / "dev" / "iio:device0").mkdir()  # cannot be read, whoever runs this test
     (folder / "buffer" / "length").unlink()
     (folder / "buffer" / "length").mkdir()
-    told: list[str] = []
-    reader = IioReader(iio_device.find(f"adxl355?root={tmp_path}"), told.append)
+    messages: list[str] = []
+    reader = IioReader(iio_device.find(f"adxl355?root={tmp_path}"), messages.append)
     (folder / "in_accel_x_raw").write_text("1000\n")
     reader.start()
     try:
         until(lambda: shown(reader.values[0]) == pytest.approx(1000 * 0.000038245))
     finally:
         reader.stop()
-    assert "its files are read one by one" in told[0]
+    assert "its files are read one by one" in messages[0]
     assert (folder / "scan_elements" / "in_accel_x_en").read_text() == "0"
 
 

@@ -67,7 +67,7 @@ def run(browser: Browser, lab: Lab, seconds: float) -> Load:
         )
         with opened(browser, lab, route="measure") as page:
             kept = station.request("POST", "/measurements", {"uuids": uuids, "rate": RATE})["id"]
-            until(lambda: told(page)["received"] > RATE * SHOWN, "no points arrive", 30)
+            until(lambda: counts_of(page)["received"] > RATE * SHOWN, "no points arrive", 30)
             devtools = page.context.new_cdp_session(page)
             began, heaps = time.monotonic(), []
             for _ in range(LOOKS):
@@ -77,11 +77,13 @@ def run(browser: Browser, lab: Lab, seconds: float) -> Load:
             sampled, lost = samples(station)
             station.request("DELETE", f"/measurements/{kept}", {})
             page.wait_for_timeout(1500)  # the page tells of itself once a second
-            said, took = told(page), time.monotonic() - began
-    return Load(took, tuple(heaps), said["received"], said["dropped"], said["drawn"], said["skipped"], sampled, lost)
+            counts, elapsed = counts_of(page), time.monotonic() - began
+    return Load(
+        elapsed, tuple(heaps), counts["received"], counts["dropped"], counts["drawn"], counts["skipped"], sampled, lost
+    )
 
 
-def told(page: Page) -> dict[str, int]:
+def counts_of(page: Page) -> dict[str, int]:
     """What the plot says of itself, once a second."""
     dataset = page.locator(".plot-foot").evaluate("foot => ({...foot.dataset})")
     return {name: int(dataset.get(name, 0)) for name in ("received", "dropped", "drawn", "skipped")}

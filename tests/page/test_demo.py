@@ -17,18 +17,18 @@ pytestmark = pytest.mark.link
 def test_the_demo_serves_the_page_measures_and_leaves_nothing_behind() -> None:
     running = Running("--json", "demo", "--page")
     try:
-        [told] = running.wait_for_lines(1, 150)
+        [line] = running.wait_for_lines(1, 150)
         browser = urllib.request.build_opener(
             urllib.request.ProxyHandler({}), urllib.request.HTTPCookieProcessor(CookieJar())
         )
-        with browser.open(told["url"], timeout=60) as page:
+        with browser.open(line["url"], timeout=60) as page:
             assert b"js/main.js" in page.read()
-        with browser.open(told["url"].split("/login")[0] + "/api/v1/measurements", timeout=60) as answer:
+        with browser.open(line["url"].split("/login")[0] + "/api/v1/measurements", timeout=60) as answer:
             assert b'"group":"crane"' in answer.read()
-        assert Path(told["home"]).exists()
+        assert Path(line["home"]).exists()
         running.signal(signal.SIGINT)
         assert running.end().code == 0
-        assert not Path(told["home"]).exists()
+        assert not Path(line["home"]).exists()
     finally:
         running.close()
 

@@ -112,25 +112,25 @@ def test_a_service_without_a_link_says_how_to_add_one_until_it_has_one(browser: 
     words = ["--home", fresh.station.home, "--json", "ncap", "run", "--http", f"127.0.0.1:{fresh.port}"]
     fresh.daemon = fresh.desk.start(*words, passphrase=PASSPHRASE)
     fresh.daemon.wait_for('"ready": true')
-    told = "No link is configured"
+    message = "No link is configured"
     for width in (360, 1600):
         with opened(browser, fresh, width=width) as page:
-            page.locator("p:visible", has_text=told).get_by_text("teds-provision ncap run --can").wait_for()
+            page.locator("p:visible", has_text=message).get_by_text("teds-provision ncap run --can").wait_for()
             assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     with opened(browser, fresh, route="station") as page:
-        page.get_by_label("Links").get_by_text(told).wait_for()
+        page.get_by_label("Links").get_by_text(message).wait_for()
         with client.connect(home=fresh.station.home) as station:
             station.request("POST", "/virtual", {"profile": ANGLE, "name": "lone"})
         page.goto(f"{fresh.url}/#/nodes")
         page.locator(".card", has_text="lone").wait_for()
-        page.locator(".side").get_by_text(told).wait_for()  # their bus reaches no board
+        page.locator(".side").get_by_text(message).wait_for()  # their bus reaches no board
         fresh.end()
         fresh.run()
         page.locator("#connection", has_text="Live").wait_for()
-        page.locator(".side").get_by_text(told).wait_for(state="hidden")
+        page.locator(".side").get_by_text(message).wait_for(state="hidden")
         with opened(browser, fresh) as after:
             after.locator(".card", has_text="lone").wait_for()
-            assert after.locator("p:visible", has_text=told).count() == 0
+            assert after.locator("p:visible", has_text=message).count() == 0
 
 
 WIDE = pytest.mark.nightly(
@@ -145,7 +145,7 @@ def test_long_names_fit_the_window(browser: Browser, lab: Lab, width: int) -> No
     with lab.visited(), opened(browser, lab, width=width) as page, client.connect(home=lab.station.home) as station:
         station.request("POST", "/groups", {"name": "g" * 60, "uuids": [uuid]})
         station.request("POST", "/measurements", {"group": "g" * 60, "rate": 20, "sinks": [f"{name}.csv"]})
-        until(lambda: [one["state"] for one in station.measurements()] == ["running"])
+        until(lambda: [measurement["state"] for measurement in station.measurements()] == ["running"])
         for view, words in (("station", name), ("measure", "g" * 60), (f"nodes/{uuid}/live", "g" * 60)):
             page.goto(f"{lab.url}/#/{view}")
             page.get_by_text(words).locator("visible=true").first.wait_for()

@@ -14,7 +14,7 @@ from tests.bench import MemoryLink
 from tests.e2e.desk import Desk
 from tests.plant.owner import alone, job_of, join, member, roster_of
 from tests.plant.stations import certified
-from tests.plant.test_jobs import board, build, line_of
+from tests.plant.test_jobs import build, line_of, make_board
 
 from .lab import Lab, opened
 
@@ -39,11 +39,11 @@ def line(tmp_path: Path) -> Iterator[Lab]:
     join(station, roster_of(station, *members, version=2, previous=station.plant.roster.hash))
     allotted = {station.identity.fingerprint: 5, east.identity.fingerprint: 3}
     run = line_of(station, count=8, stations=allotted)
-    one = board(1)
+    board = make_board(1)
     with pytest.raises(NodeSilentError):
-        build(run, one, MemoryLink(one, lose_request=4))
+        build(run, board, MemoryLink(board, lose_request=4))
     for number in (1, 2, 3):
-        build(run, one if number == 1 else board(number))
+        build(run, board if number == 1 else make_board(number))
     take_job(station, job_of(station, title="<b>later</b>"))
     station.close()
     east.close()
@@ -61,8 +61,8 @@ def test_a_job_shows_its_yield_its_seconds_and_its_failures(browser: Browser, li
             ("three angles", 3, 3, 8),
             ("<b>later</b>", 0, 0, 3),
         ]
-        told = asked.request("GET", f"/jobs/{jobs[0]['id'][:8]}")
-        parts = {station["name"]: station for station in told["stations"]}
+        job = asked.request("GET", f"/jobs/{jobs[0]['id'][:8]}")
+        parts = {station["name"]: station for station in job["stations"]}
         assert parts["owner"]["first_pass"] == pytest.approx(2 / 3, abs=1e-3)
         assert parts["owner"]["failures"] == {"node-silent": 1}
         assert (parts[EAST]["units"], parts[EAST]["first_pass"]) == (0, None)

@@ -72,14 +72,14 @@ def test_an_empty_home_says_what_to_do_next_and_a_tap_opens_the_node(browser: Br
 def test_measuring_is_said_of_a_node_that_is_measured_and_of_no_other(browser: Browser, lab: Lab) -> None:
     """A node that was refused had the word for as long as the measurement was kept."""
     with opened(browser, lab) as page:
-        told = page.evaluate(
+        texts = page.evaluate(
             """async () => {
                 const { node } = await import("/js/shapes.js");
                 const of = (state) => node({ uuid: "00", measurement: "m", measuring: state && { state } }).mode;
                 return ["running", "refused", "lost", undefined].map(of).concat(node({ uuid: "00" }).mode);
             }"""
         )
-    assert told == ["measuring", "refused, not measured", "lost, not measured", "waiting to be measured", None]
+    assert texts == ["measuring", "refused, not measured", "lost, not measured", "waiting to be measured", None]
 
 
 def test_a_node_that_leaves_is_shown_as_away(browser: Browser, fresh: Lab) -> None:
@@ -154,7 +154,7 @@ def test_a_verdict_that_rests_on_what_was_read_before_says_so_and_what_no_sessio
         },
     }
 
-    def told(route: Route) -> None:
+    def fulfil(route: Route) -> None:
         answer = route.fetch()
         found = answer.json()
         for node in found.get("nodes", [found]):
@@ -163,8 +163,8 @@ def test_a_verdict_that_rests_on_what_was_read_before_says_so_and_what_no_sessio
         route.fulfill(response=answer, json=found)
 
     with opened(browser, lab) as page:
-        page.route("**/api/v1/nodes*", told)
-        page.route(f"**/api/v1/nodes/{uuid}", told)
+        page.route("**/api/v1/nodes*", fulfil)
+        page.route(f"**/api/v1/nodes/{uuid}", fulfil)
         page.goto(f"{lab.url}/#/nodes/{uuid}")
         page.reload()
         head = page.locator(".node-head")

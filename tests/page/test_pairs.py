@@ -141,10 +141,10 @@ def test_a_datasheet_that_is_open_has_the_verdict_of_now(browser: Browser, lab: 
         until(lambda: (station.node(uuid)["verdict"] or {}).get("verdict") == "authentic")
         try:
             with opened(browser, lab, route=f"nodes/{uuid}/datasheet") as page:
-                head, told = page.locator(".node-facts .chip").first, page.locator(".sheet-verdict .chip").first
-                told.get_by_text("Authentic", exact=True).wait_for()
+                head, verdict = page.locator(".node-facts .chip").first, page.locator(".sheet-verdict .chip").first
+                verdict.get_by_text("Authentic", exact=True).wait_for()
                 lab.ask("revoke", uuid, "--why", "a test", "--yes")
                 head.get_by_text("Not authentic", exact=True).wait_for()
-                told.get_by_text("Not authentic", exact=True).wait_for()
+                verdict.get_by_text("Not authentic", exact=True).wait_for()
         finally:
             station.request("DELETE", f"/virtual/{uuid}")

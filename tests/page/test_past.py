@@ -39,8 +39,8 @@ def test_a_reload_loses_nothing_and_a_stretch_is_looked_at_closely(browser: Brow
         assert age(page, f"{uuid}/2") > 4
         page.locator(".rate").filter(has_text=re.compile(r"^(49|50)(\.\d)? Hz$")).first.wait_for()
         with client.connect(home=lab.station.home) as station:
-            told = station.measurements()[0]["nodes"][0]["lost"]
-            assert sum(station.past(uuid, 2, points=3600)["lost"]) == pytest.approx(told, abs=20), "as the report says"
+            lost = station.measurements()[0]["nodes"][0]["lost"]
+            assert sum(station.past(uuid, 2, points=3600)["lost"]) == pytest.approx(lost, abs=20), "as the report says"
         page.get_by_role("button", name="1 h").click()
         plot = page.locator(".canvas").first
         plot.scroll_into_view_if_needed()

@@ -74,7 +74,10 @@ def test_a_rate_that_can_be_carried_is_a_preset_and_a_lower_one_after_losses(
             assert lower <= 10
             assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
             card.locator(".rate-hint").get_by_role("button").click()
-            until(lambda: [one for one in station.measurements() if one["rate"] <= lower], "or lower by now")
+            until(
+                lambda: [measurement for measurement in station.measurements() if measurement["rate"] <= lower],
+                "or lower by now",
+            )
             card.get_by_text(re.compile("running")).first.wait_for()
             with opened(browser, fresh, width=width, route=f"nodes/{node.uuid}/live") as after:
                 after.get_by_text("Stop it there").wait_for()

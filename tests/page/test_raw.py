@@ -50,8 +50,8 @@ def test_raw_numbers_are_shown_marked_until_there_is_a_calibration(browser: Brow
         until(lambda: len(drawn(page, uuid)) > 20)
         assert max(drawn(page, uuid)) > 360, "raw numbers, not degrees"
         page.get_by_text(re.compile(r"\d+ samples, (none|\d+) lost,.* \d+ invalid\.")).wait_for()
-        told = page.locator(".mode .state").inner_text()
-        assert len(re.findall("calibrat", told)) == 1, "one explanation"
+        text = page.locator(".mode .state").inner_text()
+        assert len(re.findall("calibrat", text)) == 1, "one explanation"
         with opened(browser, fresh, route=f"nodes/{uuid}/live", width=360) as after:
             after.locator("tr .figure").filter(has_text=RAW).wait_for()
             until(lambda: len(drawn(after, uuid)) > 40, "what was measured before it was opened")
@@ -64,8 +64,8 @@ def test_raw_numbers_are_shown_marked_until_there_is_a_calibration(browser: Brow
                 fresh.provision("bare", ANGLE)
                 until(lambda: station.node(uuid)["channels"][0]["problem"] is None)
                 station.request("POST", "/measurements", {"uuids": [uuid], "rate": 50})
-            for each in (page, after):
-                each.locator("tr .figure").filter(has_text=VALUE).wait_for()
-                each.locator("figcaption .unit", has_text="°").wait_for()
-                until(lambda each=each: drawn(each, uuid))
-                assert max(drawn(each, uuid)) < 7, "radians: no raw number is among them"
+            for shown in (page, after):
+                shown.locator("tr .figure").filter(has_text=VALUE).wait_for()
+                shown.locator("figcaption .unit", has_text="°").wait_for()
+                until(lambda tab=shown: drawn(tab, uuid))
+                assert max(drawn(shown, uuid)) < 7, "radians: no raw number is among them"

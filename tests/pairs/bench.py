@@ -22,7 +22,7 @@ import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 
-from tests.pairs.cells import TIMES, Cell, Found, all_cells, run_cell
+from tests.pairs.cells import TIMES, Cell, CellResult, all_cells, run_cell
 from tests.pairs.changes import CHANGES
 from tests.pairs.long_runs import LONG_RUNS
 from tests.pairs.scene import Scenes
@@ -30,7 +30,7 @@ from tests.pairs.scene import Scenes
 GOOD, BAD, NOT_RUN = ".", "X", "-"
 
 
-def table(found: Iterable[Found]) -> str:
+def table(found: Iterable[CellResult]) -> str:
     """Return the result of each cell: a row for each change, a column for each long run, a letter for each time."""
     results = {
         (current.cell.change.name, current.cell.run, current.cell.when): BAD if current.complaints else GOOD
@@ -63,7 +63,7 @@ def main(arguments: list[str]) -> int:
     random.Random(1).shuffle(cells)  # so that a run that is cut short has seen some of everything
     began = time.monotonic()
 
-    def run(cell: Cell) -> Found | None:
+    def run(cell: Cell) -> CellResult | None:
         if time.monotonic() - began > chosen.minutes * 60:
             return None
         found = run_cell(scenes, cell, punctual=not chosen.busy)

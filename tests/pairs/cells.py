@@ -9,7 +9,7 @@ from typing import Final
 
 from tests.pairs.changes import CHANGES, Change
 from tests.pairs.long_runs import LONG_RUNS, LongRun
-from tests.pairs.scene import NODES, Ended, Scene, Scenes
+from tests.pairs.scene import NODES, Outcome, Scene, Scenes
 from tests.zygote import Child
 
 BEFORE: Final = "before"
@@ -33,7 +33,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Found:
+class CellResult:
     """The complaints of a cell, none if everything holds; ``seconds`` is what it took."""
 
     cell: Cell
@@ -49,7 +49,7 @@ def all_cells() -> Iterator[Cell]:
                 yield Cell(change, run, when)
 
 
-def run_cell(scenes: Scenes, cell: Cell, *, punctual: bool = True) -> Found:
+def run_cell(scenes: Scenes, cell: Cell, *, punctual: bool = True) -> CellResult:
     """Run one cell in a copy of its scene; ``punctual``: the machine is quiet enough for rules about time."""
     began = time.monotonic()
     kind = LONG_RUNS[cell.run]
@@ -65,7 +65,7 @@ def run_cell(scenes: Scenes, cell: Cell, *, punctual: bool = True) -> Found:
         finally:
             if long_run.child is not None:
                 long_run.child.close()
-    return Found(cell, tuple(complaints), time.monotonic() - began)
+    return CellResult(cell, tuple(complaints), time.monotonic() - began)
 
 
 def _meet(scene: Scene, cell: Cell, long_run: LongRun) -> list[str]:
@@ -105,8 +105,8 @@ def _start(scene: Scene, change: Change) -> Child | None:
     return scene.start(*change.words)
 
 
-def _end(scene: Scene, changing: Child | None) -> Ended:
-    return scene.end_of(changing) if changing is not None else Ended(0, "", "")
+def _end(scene: Scene, changing: Child | None) -> Outcome:
+    return scene.end_of(changing) if changing is not None else Outcome(0, "", "")
 
 
 def _work_undisturbed(long_run: LongRun) -> None:
@@ -117,7 +117,7 @@ def _work_undisturbed(long_run: LongRun) -> None:
     long_run.leaves = leaves
 
 
-def _follow(scene: Scene, change: Change, long_run: LongRun, ended: Ended) -> None:
+def _follow(scene: Scene, change: Change, long_run: LongRun, ended: Outcome) -> None:
     """Take note of what the change did; expect nothing of the long run on account of one that was refused."""
     if change.after is not None:
         change.after(scene, ended)
@@ -125,44 +125,46 @@ def _follow(scene: Scene, change: Change, long_run: LongRun, ended: Ended) -> No
         long_run.leaves = ()
 
 
-def _change_holds(scene: Scene, cell: Cell, long_run: LongRun, ended: Ended) -> list[str]:
+def _change_holds(scene: Scene, cell: Cell, long_run: LongRun, ended: Outcome) -> list[str]:
     """Compare the exit code of the change with the store, and repeat the change."""
     change = cell.change
-    said = []
+    differences = []
     may_refuse = change.refused is not None and long_run.measures
     if ended.is_bug or (ended.code and not (may_refuse and ended.code == change.refused)):
-        said.append(f"{change.name}: {ended}")
+        differences.append(f"{change.name}: {ended}")
     if change.done(scene) is not (ended.code == 0):
-        said.append(f"{change.name} ended with {ended.code}, its effect is {'' if ended.code else 'not '}in the store")
+        differences.append(
+            f"{change.name} ended with {ended.code}, its effect is {'' if ended.code else 'not '}in the store"
+        )
     if change.edit is not None:
-        return said
+        return differences
     again = scene.run(*change.words)
     if again.is_bug or again.code not in change.again:
-        said.append(f"{change.name}, repeated alone: {again}")
+        differences.append(f"{change.name}, repeated alone: {again}")
     if change.after is not None:
         change.after(scene, again)
     if not change.done(scene):
-        said.append(f"{change.name}, repeated alone, has no effect in the store")
-    return said
+        differences.append(f"{change.name}, repeated alone, has no effect in the store")
+    return differences
 
 
-def _store_holds(scene: Scene, cell: Cell, ended: Ended) -> list[str]:
+def _store_holds(scene: Scene, cell: Cell, ended: Outcome) -> list[str]:
     """Look at what no change may break: the log, every key, the verdicts, and rows that no process owns."""
-    said = []
+    differences = []
     log = scene.run("log")
     if log.code or not log.lines[-1]["intact"]:
-        said.append(f"the audit log does not hold: {log}")
+        differences.append(f"the audit log does not hold: {log}")
     opened = scene.run("vault", "rewrap", "--yes")
     if opened.code:
-        said.append(f"not every key opens: {opened}")
+        differences.append(f"not every key opens: {opened}")
     for name in _JUDGED:
         wanted = cell.change.verdicts.get(name, 0)
         verified = scene.run("verify", NODES[name], "BUS")
         if verified.code != wanted:
-            said.append(f"verify {name} ends with {verified.code}, not {wanted}: {verified}")
+            differences.append(f"verify {name} ends with {verified.code}, not {wanted}: {verified}")
     if rows := scene.count("SELECT count(*) FROM measurements"):
-        said.append(f"{rows} measurements of commands that have ended are in the store")
-    return said
+        differences.append(f"{rows} measurements of commands that have ended are in the store")
+    return differences
 
 
 def cell_named(name: str) -> Cell:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from tests.pairs.scene import ABSENT, NEW_PASSPHRASE, NODES, REVOKED, Ended, Scene
+from tests.pairs.scene import ABSENT, NEW_PASSPHRASE, NODES, REVOKED, Outcome, Scene
 
 MEASURING: Final = ("ncap run", "measure")
 PROVISIONING: Final = ("provision --watch", "provision --batch", "provision --all")
@@ -40,7 +40,7 @@ class Change:
     verdicts: Mapping[str, int] = field(default_factory=dict)
     again: tuple[int, ...] = (0,)
     ends: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    after: Callable[[Scene, Ended], None] | None = None
+    after: Callable[[Scene, Outcome], None] | None = None
     edit: Callable[[Scene], None] | None = None
 
 
@@ -84,7 +84,7 @@ def _holds_values(name: str) -> Looks:
     return lambda scene: (scene.files / name).exists() and '"event":"data"' in (scene.files / name).read_text()
 
 
-def _drop_empty_recording(scene: Scene, ended: Ended) -> None:
+def _drop_empty_recording(scene: Scene, ended: Outcome) -> None:
     """Remove the recording of a refused measurement: the same command would refuse to write over it."""
     if ended.code:
         (scene.files / "hand.jsonl").unlink(missing_ok=True)
@@ -106,7 +106,7 @@ def _set(name: str, value: object) -> Looks:
     return look
 
 
-def _keeps_new_passphrase(scene: Scene, ended: Ended) -> None:
+def _keeps_new_passphrase(scene: Scene, ended: Outcome) -> None:
     if ended.code == 0:
         scene.passphrases["bench"] = NEW_PASSPHRASE
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from tests.pace import PATIENCE, until
-from tests.pairs.scene import BOARDS, GROUP, NODES, Ended, Scene
+from tests.pairs.scene import BOARDS, GROUP, NODES, Outcome, Scene
 from tests.zygote import Child
 
 NAMES = {uuid: name for name, uuid in NODES.items()}
@@ -41,7 +41,7 @@ class LongRun(ABC):
     punctual: bool = True
     """False on a machine that is busy: how long something takes, and lost messages, count for nothing then."""
     child: Child | None = None
-    ended: Ended | None = None
+    ended: Outcome | None = None
     complaints: list[str] = field(default_factory=list)
 
     name: ClassVar[str]
@@ -55,7 +55,7 @@ class LongRun(ABC):
         """The lines of JSON that it has printed."""
         if self.ended is not None:
             return self.ended.lines
-        return Ended(0, self.child.stdout(), "").lines if self.child is not None else []
+        return Outcome(0, self.child.stdout(), "").lines if self.child is not None else []
 
     @property
     def settles(self) -> float:
@@ -119,7 +119,7 @@ class LongRun(ABC):
 
 
 @dataclass
-class Measuring(LongRun):
+class MeasuringRun(LongRun):
     """What ``measure`` and ``ncap run`` share: which nodes are measured."""
 
     measures = True
@@ -152,7 +152,7 @@ class Measuring(LongRun):
 
 
 @dataclass
-class Measure(Measuring):
+class Measure(MeasuringRun):
     """``measure GROUP`` to a file, until SIGTERM."""
 
     name = "measure"
@@ -182,16 +182,18 @@ class Measure(Measuring):
                 kept[line["uuid"]] += len(line["value"])
         for node in end["nodes"]:
             name = NAMES.get(node["uuid"], node["uuid"])
-            told = sum(stream["samples"] for stream in node["streams"])
-            if told != kept[node["uuid"]]:
-                self.complaints.append(f"measure reports {told} values of {name}, its file holds {kept[node['uuid']]}")
+            samples = sum(stream["samples"] for stream in node["streams"])
+            if samples != kept[node["uuid"]]:
+                self.complaints.append(
+                    f"measure reports {samples} values of {name}, its file holds {kept[node['uuid']]}"
+                )
             lost = sum(stream["lost"] + stream["bad"] for stream in node["streams"])
             if lost and self.punctual and name not in (*self.touches, *self.leaves):
                 self.complaints.append(f"measure lost {lost} messages of {name}")
 
 
 @dataclass
-class Ncap(Measuring):
+class Ncap(MeasuringRun):
     """``ncap run --measure GROUP``, recording, until SIGTERM."""
 
     name = "ncap run"
@@ -339,7 +341,7 @@ class Sheet(Watch):
 
 
 @dataclass
-class All(LongRun):
+class ProvisionAll(LongRun):
     """``provision --all`` over the bus: three boards that take a second or two each."""
 
     name = "provision --all"
@@ -464,12 +466,14 @@ class Sync(LongRun):
         if bench != line:
             self.complaints.append(f"the members hold different pages: {bench} and {line}")
         status = self.scene.run("registry", "status")
-        told = status.lines[-1] if status.lines else {}
-        if status.code or told.get("alarms") or told.get("conflicts") or told.get("unsent"):
+        summary = status.lines[-1] if status.lines else {}
+        if status.code or summary.get("alarms") or summary.get("conflicts") or summary.get("unsent"):
             self.complaints.append(f"registry status: {status}")
 
     def _pages(self, home: str) -> int:
         return self.scene.count("SELECT count(*) FROM pages", home=home)
 
 
-LONG_RUNS: dict[str, type[LongRun]] = {kind.name: kind for kind in (Ncap, Measure, Watch, Sheet, All, Signer, Sync)}
+LONG_RUNS: dict[str, type[LongRun]] = {
+    kind.name: kind for kind in (Ncap, Measure, Watch, Sheet, ProvisionAll, Signer, Sync)
+}

@@ -67,7 +67,7 @@ _TIMED_OUT = -1
 
 
 @dataclass(frozen=True)
-class Ended:
+class Outcome:
     """How a command ended, and its output."""
 
     code: int
@@ -153,7 +153,7 @@ class Scene:
             for descriptor in secrets:
                 os.close(descriptor)
 
-    def run(self, *words: str, home: str = "bench", seconds: float = 120.0) -> Ended:
+    def run(self, *words: str, home: str = "bench", seconds: float = 120.0) -> Outcome:
         """Run a command of a station to its end."""
         return self.end_of(self.start(*words, home=home), seconds)
 
@@ -163,14 +163,14 @@ class Scene:
         assert ended.code == 0, f"{' '.join(words)}: {ended}"
         return ended.lines[-1]
 
-    def end_of(self, child: Child, seconds: float = 120.0) -> Ended:
+    def end_of(self, child: Child, seconds: float = 120.0) -> Outcome:
         """Wait for the end of a command; one that takes longer than ``seconds`` is killed, and ends with -1."""
         try:
             code = child.wait(seconds)
         except Exception:  # noqa: BLE001  subprocess.TimeoutExpired: it has been killed
             code = _TIMED_OUT
         try:
-            return Ended(code, child.stdout(), child.stderr())
+            return Outcome(code, child.stdout(), child.stderr())
         finally:
             child.close()
 

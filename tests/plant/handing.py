@@ -173,9 +173,9 @@ class Plant:
                 if word in self.deaf and word != name:
                     continue
                 for _, _, text in station.plant.outbox(10_000):
-                    told = event.read(json.loads(text))
-                    if isinstance(told, event.Event) and told.uuid == uuid:
-                        claims.setdefault(station.fingerprint, Claim()).apply_event(told)
+                    event_read = event.read(json.loads(text))
+                    if isinstance(event_read, event.Event) and event_read.uuid == uuid:
+                        claims.setdefault(station.fingerprint, Claim()).apply_event(event_read)
             own = self[name]
             pin = own.pins.pinned(uuid)
             return merge_claims(self.roster_, claims, LocalState(own.fingerprint, pin, "tap" if pin else "", bool(pin)))
@@ -191,11 +191,11 @@ def keyed(station: Station, board: Board) -> None:
     with talk(board) as node:
         who = identify(station, node)
         agree(station, node, who, newcomer=WhitelistEntry(node.uuid, who.fingerprint, utc_now(), "tap", None))
-    told = {"fingerprint": who.fingerprint}
+    members = {"fingerprint": who.fingerprint}
     keys = station.keys.keys_of(board.uuid)
     with station.transaction():
-        station.plant.record_event("pinned", board.uuid, assurance="tap", **told)
-        station.plant.record_event("agreed", board.uuid, epoch=keys[-1].epoch, key_id=keys[-1].key_id, **told)
+        station.plant.record_event("pinned", board.uuid, assurance="tap", **members)
+        station.plant.record_event("agreed", board.uuid, epoch=keys[-1].epoch, key_id=keys[-1].key_id, **members)
 
 
 def board_of(station: Station, uuid: bytes) -> Board:

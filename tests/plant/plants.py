@@ -109,12 +109,14 @@ class Reader:
                 seen.add(item.id)
                 self._take(station, place, item)
         for place, page in sorted(there.items()):
-            for event_read in map(event.read, page.events):
-                if isinstance(event_read, event.Event) and event_read.act == "revoked" and event_read.uuid is not None:
-                    said = open_revocation(event_read.members["statement"], self.roster.point_of)
-                    held = BanStatement(event.hash_of_statement(said.statement), station, place in counts.pages, said)
-                    if held not in self.statements.setdefault(event_read.uuid, []):
-                        self.statements[event_read.uuid].append(held)
+            for read_event in map(event.read, page.events):
+                if isinstance(read_event, event.Event) and read_event.act == "revoked" and read_event.uuid is not None:
+                    revocation = open_revocation(read_event.members["statement"], self.roster.point_of)
+                    held = BanStatement(
+                        event.hash_of_statement(revocation.statement), station, place in counts.pages, revocation
+                    )
+                    if held not in self.statements.setdefault(read_event.uuid, []):
+                        self.statements[read_event.uuid].append(held)
 
     def _take(self, station: str, place: Place, stated: event.Event) -> None:
         if stated.act in ("signed", "vouched"):
@@ -127,8 +129,8 @@ class Reader:
 
     def view(self, uuid: bytes, own: LocalState | None = None) -> MergedClaims:
         own = own or LocalState("f" * 64)
-        claims, said = self.claims.get(uuid, {}), self.statements.get(uuid, [])
-        return merge_claims(self.roster, claims, own, said, self.liftings)
+        claims, statements = self.claims.get(uuid, {}), self.statements.get(uuid, [])
+        return merge_claims(self.roster, claims, own, statements, self.liftings)
 
     def signing(self, signer: str, digest: str) -> SignerVerdict:
         behind = any(

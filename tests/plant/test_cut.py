@@ -27,7 +27,7 @@ NODES = [bytes([n] * 10) for n in range(1, 5)]
 KEY = "ab" * 32
 
 
-def say(station: Station, *uuids: bytes) -> None:
+def record_events(station: Station, *uuids: bytes) -> None:
     for uuid in uuids:
         station.pins.put(WhitelistEntry(uuid, KEY, assurance="tap"))
 
@@ -37,12 +37,12 @@ def scene(folder: Path) -> None:
     made = Plant(folder)
     west = made.member("west", "line", "sign")
     made.round()
-    say(made.north, NODES[0])
+    record_events(made.north, NODES[0])
     made.sync(made.north)
-    say(west, NODES[1])
+    record_events(west, NODES[1])
     made.sync(west)
-    say(made.north, NODES[2])
-    say(west, NODES[3])
+    record_events(made.north, NODES[2])
+    record_events(west, NODES[3])
     made.close()
 
 
@@ -94,8 +94,8 @@ def carried_on(folder: Path) -> list[object]:
         assert station.plant.alarms.all() == []
         assert station.plant.unsent() == 0
         assert station.plant.claims.to_judge(1) == []
-        said = merged_views(station, roster, NODES)
-        seen.append((heads_digest(station)[1], {uuid: sorted(view.pins.values()) for uuid, view in said.items()}))
+        views = merged_views(station, roster, NODES)
+        seen.append((heads_digest(station)[1], {uuid: sorted(view.pins.values()) for uuid, view in views.items()}))
         entry = station.pins.entry(NODES[0])
         assert entry is not None
         assert entry.fingerprint == KEY
@@ -142,13 +142,13 @@ def test_a_rebuilt_home_that_is_killed_while_it_adopts_is_carried_on(tmp_path: P
     (tmp_path / "kept").mkdir()
     made = Plant(tmp_path / "kept")
     west = made.member("west", "line", "sign")
-    say(made.north, NODES[0])
-    say(west, NODES[1])
+    record_events(made.north, NODES[0])
+    record_events(west, NODES[1])
     made.round()
     west.close()
     shutil.copytree(tmp_path / "kept" / "west", tmp_path / "yesterday")
     west = Station.open(tmp_path / "kept" / "west", ask=ask)
-    say(west, NODES[3])
+    record_events(west, NODES[3])
     made.sync(west)
     made.sync(made.north)
     west.close()
@@ -157,7 +157,7 @@ def test_a_rebuilt_home_that_is_killed_while_it_adopts_is_carried_on(tmp_path: P
     shutil.copytree(tmp_path / "yesterday", tmp_path / "kept" / "west")
     back = Station.open(tmp_path / "kept" / "west", ask=ask)
     rebuilt(back)
-    say(back, NODES[2])
+    record_events(back, NODES[2])
     back.close()
     reached = 0
     for step in range(100):

@@ -23,8 +23,8 @@ def test_three_stations_share_a_key_and_refuse_what_the_stolen_one_signs(
         pytest.skip("no PostgreSQL 15 here (scripts/install-test-packages)")
     if not driver:
         monkeypatch.setattr(plant, "find_spec", lambda _name: None)
-    said: list[str] = []
-    done = plant.run_plant_demo(SilentReporter(), said.append)
+    messages: list[str] = []
+    done = plant.run_plant_demo(SilentReporter(), messages.append)
     assert (done.by, done.before, done.after) == ("postgresql" if driver else "files", "authentic", "not authentic")
-    assert ("No psycopg (the extra registry) is installed here" in said[0]) == (not driver)
+    assert ("No psycopg (the extra registry) is installed here" in messages[0]) == (not driver)
     assert all(step.result != "failed" for step in done.steps)

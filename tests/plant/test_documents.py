@@ -87,8 +87,8 @@ def test_the_other_s_of_a_signature_is_good_and_names_the_same_document() -> Non
 )
 def test_a_header_holds_exactly_algorithm_signer_and_type(header: dict[str, str]) -> None:
     key = KEYS["west"]
-    told = json.dumps(header).replace("KID", document.fingerprint(key.point)).encode()
-    signed = b".".join((document.base64url(told), document.base64url(b'{"format":"teds-page/1"}')))
+    header_text = json.dumps(header).replace("KID", document.fingerprint(key.point)).encode()
+    signed = b".".join((document.base64url(header_text), document.base64url(b'{"format":"teds-page/1"}')))
     octets = signed + b"." + document.base64url(key.sign(signed))
     with pytest.raises((BadDataError, PolicyError)):
         document.open_document(octets, POINTS.get, document.PAGE)
@@ -166,11 +166,11 @@ def test_the_known_rosters_are_read_and_follow_each_other() -> None:
 
 
 def test_two_rosters_of_one_version_are_told_and_the_next_version_cures() -> None:
-    one, other = a_roster(1, (NORTH,)), a_roster(1, (NORTH, WEST))
-    assert taking(other, one, one.registry)[0] == "two rosters"
-    assert taking(a_roster(2, (NORTH, WEST), other.hash), one, one.registry)[0] == "taken, two rosters"
-    assert taking(a_roster(2, (NORTH, WEST), one.hash), one, one.registry)[0] == "taken"
-    assert taking(a_roster(5, (NORTH, WEST), "ab" * 32), one, one.registry)[0] == "taken"
+    first, other = a_roster(1, (NORTH,)), a_roster(1, (NORTH, WEST))
+    assert taking(other, first, first.registry)[0] == "two rosters"
+    assert taking(a_roster(2, (NORTH, WEST), other.hash), first, first.registry)[0] == "taken, two rosters"
+    assert taking(a_roster(2, (NORTH, WEST), first.hash), first, first.registry)[0] == "taken"
+    assert taking(a_roster(5, (NORTH, WEST), "ab" * 32), first, first.registry)[0] == "taken"
 
 
 def test_nobody_leaves_a_roster_without_being_removed_and_nobody_comes_back() -> None:
@@ -290,23 +290,25 @@ def test_an_event_that_is_not_of_its_form_is_told_and_one_that_is_not_known_is_p
 
 
 def test_the_reset_of_the_known_answers_is_proven_and_no_other() -> None:
-    told = next(item for item in KAT["documents"]["west 2"]["payload"]["events"] if item["act"] == "reset")
-    good = event.read(told)
+    reset = next(item for item in KAT["documents"]["west 2"]["payload"]["events"] if item["act"] == "reset")
+    good = event.read(reset)
     assert isinstance(good, event.Event)
     assert event.reset_proven(good) == KAT["keys"]["node"]["fingerprint"]
-    other = event.read({**told, "epoch": 2})
+    other = event.read({**reset, "epoch": 2})
     assert isinstance(other, event.Event)
     assert event.reset_proven(other) is None
 
 
 def test_a_page_takes_no_more_than_readers_do() -> None:
     draft = page.PageDraft(KAT["registry"], 1, "", "0" * 16, NOW, {}, (1, "0" * 64))
-    one = event.made("unpinned", "0" * 16, "2026-02-01T12:00:00Z", bytes(10), {})
+    unpinned = event.made("unpinned", "0" * 16, "2026-02-01T12:00:00Z", bytes(10), {})
     with pytest.raises(BadDataError, match="1000"):
-        page.seal_page(draft, [one] * 1001, KEYS["west"])
+        page.seal_page(draft, [unpinned] * 1001, KEYS["west"])
     with pytest.raises(BadDataError, match="700000"):
-        page.seal_page(draft, [{**one, "x": "y" * 1000}] * 900, KEYS["west"])
-    assert hash_of(page.seal_page(draft, [one], KEYS["west"])) == hash_of(page.seal_page(draft, [one], KEYS["west"]))
+        page.seal_page(draft, [{**unpinned, "x": "y" * 1000}] * 900, KEYS["west"])
+    assert hash_of(page.seal_page(draft, [unpinned], KEYS["west"])) == hash_of(
+        page.seal_page(draft, [unpinned], KEYS["west"])
+    )
 
 
 def test_an_event_is_made_in_the_order_of_the_contract_or_not_at_all() -> None:

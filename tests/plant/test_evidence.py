@@ -135,8 +135,8 @@ def test_a_certified_station_cannot_pass_anothers_evidence_off_as_its_own(statio
 
     def mine(statement: dict[str, Any]) -> None:
         statement["predicate"]["facts"]["station"] = fingerprint(other.point)
-        told = {"point": other.point.hex(), "certificate": base64.b64encode(certificate).decode()}
-        statement["predicate"]["station"] = told
+        members = {"point": other.point.hex(), "certificate": base64.b64encode(certificate).decode()}
+        statement["predicate"]["station"] = members
 
     assert faults(station, signed_anew(document, other, mine)) == ["the board did not sign these facts (Prove)"]
 
@@ -193,24 +193,24 @@ DIGEST = "0" * 64
     ],
 )
 def test_a_row_of_the_facts_has_one_form(member: str, row: object) -> None:
-    told = json.loads(KAT["evidence"]["file"])
-    statement = json.loads(codec.base64_of(told["payload"], "payload"))
+    record = json.loads(KAT["evidence"]["file"])
+    statement = json.loads(codec.base64_of(record["payload"], "payload"))
     statement["predicate"]["facts"][member][0] = row
-    told["payload"] = base64.b64encode(json.dumps(statement).encode()).decode()
+    record["payload"] = base64.b64encode(json.dumps(statement).encode()).decode()
     with pytest.raises(BadDataError, match=member[:-1]):
-        codec.read(json.dumps(told).encode())
+        codec.read(json.dumps(record).encode())
 
 
 def test_known_answers_of_another_implementation() -> None:
     """Its document is of a time before ``node.teds``: what is hashed and signed is the same."""
-    told = KAT["evidence"]
-    payload = codec.base64_of(json.loads(told["file"])["payload"], "payload")
+    evidence = KAT["evidence"]
+    payload = codec.base64_of(json.loads(evidence["file"])["payload"], "payload")
     statement = json.loads(payload)
     predicate = statement["predicate"]
     bound = codec.canonical(predicate["facts"], statement["subject"])
-    assert bound.decode() == told["canonical"]
-    assert codec.challenge(bytes.fromhex(predicate["node"]["nonce"]), bound).hex() == told["challenge"]
-    assert codec.pae(payload).hex() == told["pae"]
+    assert bound.decode() == evidence["canonical"]
+    assert codec.challenge(bytes.fromhex(predicate["node"]["nonce"]), bound).hex() == evidence["challenge"]
+    assert codec.pae(payload).hex() == evidence["pae"]
 
 
 def test_evidence_verify_needs_nothing_but_files(tmp_path: Path, station: Station, board: Board) -> None:
@@ -220,9 +220,9 @@ def test_evidence_verify_needs_nothing_but_files(tmp_path: Path, station: Statio
     ca, none = tmp_path / "ca.pem", tmp_path / "nowhere"
     ca.write_text(to_pem(station.identity.ca))
     done = call(none, "--json", "evidence", "verify", good.parent, "--ca", ca, passphrase=None)
-    told = [json.loads(line) for line in done.out.splitlines()]
-    assert (done.code, told[0]["good"], told[0]["uuid"]) == (0, True, board.uuid.hex())
-    assert told[1] == {"totals": {"files": 1, "passed": 1}}
+    reports = [json.loads(line) for line in done.out.splitlines()]
+    assert (done.code, reports[0]["good"], reports[0]["uuid"]) == (0, True, board.uuid.hex())
+    assert reports[1] == {"totals": {"files": 1, "passed": 1}}
     assert not none.exists()
     (good.parent / "b.json").write_bytes(good.read_bytes().replace(b"payloadType", b"payloadtype"))
     (good.parent / "c.json").write_bytes(signed_anew(good.read_bytes(), SoftwareKey(9), lambda s: None))
@@ -301,12 +301,12 @@ def test_evidence_states_the_firmware_of_its_session(station: Station, report: F
         assert _firmware_in_session(node) is None, "what is said in no session is no fact"
         require_session(station, node)
         read_firmware(node)
-        said = _firmware_in_session(node)
+        firmware = _firmware_in_session(node)
     due = None if report is None else (report.text, f"{report.version_text}+{report.build}", "02" * 32, 0)
     if report is not None and report.image is None:
         due = ("bare", "0.9.0+0", "0" * 64, 0)
-    assert said == due
-    document = evidence_of(station, board, certificates=(), firmware=said)
+    assert firmware == due
+    document = evidence_of(station, board, certificates=(), firmware=firmware)
     facts = codec.read(document).facts
     assert (facts.firmware, faults(station, document)) == (due, [])
     assert facts.to_json()["firmware"] == (None if due is None else list(due))

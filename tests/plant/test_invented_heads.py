@@ -28,10 +28,10 @@ def test_an_auditors_word_counts_for_nothing_and_a_keeper_knows_its_own_chain(
         )
         rules = station.policy.signer_rules()
         assert rules is not None
-        said = rules.signing(station.ca, thief.point, os.urandom(32))
-        assert said is not None
-        assert said.result == ("unproven" if unproven and station is south else "failed")
-        if said.result == "unproven":
+        request = rules.signing(station.ca, thief.point, os.urandom(32))
+        assert request is not None
+        assert request.result == ("unproven" if unproven and station is south else "failed")
+        if request.result == "unproven":
             why = "pages of the keeper north are missing here: witness names page 10000, and the last one here is 0"
-            assert said.why == why
+            assert request.why == why
     made.close()

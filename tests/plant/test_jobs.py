@@ -72,7 +72,7 @@ def line_of(owner: Station, calibrations: Path | None = None, **changes: Any) ->
     return LineRun(owner, take_job(owner, job_of(owner, **changes)), calibrations=calibrations)
 
 
-def board(number: int) -> Board:
+def make_board(number: int) -> Board:
     return Board(uuid=bytes.fromhex("8d4d9da65281f7") + number.to_bytes(3, "big"))
 
 
@@ -83,7 +83,7 @@ def units(line: LineRun) -> list[tuple[int, int, int]]:
 
 def test_each_board_gets_one_unit_and_leaves_evidence(owner: Station) -> None:
     line = line_of(owner, name="angle {unit:03} {uuid8}")
-    boards = [board(0), board(1), FirmwareBoard(board(2).uuid)]
+    boards = [make_board(0), make_board(1), FirmwareBoard(make_board(2).uuid)]
     for built_board in boards:
         assert build(line, built_board).verified.verdict == "authentic"
     assert units(line) == [(1, 1, 1), (2, 1, 1), (3, 1, 1)]
@@ -103,18 +103,18 @@ def test_each_board_gets_one_unit_and_leaves_evidence(owner: Station) -> None:
 
 
 def test_a_second_try_takes_no_second_unit(owner: Station) -> None:
-    line, one = line_of(owner), board(1)
-    build(line, one)
-    build(line, one)
+    line, board = line_of(owner), make_board(1)
+    build(line, board)
+    build(line, board)
     assert units(line) == [(1, 2, 1)], "its first pass was its first attempt"
-    assert [row.attempt for row in owner.plant.line.evidence(uuid=one.uuid)] == [1, 2]
+    assert [row.attempt for row in owner.plant.line.evidence(uuid=board.uuid)] == [1, 2]
 
 
 def test_one_board_too_many_is_refused_and_stays_what_it_is(owner: Station) -> None:
     line = line_of(owner, count=2, stations={owner.identity.fingerprint: 2})
-    build(line, board(1))
-    build(line, board(2))
-    third = board(3)
+    build(line, make_board(1))
+    build(line, make_board(2))
+    third = make_board(3)
     with pytest.raises(PolicyError, match="one too many"):
         build(line, third)
     assert third.state.state == NodeState.FACTORY
@@ -183,69 +183,69 @@ def test_a_clock_that_is_put_back_reopens_no_job_whose_end_was_seen(
     with monkeypatch.context() as patch:
         patch.setattr(jobs, "datetime", Later)
         with pytest.raises(PolicyError, match="it ended"):
-            build(line, board(1))
+            build(line, make_board(1))
     again = Station.open(owner.home, ask=lambda prompt, confirm: PASSPHRASE)  # as the next command does
     assert line.job is not None
     with pytest.raises(PolicyError, match="it ended"):
         LineRun(again, line.job)
     again.close()
-    assert build(next_job, board(1)).verified.verdict == "authentic", "a job whose end nobody saw is open"
+    assert build(next_job, make_board(1)).verified.verdict == "authentic", "a job whose end nobody saw is open"
 
 
 def test_a_board_that_is_not_listed_or_has_another_key_costs_no_unit(owner: Station) -> None:
-    one, other = board(1), board(2)
-    line = line_of(owner, count=None, boards={one.uuid: fingerprint(one.key.point), other.uuid: "0" * 64})
+    first, other = make_board(1), make_board(2)
+    line = line_of(owner, count=None, boards={first.uuid: fingerprint(first.key.point), other.uuid: "0" * 64})
     with pytest.raises(KeyMismatchError):
         build(line, other)
     with pytest.raises(PolicyError, match="not on the job's list"):
-        build(line, board(3))
+        build(line, make_board(3))
     assert units(line) == []
-    build(line, one)
+    build(line, first)
     assert units(line) == [(1, 1, 1)]
 
 
 def test_a_board_of_another_type_costs_no_unit(tmp_path: Path, owner: Station) -> None:
-    other, one = make_station(tmp_path / "other"), board(1)
-    with talk(one) as node:
+    other, board = make_station(tmp_path / "other"), make_board(1)
+    with talk(board) as node:
         order = BuildOrder(profile="tactile-finger-sensor")
         provision(other, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
     line = line_of(owner)
     with pytest.raises(WrongBoardError):
-        build(line, one)
+        build(line, board)
     assert units(line) == []
     other.close()
 
 
 def test_a_board_on_the_bus_is_not_enough_for_a_job_that_asks_for_taps(owner: Station) -> None:
-    line, one = line_of(owner), board(1)
+    line, board = line_of(owner), make_board(1)
     with pytest.raises(PolicyError, match="assurance 'tap'"):
-        build(line, one, MemoryLink(one, via="can", tapped=True))
+        build(line, board, MemoryLink(board, via="can", tapped=True))
     assert units(line) == []
-    assert one.state.state == NodeState.FACTORY
+    assert board.state.state == NodeState.FACTORY
 
 
 @pytest.mark.parametrize("kind", ["csv", "xml"])
 def test_calibrations_are_those_that_the_job_names(tmp_path: Path, owner: Station, kind: str) -> None:
-    one, two = board(1), board(2)
+    first, second = make_board(1), make_board(2)
     folder = tmp_path / "calibrations"
     folder.mkdir()
-    file = folder / f"{one.uuid.hex()}.{kind}"
+    file = folder / f"{first.uuid.hex()}.{kind}"
     file.write_bytes(b"raw, value\n0, 0\n16384, 6.283185307\n" if kind == "csv" else CERTIFICATE)
     rule = CalibrationRule(
-        "list", by_uuid={uuid: hashlib.sha256(file.read_bytes()).hexdigest() for uuid in (one.uuid, two.uuid)}
+        "list", by_uuid={uuid: hashlib.sha256(file.read_bytes()).hexdigest() for uuid in (first.uuid, second.uuid)}
     )
     line = line_of(owner, folder, calibration=rule)
     with pytest.raises(NotFoundError, match="no file"):
-        build(line, two)
-    (folder / f"{two.uuid.hex()}.csv").write_text("raw, value\n0, 0\n16384, 6.28\n")
+        build(line, second)
+    (folder / f"{second.uuid.hex()}.csv").write_text("raw, value\n0, 0\n16384, 6.28\n")
     with pytest.raises(PolicyError, match="not the one the job specifies"):
-        build(line, two)
+        build(line, second)
     assert units(line) == []
-    done = build(line, one)
-    (row,) = owner.plant.line.evidence(uuid=one.uuid)
-    assert codec.read(row.document).facts.calibration_sha256 == rule.by_uuid[one.uuid]
-    told = certificate_reference_of(done.image.blocks, 1)
-    assert (told.sha256 if told else None) == (rule.by_uuid[one.uuid] if kind == "xml" else None)
+    done = build(line, first)
+    (row,) = owner.plant.line.evidence(uuid=first.uuid)
+    assert codec.read(row.document).facts.calibration_sha256 == rule.by_uuid[first.uuid]
+    reference = certificate_reference_of(done.image.blocks, 1)
+    assert (reference.sha256 if reference else None) == (rule.by_uuid[first.uuid] if kind == "xml" else None)
 
 
 TABLE = "raw, value\n0, 0\n16384, 6.283185307\n"
@@ -255,10 +255,10 @@ def test_a_calibration_that_is_rewritten_while_it_is_read_is_not_used(
     tmp_path: Path, owner: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its digest was looked at, then the file was read again: evidence would name another one than the board has."""
-    one = board(1)
-    file = tmp_path / f"{one.uuid.hex()}.csv"
+    board = make_board(1)
+    file = tmp_path / f"{board.uuid.hex()}.csv"
     file.write_text(TABLE)
-    listed = CalibrationRule("list", by_uuid={one.uuid: hashlib.sha256(file.read_bytes()).hexdigest()})
+    listed = CalibrationRule("list", by_uuid={board.uuid: hashlib.sha256(file.read_bytes()).hexdigest()})
     line = line_of(owner, tmp_path, calibration=listed)
 
     def rewritten(*given: Any, **more: Any) -> PreparedOrder:
@@ -267,17 +267,17 @@ def test_a_calibration_that_is_rewritten_while_it_is_read_is_not_used(
 
     monkeypatch.setattr(line_module, "prepare", rewritten)
     with pytest.raises(PolicyError, match="changed while it was being read"):
-        build(line, one)
+        build(line, board)
     outside = LineRun(owner, None, BuildOrder(profile=ANGLE, calibration=file))
     file.write_text(TABLE)
     with pytest.raises(PolicyError, match="changed while it was being read"):
-        build(outside, one)
+        build(outside, board)
     assert units(line) == []
-    assert one.state.state == NodeState.FACTORY
+    assert board.state.state == NodeState.FACTORY
 
 
 def test_evidence_names_the_calibration_that_was_read_whatever_lies_there_later(tmp_path: Path, owner: Station) -> None:
-    one, file = board(1), tmp_path / "angle.csv"
+    board, file = make_board(1), tmp_path / "angle.csv"
     file.write_text(TABLE)
     read = hashlib.sha256(file.read_bytes()).hexdigest()
     line = LineRun(owner, None, BuildOrder(profile=ANGLE, calibration=file))
@@ -285,9 +285,9 @@ def test_evidence_names_the_calibration_that_was_read_whatever_lies_there_later(
     def rewrite(who: Any) -> None:
         file.write_text(TABLE.replace("6.28", "6.27"))
 
-    with talk(one) as node:
+    with talk(board) as node:
         provision(owner, node, line.order, operator=Answers(accept=rewrite), reporter=SilentReporter(), line=line)
-    (row,) = owner.plant.line.evidence(uuid=one.uuid)
+    (row,) = owner.plant.line.evidence(uuid=board.uuid)
     assert codec.read(row.document).facts.calibration_sha256 == read
 
 
@@ -295,7 +295,7 @@ def test_a_profile_that_is_edited_beside_a_job_makes_no_board_of_it(tmp_path: Pa
     own = owner.home / "profiles" / f"{ANGLE}.toml"
     own.parent.mkdir(exist_ok=True)
     own.write_bytes(find_profile(ANGLE).read_bytes())
-    boards = [board(1), board(2)]
+    boards = [make_board(1), make_board(2)]
     for built_board in boards:
         (tmp_path / f"{built_board.uuid.hex()}.csv").write_text(f"# date: {NOW:%Y-%m-%d}\n{TABLE}")
     any_date = CalibrationRule("any", max_age_days=30)
@@ -320,29 +320,29 @@ def test_a_job_of_an_earlier_version_that_names_the_file_alone_is_refused_by_nam
 
 
 def test_the_event_and_the_evidence_of_a_board_name_the_jobs_profile_by_the_same_digest(owner: Station) -> None:
-    line, one = line_of(owner), board(1)
-    build(line, one)
+    line, board = line_of(owner), make_board(1)
+    build(line, board)
     assert line.job is not None
     files = [find_profile(name).read_bytes() for name in ("smart-sensor", ANGLE)]
     framed = b"".join(len(octets).to_bytes(4, "big") + octets for octets in files)
     assert line.job.profile_sha256 == hashlib.sha256(framed).hexdigest()
     events = [json.loads(text) for _, _, text in owner.plant.outbox(100)]
     assert [event["profile_sha256"] for event in events if event["act"] == "written"] == [line.job.profile_sha256]
-    (row,) = owner.plant.line.evidence(uuid=one.uuid)
+    (row,) = owner.plant.line.evidence(uuid=board.uuid)
     assert codec.read(row.document).facts.profile_sha256 == line.job.profile_sha256
 
 
 def test_a_calibration_of_last_year_is_too_old_for_a_job_that_says_so(tmp_path: Path, owner: Station) -> None:
-    one = board(1)
-    file = tmp_path / f"{one.uuid.hex()}.csv"
+    board = make_board(1)
+    file = tmp_path / f"{board.uuid.hex()}.csv"
     line = line_of(owner, tmp_path, calibration=CalibrationRule("any", max_age_days=30))
     table = "raw, value\n0, 0\n16384, 6.283185307\n"
     for dated, why in ((f"# date: {NOW - timedelta(days=31):%Y-%m-%d}\n", "is dated"), ("", "has no date")):
         file.write_text(dated + table)
         with pytest.raises(PolicyError, match=why):
-            build(line, one)
+            build(line, board)
     file.write_text(f"# date: {NOW - timedelta(days=3):%Y-%m-%d}\n{table}")
-    build(line, one)
+    build(line, board)
     assert units(line) == [(1, 1, 1)]
 
 
@@ -392,19 +392,19 @@ def test_patterns_of_names() -> None:
 
 def test_cut_at_every_message_a_unit_is_neither_given_twice_nor_lost(tmp_path: Path) -> None:
     owner = alone(tmp_path / "count")
-    link = MemoryLink(board(1))
+    link = MemoryLink(make_board(1))
     build(line_of(owner), link.board, link)
     owner.close()
     for first, half in enumerate(("lose_request", "lose_reply"), 1):
         for lost in range(first, link.count, 2):
             home = alone(tmp_path / f"{half}{lost}")
-            line, one = line_of(home), board(1)
+            line, board = line_of(home), make_board(1)
             with pytest.raises(NodeSilentError):
-                build(line, one, MemoryLink(one, **{half: lost}))  # type: ignore[arg-type]
-            assert build(line, one).verified.verdict == "authentic", (half, lost)
+                build(line, board, MemoryLink(board, **{half: lost}))  # type: ignore[arg-type]
+            assert build(line, board).verified.verdict == "authentic", (half, lost)
             (unit,) = units(line)
             assert (unit[0], bool(unit[2])) == (1, True)
-            rows = list(home.plant.line.evidence(uuid=one.uuid))
+            rows = list(home.plant.line.evidence(uuid=board.uuid))
             assert rows[-1].verdict == "passed"
             assert all(codec.faults(codec.read(row.document), home.identity.ca) == [] for row in rows)
             home.close()
@@ -412,10 +412,10 @@ def test_cut_at_every_message_a_unit_is_neither_given_twice_nor_lost(tmp_path: P
 
 def test_evidence_is_kept_outside_a_job_too(owner: Station) -> None:
     order = BuildOrder(profile="magnetic-angular-position-sensor")
-    line, one = LineRun(owner, None, order, operator="A. Meier"), board(1)
-    build(line, one)
-    build(line, one)
-    rows = list(owner.plant.line.evidence(uuid=one.uuid))
+    line, board = LineRun(owner, None, order, operator="A. Meier"), make_board(1)
+    build(line, board)
+    build(line, board)
+    rows = list(owner.plant.line.evidence(uuid=board.uuid))
     assert [(row.job, row.unit, row.attempt) for row in rows] == [(None, None, 1), (None, None, 2)]
     assert codec.read(rows[0].document).operator == "A. Meier"
 
@@ -424,71 +424,71 @@ def test_a_second_station_tests_what_another_one_made(tmp_path: Path) -> None:
     """Its own evidence stands beside the maker's; nothing is written, and it takes no unit."""
     plant = Plant(tmp_path)
     tester = plant.member("tester", "base")
-    told = {"registry": plant.roster.registry, "stations": {plant.north.fingerprint: 2, tester.fingerprint: 1}}
-    document = job_of(plant.north, **told)
-    made, one = LineRun(plant.north, take_job(plant.north, document)), board(1)
-    build(made, one)
-    before = one.state
+    members = {"registry": plant.roster.registry, "stations": {plant.north.fingerprint: 2, tester.fingerprint: 1}}
+    document = job_of(plant.north, **members)
+    made, board = LineRun(plant.north, take_job(plant.north, document)), make_board(1)
+    build(made, board)
+    before = board.state
     tests = LineRun(tester, take_job(tester, document), only_verify=True)
     tester.unlock()
     for attempt in (1, 2):
-        with talk(one) as node:
+        with talk(board) as node:
             done = verify_only(tester, node, tests, SilentReporter())
         assert done.verified.verdict == "authentic"
-        assert tests.unit_to_json(one.uuid)["attempt"] == attempt
-    assert one.state == before
+        assert tests.unit_to_json(board.uuid)["attempt"] == attempt
+    assert board.state == before
     assert units(tests) == []
-    rows = list(tester.plant.line.evidence(uuid=one.uuid))
+    rows = list(tester.plant.line.evidence(uuid=board.uuid))
     assert [codec.faults(codec.read(row.document), plant.north.identity.ca) for row in rows] == [[], []]
     assert {name for name, _, _ in codec.read(rows[0].document).facts.steps} == {"identify", "verify", "check"}
-    other = board(2)
+    other = make_board(2)
     with talk(other) as node:
         order = BuildOrder(profile="tactile-finger-sensor")
         provision(plant.north, node, order, operator=AcceptingOperator(), reporter=SilentReporter())
     with talk(other) as node, pytest.raises(WrongBoardError):
         verify_only(tester, node, tests, SilentReporter())
-    tampered = {**one.state.blocks, (0, 12): one.state.blocks[0, 12][:-3] + b"\0\0\0"}
-    one.flash.state = replace(one.state, blocks=tampered)
-    one.power_on()
-    with talk(one) as node:
+    tampered = {**board.state.blocks, (0, 12): board.state.blocks[0, 12][:-3] + b"\0\0\0"}
+    board.flash.state = replace(board.state, blocks=tampered)
+    board.power_on()
+    with talk(board) as node:
         assert verify_only(tester, node, tests, SilentReporter()).verified.verdict == "not authentic"
-    last = codec.read(list(tester.plant.line.evidence(uuid=one.uuid))[-1].document)
+    last = codec.read(list(tester.plant.line.evidence(uuid=board.uuid))[-1].document)
     assert (last.verdict, last.facts.failure) == ("failed", "not-authentic")
     assert codec.faults(last, plant.north.identity.ca) == []
     plant.close()
 
 
 def test_a_scan_says_which_board_must_come(owner: Station, tmp_path: Path) -> None:
-    line, one, two = line_of(owner), board(1), board(2)
+    line, first, second = line_of(owner), make_board(1), make_board(2)
     line.label_to = tmp_path / "labels" / "x.svg"
     line.scans = Scans([])
     with pytest.raises(PolicyError, match="Scan the label"):
-        build(line, one)
-    line.scans.add_label(f"TEDS1:{one.uuid.hex()}:{fingerprint(one.key.point)}")
+        build(line, first)
+    line.scans.add_label(f"TEDS1:{first.uuid.hex()}:{fingerprint(first.key.point)}")
     with pytest.raises(WrongBoardError, match="label"):
-        build(line, two)
+        build(line, second)
     assert units(line) == []
-    build(line, one)
-    label = tmp_path / "labels" / f"{one.uuid.hex()}.svg"
-    assert one.uuid.hex() in label.read_text()
-    assert line.unit_to_json(one.uuid)["label"] == str(label)
+    build(line, first)
+    label = tmp_path / "labels" / f"{first.uuid.hex()}.svg"
+    assert first.uuid.hex() in label.read_text()
+    assert line.unit_to_json(first.uuid)["label"] == str(label)
     with pytest.raises(PolicyError, match="Scan the label"):
-        build(line, one)
-    line.scans.add_label(one.uuid.hex())
-    build(line, one)
-    said: list[str] = []
-    Scans(["nonsense\n", "\n"], said.append).listen()
-    assert said == ["This is not a board label: nonsense"]
+        build(line, first)
+    line.scans.add_label(first.uuid.hex())
+    build(line, first)
+    messages: list[str] = []
+    Scans(["nonsense\n", "\n"], messages.append).listen()
+    assert messages == ["This is not a board label: nonsense"]
 
 
 def test_a_stolen_stations_evidence_does_not_hold_beside_a_roster(tmp_path: Path) -> None:
     plant = Plant(tmp_path)
     west = plant.member("west", "line", "sign")
-    told = {"registry": plant.roster.registry, "stations": {west.fingerprint: 3}}
-    line, one = LineRun(west, take_job(west, job_of(plant.north, **told))), board(1)
+    members = {"registry": plant.roster.registry, "stations": {west.fingerprint: 3}}
+    line, board = LineRun(west, take_job(west, job_of(plant.north, **members))), make_board(1)
     west.unlock()
-    build(line, one)
-    (row,) = west.plant.line.evidence(uuid=one.uuid)
+    build(line, board)
+    (row,) = west.plant.line.evidence(uuid=board.uuid)
     document = codec.read(row.document)
 
     def faults() -> list[str]:
@@ -508,8 +508,8 @@ def test_a_stolen_stations_evidence_does_not_hold_beside_a_roster(tmp_path: Path
 def test_a_job_is_sent_to_those_that_it_is_for(tmp_path: Path) -> None:
     plant = Plant(tmp_path)
     west = plant.member("west", "line")
-    told = {"registry": plant.roster.registry, "stations": {west.fingerprint: 3}}
-    job = take_job(plant.north, job_of(plant.north, **told))
+    members = {"registry": plant.roster.registry, "stations": {west.fingerprint: 3}}
+    job = take_job(plant.north, job_of(plant.north, **members))
     send_job(plant.north, FolderTransport(plant.stick), job)
     send_job(plant.north, FolderTransport(plant.stick), job)
     plant.round()

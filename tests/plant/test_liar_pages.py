@@ -23,7 +23,7 @@ FAR = 0xFFFFFFFF
 AT = "2026-03-01T12:00:00Z"
 
 
-def said(act: str, number: int, uuid: bytes | None = NODE, at: str = AT, **members: Any) -> dict[str, Any]:
+def wire(act: str, number: int, uuid: bytes | None = NODE, at: str = AT, **members: Any) -> dict[str, Any]:
     about = {} if uuid is None else {"uuid": uuid.hex()}
     return {"act": act, "id": f"{number:016x}", "at": at, **about, **members}
 
@@ -37,22 +37,22 @@ ATTACKS: dict[str, dict[str, Any]] = {
     "five thousand heads": {"heads": {f"{n:064x}": [1, LIE] for n in range(5_000)}},
     "audit that is none": {"audit": {"a": [[[]]]}},
     "a home with an escape": {"home": "\x1b[2J"},
-    "the highest epoch": {"events": [said("agreed", 1, fingerprint=LIE, epoch=FAR, key_id="ee" * 8)]},
-    "the highest sequence": {"events": [said("written", 1, epoch=FAR, sequence=FAR, teds_sha256=LIE, profile="p",
+    "the highest epoch": {"events": [wire("agreed", 1, fingerprint=LIE, epoch=FAR, key_id="ee" * 8)]},
+    "the highest sequence": {"events": [wire("written", 1, epoch=FAR, sequence=FAR, teds_sha256=LIE, profile="p",
                                              profile_sha256=LIE, due=None)]},
-    "all is forgotten": {"events": [said("forgot", 1, epoch=FAR)]},
-    "every bundle undone": {"events": [said("undone", 1, bundle="x" * 36, peer=KEY, why="")]},
-    "an event at no time": {"events": [{**said("named", 1, name="x"), "at": "9999-99-99T99:99:99Z"}]},
-    "a name with an escape": {"events": [{**said("named", 1, name="x"), "name": "\x1b]0;owned\x07"}]},
-    "names by the thousand": {"events": [said("named", n, n.to_bytes(10, "big"), name="x" * 100) for n in range(1000)]},
-    "one id for all": {"events": [said("named", 1, name=str(n)) for n in range(50)]},
-    "more events than a page takes": {"events": [said("named", n, name="x") for n in range(1, 1500)]},
-    "a number as text": {"events": [{**said("agreed", 1, fingerprint=LIE, epoch=1, key_id="ee" * 8), "epoch": "1"}]},
-    "true as a number": {"events": [{**said("agreed", 1, fingerprint=LIE, epoch=1, key_id="ee" * 8), "epoch": True}]},
+    "all is forgotten": {"events": [wire("forgot", 1, epoch=FAR)]},
+    "every bundle undone": {"events": [wire("undone", 1, bundle="x" * 36, peer=KEY, why="")]},
+    "an event at no time": {"events": [{**wire("named", 1, name="x"), "at": "9999-99-99T99:99:99Z"}]},
+    "a name with an escape": {"events": [{**wire("named", 1, name="x"), "name": "\x1b]0;owned\x07"}]},
+    "names by the thousand": {"events": [wire("named", n, n.to_bytes(10, "big"), name="x" * 100) for n in range(1000)]},
+    "one id for all": {"events": [wire("named", 1, name=str(n)) for n in range(50)]},
+    "more events than a page takes": {"events": [wire("named", n, name="x") for n in range(1, 1500)]},
+    "a number as text": {"events": [{**wire("agreed", 1, fingerprint=LIE, epoch=1, key_id="ee" * 8), "epoch": "1"}]},
+    "true as a number": {"events": [{**wire("agreed", 1, fingerprint=LIE, epoch=1, key_id="ee" * 8), "epoch": True}]},
     "lists where words stand": {"events": [{"act": ["named"], "id": {}, "at": 1, "uuid": []}, [], None, 7]},
-    "an alarm about everybody": {"events": [said("alarm", 1, None, code="fork", about=KEY, n=FAR)]},
-    "a ban that nobody signed": {"events": [{**said("named", 1, name="x"), "act": "revoked", "statement": "a.b.c"}]},
-    "a reset that is none": {"events": [said("reset", 1, epoch=FAR, challenge="00" * 32, proof="00" * 64,
+    "an alarm about everybody": {"events": [wire("alarm", 1, None, code="fork", about=KEY, n=FAR)]},
+    "a ban that nobody signed": {"events": [{**wire("named", 1, name="x"), "act": "revoked", "statement": "a.b.c"}]},
+    "a reset that is none": {"events": [wire("reset", 1, epoch=FAR, challenge="00" * 32, proof="00" * 64,
                                              point="04" + "00" * 64)]},
 }  # fmt: skip
 
@@ -99,11 +99,11 @@ def test_no_page_of_a_liar_stops_a_reader_or_takes_anything(plants: Plant, name:
     assert north.plant.pages.chain(west.fingerprint).counted[0] == n, "its chain goes on"
     shown = plant.status.status(north, record, roster)
     assert {standing.name for standing in shown.standings} == {"north", "west"}
-    told = list(plant.status.log(north, of=west.fingerprint))
+    entries = list(plant.status.log(north, of=west.fingerprint))
     listed = {node["uuid"]: node for node in plant.status.nodes(north, roster)}
     assert listed[NODE.hex()]["says"]["pinned_by"]["north"] == KEY
     assert listed[NODE.hex()]["says"]["revoked"] == []
-    assert all("\x1b" not in str(stated.event) for stated in told)
+    assert all("\x1b" not in str(stated.event) for stated in entries)
     entry = north.pins.entry(NODE)
     assert entry is not None
     assert (entry.fingerprint, entry.assurance) == (KEY, "tap")

@@ -69,8 +69,8 @@ def test_from_an_order_to_boards_with_proof(desk: Desk, owner: Station, tmp_path
     (tmp_path / "ca.pem").write_text(to_pem(_ca(owner)))
     done = owner.run("--json", "evidence", "verify", tmp_path / "proof", "--ca", tmp_path / "ca.pem")
     assert (done.code, json.loads(done.out.splitlines()[-1])["totals"]) == (0, {"files": 2, "passed": 2})
-    told = owner.ask("job", "status", job["id"], "--csv", tmp_path / "attempts.csv")
-    (part,) = told["stations"]
+    reply = owner.ask("job", "status", job["id"], "--csv", tmp_path / "attempts.csv")
+    (part,) = reply["stations"]
     assert (part["units"], part["passed"], part["first_pass"], part["over"]) == (2, 2, 1.0, False)
     assert list(part["steps"])[-1] == "check"
     assert len((tmp_path / "attempts.csv").read_text().splitlines()) == 3
@@ -245,8 +245,8 @@ def test_an_office_signs_for_a_line_over_a_folder(desk: Desk, owner: Station, we
     node = desk.node().start()
     done = west.provision("nfc", "--job", job, "--files", stick)
     assert (done["verdict"], done["unit"]) == ("authentic", 1)
-    (said,) = office.wait_for_lines(1)
-    assert (said["uuid"], said["sequence"]) == (node.uuid, 1)
+    (line,) = office.wait_for_lines(1)
+    assert (line["uuid"], line["sequence"]) == (node.uuid, 1)
     office.signal(15)
     assert office.end().code == 0
     node.stop()
@@ -321,7 +321,7 @@ def nfc(desk: Desk) -> list[str]:
 
 
 def test_the_demo_of_a_line_ends_as_it_says(desk: Desk) -> None:
-    told = desk.start("--json", "demo", "--line").end().json
-    assert (told["passed"], told["refused"]) == (3, ["wrong-board", "one too many"])
-    assert told["evidence"] == {"passed": 4, "failed": 1}
-    assert [step["name"] for step in told["steps"]][-1] == "evidence"
+    report = desk.start("--json", "demo", "--line").end().json
+    assert (report["passed"], report["refused"]) == (3, ["wrong-board", "one too many"])
+    assert report["evidence"] == {"passed": 4, "failed": 1}
+    assert [step["name"] for step in report["steps"]][-1] == "evidence"

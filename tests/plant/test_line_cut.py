@@ -31,13 +31,13 @@ from tests.bench import Board
 
 from .owner import alone, job_of
 from .stations import Plant, ask
-from .test_jobs import board, build, units
-from .test_office import AtHand, proven
+from .test_jobs import build, make_board, units
+from .test_office import LocalOffice, proven
 
 Homes = dict[str, Station]
 
 
-class Killed(BaseException):
+class KilledError(BaseException):
     """The machine stopped."""
 
 
@@ -53,7 +53,7 @@ def killed_at(step: int, folder: Path, disk: Path, patch: pytest.MonkeyPatch) ->
         if left < 0:
             if not disk.exists():
                 shutil.copytree(folder, disk)
-            raise Killed
+            raise KilledError
 
     def counted(self: Connection, statement: str, values: object = ()) -> object:
         if statement == "COMMIT":
@@ -87,18 +87,18 @@ def cut(
 ) -> Iterator[Homes]:
     """Build a board and be cut at each step, carry on, build another; gives the homes as they are then."""
     for step in steps:
-        work, disk, one = folder / "work", folder / "disk", board(1)
+        work, disk, board = folder / "work", folder / "disk", make_board(1)
         shutil.copytree(folder / "kept", work)
         with opened(work, *names) as homes:
             line = line_of(homes)
-            with killed_at(step, work, disk, patch), suppress(Killed):
-                build(line, one)
+            with killed_at(step, work, disk, patch), suppress(KilledError):
+                build(line, board)
         if not disk.exists():
             return
         with opened(disk, *names) as homes:
             line = line_of(homes)
-            assert build(line, one).verified.verdict == "authentic", step
-            assert build(line, board(2)).verified.verdict == "authentic", step
+            assert build(line, board).verified.verdict == "authentic", step
+            assert build(line, make_board(2)).verified.verdict == "authentic", step
             given = units(line)
             assert [unit for unit, _, _ in given] == [1, 2], step
             assert all(passed for _, _, passed in given), step
@@ -135,7 +135,7 @@ def cut_office(folder: Path, steps: range, patch: pytest.MonkeyPatch) -> int:
     plant.close()
 
     def line_of(homes: Homes) -> LineRun:
-        return LineRun(homes["west"], find_job(homes["west"], job.id), office=AtHand(homes["north"]))
+        return LineRun(homes["west"], find_job(homes["west"], job.id), office=LocalOffice(homes["north"]))
 
     done = 0
     for homes in cut(folder, ("north", "west"), steps, patch, line_of):
@@ -188,19 +188,19 @@ def test_a_disk_that_is_full_loses_no_unit_and_gives_none_twice(tmp_path: Path, 
     own = {"stations": {west.identity.fingerprint: 50}, "sign": north.identity.fingerprint, "count": 50}
     document = job_of(north, registry=plant.roster.registry, **own)
     take_job(north, document)
-    line = LineRun(west, take_job(west, document), office=AtHand(north))
+    line = LineRun(west, take_job(west, document), office=LocalOffice(north))
     full = west if home == "line" else north
     failed = 0
     for number, room in enumerate((0, 1, 2, 3, 5, 8), 1):
-        one = board(number)
+        board = make_board(number)
         pages_of(full, pages_of(full) + room)
         try:
-            build(line, one)
+            build(line, board)
         except StoreError:
             failed += 1
         pages_of(full, 1 << 20)
-        assert build(line, one).verified.verdict == "authentic", room
-        rows = list(west.plant.line.evidence(uuid=one.uuid))
+        assert build(line, board).verified.verdict == "authentic", room
+        rows = list(west.plant.line.evidence(uuid=board.uuid))
         assert rows[-1].verdict == codec.PASSED, room
         assert all(codec.faults(codec.read(row.document), west.identity.ca) == [] for row in rows), room
         assert [unit for unit, _, _ in units(line)] == list(range(1, number + 1)), room
@@ -216,17 +216,17 @@ def test_a_home_out_of_an_old_backup_gives_no_unit_before_it_knows_those_given_s
     own = {"stations": {west.identity.fingerprint: 3}}
     job = take_job(west, job_of(plant.north, registry=plant.roster.registry, **own))
     west.unlock()
-    build(LineRun(west, job), board(1))
+    build(LineRun(west, job), make_board(1))
     sync(west, FolderTransport(plant.stick))
     west.close()
     shutil.copytree(tmp_path / "west", tmp_path / "backup")
     with opened(tmp_path, "west") as homes:
-        build(LineRun(homes["west"], job), board(2))
+        build(LineRun(homes["west"], job), make_board(2))
         sync(homes["west"], FolderTransport(plant.stick))
     with opened(tmp_path, "backup") as homes:
         back = homes["backup"]
         back.plant.begin_restored()
-        line, third = LineRun(back, job), board(3)
+        line, third = LineRun(back, job), make_board(3)
         with pytest.raises(PolicyError, match="was restored from a backup"):
             build(line, third)
         assert units(line) == [(1, 1, 1)]
@@ -235,7 +235,7 @@ def test_a_home_out_of_an_old_backup_gives_no_unit_before_it_knows_those_given_s
         build(line, third)
         assert [unit for unit, _, _ in units(line)] == [1, 2, 3]
         with pytest.raises(PolicyError, match="one too many"):
-            build(line, board(4))
+            build(line, make_board(4))
     plant.north.close()
 
 
@@ -263,14 +263,14 @@ def test_an_office_out_of_an_old_backup_counts_the_units_and_answers_that_it_gav
     office.close()
     shutil.copytree(tmp_path / "office", tmp_path / "backup")
     with opened(tmp_path, "office") as homes:
-        hand = AtHand(homes["office"])
+        hand = LocalOffice(homes["office"])
         run = LineRun(west, job, office=hand)
-        one, two = board(1), board(2)
-        build(run, one)
+        first_board, two = make_board(1), make_board(2)
+        build(run, first_board)
         build(run, two)
         first = hand.asked[0]
         for number in range(MOST_ANSWERS - 2):
-            again = proven(first, west, one, nonce=number.to_bytes(16, "big"))
+            again = proven(first, west, first_board, nonce=number.to_bytes(16, "big"))
             assert answered(homes["office"], west, again).security
         sync(homes["office"], FolderTransport(plant.stick))
     with opened(tmp_path, "backup") as homes:
@@ -279,15 +279,15 @@ def test_an_office_out_of_an_old_backup_counts_the_units_and_answers_that_it_gav
         sync(back, FolderTransport(plant.stick))
         rows = back.plant.line.units(job.id)
         assert [(row.uuid, row.unit, row.attempts) for row in rows] == [
-            (one.uuid, 1, MOST_ANSWERS - 1),
+            (first_board.uuid, 1, MOST_ANSWERS - 1),
             (two.uuid, 2, 1),
         ]
-        assert answered(back, west, a_request_for(board(3), first, west)).refused == "full"
-        twin = Board(uuid=one.uuid)
+        assert answered(back, west, a_request_for(make_board(3), first, west)).refused == "full"
+        twin = Board(uuid=first_board.uuid)
         assert answered(back, west, a_request_for(twin, first, west)).refused == "other-key"
-        last = proven(first, west, one, nonce=b"\xfe" * 16)
+        last = proven(first, west, first_board, nonce=b"\xfe" * 16)
         assert answered(back, west, last).sequence == MOST_ANSWERS, "no sequence says two things"
-        assert answered(back, west, proven(first, west, one, nonce=b"\xff" * 16)).refused == "full"
+        assert answered(back, west, proven(first, west, first_board, nonce=b"\xff" * 16)).refused == "full"
     plant.close()
 
 

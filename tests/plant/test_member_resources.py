@@ -232,8 +232,8 @@ def test_the_schema_run_again_brings_the_limits_to_logins_that_were_made_before(
         "grant execute on function pg_try_advisory_lock(bigint) to public; grant usage on language plpgsql to public;"
         "grant execute on function pg_export_snapshot() to public"
     )
-    told = parameters(database.url, login.fingerprint, login.secret)
-    registry = Registry(told)
+    settings = parameters(database.url, login.fingerprint, login.secret)
+    registry = Registry(settings)
     assert registry.open_doors() == [
         "procedural blocks",
         "snapshot files or messages in the WAL",

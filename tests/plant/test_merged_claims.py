@@ -100,14 +100,14 @@ def add_without_statements(reader: Reader, octets: bytes) -> None:
 
 
 def test_a_chain_counts_up_to_where_two_histories_part() -> None:
-    one = [(1, "a", ""), (2, "b", "a"), (3, "c", "b")]
-    assert counting(one, last=None, accepted=None).pages == ((1, "a"), (2, "b"), (3, "c"))
-    two = [*one, (3, "C", "b")]
+    first = [(1, "a", ""), (2, "b", "a"), (3, "c", "b")]
+    assert counting(first, last=None, accepted=None).pages == ((1, "a"), (2, "b"), (3, "c"))
+    two = [*first, (3, "C", "b")]
     assert (counting(two, last=None, accepted=None).newest, counting(two, last=None, accepted=None).two) == (
         (2, "b"),
         3,
     )
-    torn = [*one, (4, "d", "X")]  # page 4 follows another page 3 than the one here
+    torn = [*first, (4, "d", "X")]  # page 4 follows another page 3 than the one here
     assert (counting(torn, last=None, accepted=None).newest, counting(torn, last=None, accepted=None).two) == (
         (2, "b"),
         3,
@@ -149,12 +149,12 @@ def chatter(seed: int) -> list[Speaker]:
     for current in speakers:
         places: list[Place] = [(0, "")]
         for _ in range(chance.randrange(1, 5)):
-            told = [anything(current, chance, speakers) for _ in range(chance.randrange(5))]
+            events = [anything(current, chance, speakers) for _ in range(chance.randrange(5))]
             if chance.random() < 0.1:
-                told += told[:1]  # an id that stood before
+                events += events[:1]  # an id that stood before
             fork = chance.choice(places) if chance.random() < 0.1 else None
             heads = {other.fingerprint: other.head for other in speakers if other.head[0] and other is not current}
-            places.append(current.page(*told, heads=heads, after=fork))
+            places.append(current.page(*events, heads=heads, after=fork))
     return speakers
 
 
@@ -165,7 +165,7 @@ def anything(current: Speaker, chance: random.Random, speakers: list[Speaker]) -
     handed = {"epoch": epoch, "key_id": key_id, "peer": peer, "mode": chance.choice(["copy", "move"]), "bundle": bundle}
     second, challenge = chance.randrange(100), bytes(32)
     statement = seal_revocation(current.key, uuid=uuid, node=key, why="lost", created=NOW)
-    say: list[tuple[str, bytes | None, dict[str, Any]]] = [
+    acts: list[tuple[str, bytes | None, dict[str, Any]]] = [
         ("pinned", uuid, {"fingerprint": key, "assurance": "tap"}),
         ("unpinned", uuid, {}),
         ("agreed", uuid, {"fingerprint": key, "epoch": epoch, "key_id": key_id}),
@@ -185,7 +185,7 @@ def anything(current: Speaker, chance: random.Random, speakers: list[Speaker]) -
         ("revoked", uuid, {"statement": statement.statement}),
         ("lifted", None, {"of": event.hash_of_statement(statement.statement)}),
     ]  # fmt: skip
-    act, node, members = chance.choice(say)
+    act, node, members = chance.choice(acts)
     return current.event(act, node, second, **members)
 
 
@@ -393,8 +393,8 @@ def test_no_liar_without_a_key_bans_unsigns_or_unpins_a_node(roles: str, four: l
     members = four if roles == "stranger" else [*four, liar]
     roster = roster_of(members)
     lies(liar, four)
-    told = [] if roles == "stranger" else liar.pages
-    honest, lied = Reader(roster, pages_of(four)), Reader(roster, [*pages_of(four), *told])
+    pages = [] if roles == "stranger" else liar.pages
+    honest, lied = Reader(roster, pages_of(four)), Reader(roster, [*pages_of(four), *pages])
     for own in (
         LocalState("f" * 64),
         LocalState(base.fingerprint, pin=PIN, met=True, holds=True, holders=frozenset({line.fingerprint})),
@@ -408,7 +408,7 @@ def test_no_liar_without_a_key_bans_unsigns_or_unpins_a_node(roles: str, four: l
     if roles == "stranger":
         assert Reader(gone, pages_of(four)).signing(line.fingerprint, DIGEST).result == "passed"
         return
-    after_removal = Reader(gone, [*pages_of(four), *told])
+    after_removal = Reader(gone, [*pages_of(four), *pages])
     assert after_removal.signing(line.fingerprint, DIGEST).result == "passed", "hearsay of heads takes nothing away"
 
 

@@ -46,13 +46,13 @@ from tests.teds.certificates import ANGLE as CERTIFICATE
 
 from .owner import ANGLE, NOW, job_of
 from .stations import Plant
-from .test_jobs import board, build
+from .test_jobs import build, make_board
 
 KAT = json.loads((Path(__file__).parents[1] / "vectors" / "profile" / "plant_kat.json").read_text())
 
 
 @dataclass
-class AtHand:
+class LocalOffice:
     """An office on the same desk; ``away``: it does not answer. ``change`` is what somebody does to a request."""
 
     station: Station
@@ -71,14 +71,14 @@ class Desk:
     plant: Plant
     office: Station
     line: Station
-    at_hand: AtHand
+    at_hand: LocalOffice
 
     def run(self, calibrations: Path | None = None, **changes: Any) -> LineRun:
-        told: dict[str, Any] = {
+        roster: dict[str, Any] = {
             "stations": {self.line.identity.fingerprint: 3},
             "sign": self.office.identity.fingerprint,
         }
-        document = job_of(self.office, **{**told, "registry": self.plant.roster.registry, **changes})
+        document = job_of(self.office, **{**roster, "registry": self.plant.roster.registry, **changes})
         take_job(self.office, document)
         return LineRun(self.line, take_job(self.line, document), calibrations=calibrations, office=self.at_hand)
 
@@ -105,7 +105,7 @@ def desk(tmp_path: Path) -> Iterator[Desk]:
     line = plant.member("west", "line")
     plant.north.unlock()
     line.unlock()
-    yield Desk(plant, plant.north, line, AtHand(plant.north))
+    yield Desk(plant, plant.north, line, LocalOffice(plant.north))
     plant.close()
 
 
@@ -118,61 +118,61 @@ def proven(request: SignRequest, line: Station, built_board: Board, **changes: A
 
 
 def test_a_line_without_sign_makes_authentic_boards_by_its_office(desk: Desk) -> None:
-    run, one = desk.run(), board(1)
-    done = build(run, one)
+    run, board = desk.run(), make_board(1)
+    done = build(run, board)
     assert done.verified.verdict == "authentic"
     shown = security.decode(done.image.blocks[SECURITY])
     assert shown.station_key == desk.office.point
-    (row,) = desk.line.plant.line.evidence(uuid=one.uuid)
+    (row,) = desk.line.plant.line.evidence(uuid=board.uuid)
     assert codec.faults(codec.read(row.document), desk.office.identity.ca) == []
-    assert desk.office.pins.entry(one.uuid) is not None
+    assert desk.office.pins.entry(board.uuid) is not None
     assert run.job is not None
     assert [unit.unit for unit in desk.office.plant.line.units(run.job.id)] == [1]
 
 
 def test_what_a_person_pinned_at_the_office_is_not_weakened_by_a_line(desk: Desk) -> None:
-    run, one = desk.run(), board(1)
-    pinned = WhitelistEntry(one.uuid, fingerprint(one.key.point), assurance="tap", name="seen")
+    run, board = desk.run(), make_board(1)
+    pinned = WhitelistEntry(board.uuid, fingerprint(board.key.point), assurance="tap", name="seen")
     desk.office.pins.put(pinned)
-    build(run, one)
-    entry = desk.office.pins.entry(one.uuid)
+    build(run, board)
+    entry = desk.office.pins.entry(board.uuid)
     assert entry is not None
     assert (entry.assurance, entry.name) == ("tap", "seen")
 
 
 def test_nothing_is_asked_twice_for_what_the_board_has(desk: Desk) -> None:
-    run, one = desk.run(), board(1)
-    build(run, one)
-    assert build(run, one).verified.verdict == "authentic"
+    run, board = desk.run(), make_board(1)
+    build(run, board)
+    assert build(run, board).verified.verdict == "authentic"
     assert len(desk.at_hand.asked) == 1
 
 
 def test_an_office_that_is_away_costs_nothing_but_time(desk: Desk) -> None:
-    run, one = desk.run(), board(1)
-    first = desk.request(run, one)
-    second = desk.request(run, one)
+    run, board = desk.run(), make_board(1)
+    first = desk.request(run, board)
+    second = desk.request(run, board)
     assert first.hash == second.hash, "the same request again: no second datasheet is made"
-    done = build(run, one)
+    done = build(run, board)
     assert (done.verified.verdict, len({request.hash for request in desk.at_hand.asked})) == ("authentic", 1)
     assert security.decode(done.image.blocks[SECURITY]).sequence == 1
 
 
 def test_the_newest_request_is_that_of_the_highest_sequence_whatever_the_clock_was(desk: Desk) -> None:
-    run, one = desk.run(), board(1)
-    first = desk.request(run, one)
+    run, board = desk.run(), make_board(1)
+    first = desk.request(run, board)
     (row,) = desk.line.plant.line.sign_requests(first.job, first.uuid, "out")
     sealed = seal_request(replace(first, sequence=first.sequence + 1), desk.line.credentials().key)
     later = replace(row, hash=open_request(sealed, lambda kid: desk.line.point).hash, request=sealed)
     with desk.line.durable("test"):
         desk.line.plant.line.put_sign_request(replace(later, at="2000-01-01T00:00:00Z"))
-    assert desk.request(run, one).hash != first.hash, "the later request does not fit the board, so a new one is made"
+    assert desk.request(run, board).hash != first.hash, "the later request does not fit the board, so a new one is made"
 
 
 def test_the_count_holds_when_another_signer_takes_the_last_unit_meanwhile(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = desk.request(desk.run(count=1, stations={desk.line.identity.fingerprint: 1}), board(1))
-    two = board(2)
+    first = desk.request(desk.run(count=1, stations={desk.line.identity.fingerprint: 1}), make_board(1))
+    two = make_board(2)
     signed = two.key.sign(node_key_message(two.uuid, two.key.point))
     second = replace(
         first, image=Image(two.uuid, first.image.blocks), point=two.key.point, key_signature=signed, nonce=bytes(16)
@@ -185,20 +185,20 @@ def test_the_count_holds_when_another_signer_takes_the_last_unit_meanwhile(
 
     monkeypatch.setattr(office, "_built", and_another_signs)
     assert desk.asks(proven(second, desk.line, two)).refused == "full"
-    assert [row.uuid for row in desk.office.plant.line.units(first.job)] == [board(1).uuid]
+    assert [row.uuid for row in desk.office.plant.line.units(first.job)] == [make_board(1).uuid]
 
 
 def test_an_office_counts_the_boards_that_it_signed_before_their_line_reports(desk: Desk) -> None:
-    run, one = desk.run(), board(1)
-    build(run, one)
+    run, board = desk.run(), make_board(1)
+    build(run, board)
     assert run.job is not None
     (part,) = yield_stats(desk.office, run.job, attempts_of(desk.office, run.job.id))
     assert (part.station, part.units, part.passed, part.failures) == (desk.line.fingerprint, 1, 0, {})
     desk.plant.round()
     (part,) = yield_stats(desk.office, run.job, attempts_of(desk.office, run.job.id))
     assert (part.units, part.passed, part.attempts) == (1, 1, 1)
-    (row,) = desk.line.plant.line.evidence(uuid=one.uuid)
-    build(run, board(2))
+    (row,) = desk.line.plant.line.evidence(uuid=board.uuid)
+    build(run, make_board(2))
     desk.plant.round()
     found = attempts_of(desk.office, run.job.id, [row.document])
     (part,) = yield_stats(desk.office, run.job, found)
@@ -210,7 +210,7 @@ def test_an_office_counts_the_boards_that_it_signed_before_their_line_reports(de
 
 
 def test_the_same_request_gets_the_same_answer_octet_for_octet(desk: Desk) -> None:
-    request = desk.request(desk.run(), board(1))
+    request = desk.request(desk.run(), make_board(1))
     first = answer(desk.office, request.octets)
     assert first == answer(desk.office, request.octets)
     assert len(list(desk.office.plant.line.sign_requests(request.job, request.uuid, "in"))) == 1
@@ -218,16 +218,16 @@ def test_the_same_request_gets_the_same_answer_octet_for_octet(desk: Desk) -> No
 
 @pytest.mark.parametrize("kind", ["csv", "xml"])
 def test_calibrations_come_along_and_are_fitted_by_the_office(desk: Desk, tmp_path: Path, kind: str) -> None:
-    one = board(1)
-    file = tmp_path / f"{one.uuid.hex()}.{kind}"
+    board = make_board(1)
+    file = tmp_path / f"{board.uuid.hex()}.{kind}"
     file.write_bytes(b"raw, value\n0, 0\n16384, 6.283185307\n" if kind == "csv" else CERTIFICATE)
-    rule = CalibrationRule("list", by_uuid={one.uuid: hashlib.sha256(file.read_bytes()).hexdigest()})
+    rule = CalibrationRule("list", by_uuid={board.uuid: hashlib.sha256(file.read_bytes()).hexdigest()})
     run = desk.run(tmp_path, calibration=rule)
-    done = build(run, one)
+    done = build(run, board)
     assert done.verified.verdict == "authentic"
     assert ((1, AccessCode.CERTIFICATE) in done.image.blocks) == (kind == "xml"), "the office made the same TEDS"
     request = desk.at_hand.asked[-1]
-    other = proven(request, desk.line, one, nonce=bytes(16), calibration=b"raw, value\n0, 0\n16384, 7\n")
+    other = proven(request, desk.line, board, nonce=bytes(16), calibration=b"raw, value\n0, 0\n16384, 7\n")
     assert desk.asks(other).refused == "job"
 
 
@@ -242,10 +242,10 @@ def test_an_office_notices_that_what_its_profile_extends_was_edited(
     for name in (ANGLE, "smart-sensor"):
         (folder / f"{name}.toml").write_bytes(find_profile(name).read_bytes())
     base = folder / "smart-sensor.toml"
-    assert build(desk.run(), board(1)).verified.verdict == "authentic"
+    assert build(desk.run(), make_board(1)).verified.verdict == "authentic"
     base.write_text(base.read_text().replace('operation-timeout = "500 ms"', 'operation-timeout = "400 ms"'))
     with pytest.raises(OfficeRefusedError, match=r"\(differs\)"):
-        build(desk.run(), board(2))
+        build(desk.run(), make_board(2))
 
 
 def _meta(image: Image) -> Image:
@@ -267,16 +267,16 @@ def _meta(image: Image) -> Image:
 def test_a_station_with_the_board_in_its_hands_gets_nothing_that_the_office_did_not_make(
     desk: Desk, change: Callable[[SignRequest], dict[str, Any]], word: str
 ) -> None:
-    one = board(1)
-    request = desk.request(desk.run(), one)
-    told = desk.asks(proven(request, desk.line, one, **change(request)))
-    assert (told.refused, told.security) == (word, b"")
-    assert told.why
+    board = make_board(1)
+    request = desk.request(desk.run(), board)
+    reply = desk.asks(proven(request, desk.line, board, **change(request)))
+    assert (reply.refused, reply.security) == (word, b"")
+    assert reply.why
     assert desk.office.plant.line.units(request.job) == []
 
 
 def test_without_the_board_nothing_is_signed(desk: Desk) -> None:
-    request = desk.request(desk.run(), board(1))
+    request = desk.request(desk.run(), make_board(1))
     assert desk.asks(replace(request, epoch=request.epoch + 1)).refused == "proof"
     assert desk.asks(replace(request, nonce=bytes(16))).refused == "proof"
     mine = SoftwareKey(9)
@@ -286,9 +286,9 @@ def test_without_the_board_nothing_is_signed(desk: Desk) -> None:
 
 
 def test_another_key_under_a_known_uuid_is_refused(desk: Desk) -> None:
-    run, one = desk.run(), board(1)
-    build(run, one)
-    twin = Board(uuid=one.uuid)
+    run, board = desk.run(), make_board(1)
+    build(run, board)
+    twin = Board(uuid=board.uuid)
     request = desk.at_hand.asked[-1]
     signed = twin.key.sign(node_key_message(twin.uuid, twin.key.point))
     asked = replace(request, point=twin.key.point, key_signature=signed, nonce=bytes(16))
@@ -296,9 +296,9 @@ def test_another_key_under_a_known_uuid_is_refused(desk: Desk) -> None:
 
 
 def test_only_who_is_line_now_is_answered_with_a_signature(desk: Desk) -> None:
-    run, one = desk.run(), board(1)
+    run, board = desk.run(), make_board(1)
     base = desk.plant.member("south", "base")
-    request = desk.request(run, one)
+    request = desk.request(run, board)
     assert desk.asks(request, by=base).refused == "not-line"
     assert answer(desk.office, seal_request(request, SoftwareKey(5))) is None, "nobody's"
     assert answer(desk.office, seal_request(replace(request, to="0" * 64), desk.line.credentials().key)) is None
@@ -308,8 +308,8 @@ def test_only_who_is_line_now_is_answered_with_a_signature(desk: Desk) -> None:
 def test_a_stolen_line_gets_nothing_after_its_removal(desk: Desk) -> None:
     from teds_provision import plant
 
-    run, one = desk.run(), board(1)
-    request = desk.request(run, one)
+    run, board = desk.run(), make_board(1)
+    request = desk.request(run, board)
     assert desk.asks(request).security
     desk.plant.change(plant.owner.draft_removal(desk.office, "west", "stolen", 0))
     assert desk.asks(request).refused == "not-line", "not even what was answered before"
@@ -317,40 +317,40 @@ def test_a_stolen_line_gets_nothing_after_its_removal(desk: Desk) -> None:
 
 def test_one_board_too_many_and_one_answer_too_many(desk: Desk) -> None:
     run = desk.run(count=1, stations={desk.line.identity.fingerprint: 1})
-    one = board(1)
-    request = desk.request(run, one)
+    board = make_board(1)
+    request = desk.request(run, board)
     for number in range(MOST_ANSWERS):
-        told = desk.asks(proven(request, desk.line, one, nonce=number.to_bytes(16, "big")))
-        assert told.sequence == number + 1
-    assert desk.asks(proven(request, desk.line, one, nonce=bytes(15) + b"\xff")).refused == "full"
+        reply = desk.asks(proven(request, desk.line, board, nonce=number.to_bytes(16, "big")))
+        assert reply.sequence == number + 1
+    assert desk.asks(proven(request, desk.line, board, nonce=bytes(15) + b"\xff")).refused == "full"
     assert desk.line.plant.line.count_units(request.job)[0] == 1
-    two = board(2)  # the line forgot how to count
+    two = make_board(2)  # the line forgot how to count
     signed = two.key.sign(node_key_message(two.uuid, two.key.point))
     more = replace(request, image=Image(two.uuid, request.image.blocks), point=two.key.point, key_signature=signed)
     assert desk.asks(proven(more, desk.line, two, epoch=1)).refused == "full"
 
 
 def test_a_revoked_board_and_a_job_that_is_over_are_refused(desk: Desk) -> None:
-    one = board(1)
-    request = desk.request(desk.run(), one)
-    assert desk.asks(proven(request, desk.line, one, nonce=bytes(16)), jobs=[]).refused == "job"
-    desk.office.policy.deny(RevocationRecord(one.uuid, None, "stolen", ""))
+    board = make_board(1)
+    request = desk.request(desk.run(), board)
+    assert desk.asks(proven(request, desk.line, board, nonce=bytes(16)), jobs=[]).refused == "job"
+    desk.office.policy.deny(RevocationRecord(board.uuid, None, "stolen", ""))
     assert desk.asks(request).refused == "revoked"
 
 
 def test_a_person_may_let_a_sequence_jump(desk: Desk) -> None:
-    one = board(1)
-    request = proven(desk.request(desk.run(), one), desk.line, one, sequence=70_000)
+    board = make_board(1)
+    request = proven(desk.request(desk.run(), board), desk.line, board, sequence=70_000)
     assert desk.asks(request).refused == "sequence"
     assert desk.asks(request, jump=True).sequence == 70_001
 
 
 def test_the_line_takes_no_word_but_the_offices(desk: Desk) -> None:
     """An answer of the line's own making, or to another request, or that says something else."""
-    run, one = desk.run(), board(1)
+    run, board = desk.run(), make_board(1)
     office = desk.at_hand
 
-    class Liar:
+    class LyingOffice:
         def __init__(self, lie: Callable[[SignRequest], bytes]) -> None:
             self.lie = lie
 
@@ -367,30 +367,30 @@ def test_the_line_takes_no_word_but_the_offices(desk: Desk) -> None:
         return seal_answer(Answer(request.hash, 1, b"\0" * 40), desk.office.credentials().key)
 
     for lie in (forged, other, nonsense):
-        run.office = Liar(lie)
+        run.office = LyingOffice(lie)
         with pytest.raises(NotAuthenticError):
-            build(run, one)
+            build(run, board)
     run.office = office
-    assert build(run, one).verified.verdict == "authentic"
+    assert build(run, board).verified.verdict == "authentic"
 
 
 def test_a_board_that_waits_for_the_office_has_a_draft_until_its_datasheet_is_written(desk: Desk) -> None:
-    run, one = desk.run(), board(1)
-    request = desk.request(run, one)
-    waiting = desk.line.datasheets.draft(one.uuid)
+    run, board = desk.run(), make_board(1)
+    request = desk.request(run, board)
+    waiting = desk.line.datasheets.draft(board.uuid)
     assert waiting is not None
     assert (waiting.stage, waiting.profile) == ("built", ANGLE)
     assert waiting.image.unsigned_blocks() == request.image.unsigned_blocks()
-    assert build(run, one).verified.verdict == "authentic"
-    assert desk.line.datasheets.draft(one.uuid) is None
+    assert build(run, board).verified.verdict == "authentic"
+    assert desk.line.datasheets.draft(board.uuid) is None
 
 
 def test_another_members_answer_neither_ends_the_waiting_nor_hides_the_offices(desk: Desk) -> None:
     east = desk.plant.member("east", "audit")
     desk.plant.round()
     east.unlock()
-    run, one, transport = desk.run(), board(1), FolderTransport(desk.plant.stick)
-    request = desk.request(run, one)
+    run, board, transport = desk.run(), make_board(1), FolderTransport(desk.plant.stick)
+    request = desk.request(run, board)
     lies = [
         seal_answer(Answer(request.hash, refused="revoked", why="a lie"), station.credentials().key)
         for station in (east, desk.line)
@@ -403,19 +403,19 @@ def test_another_members_answer_neither_ends_the_waiting_nor_hides_the_offices(d
     leave(lies[0], "00000000")
     run.office = RemoteOffice(desk.line, transport, 0.2)
     with pytest.raises(OfficeSilentError):
-        build(run, one)
+        build(run, board)
     for n, lie in enumerate(lies):
         leave(lie, f"fffffff{n}")
     answered = answer(desk.office, request.octets)
     assert answered is not None
     leave(answered, "88888888")
-    assert build(run, one).verified.verdict == "authentic"
+    assert build(run, board).verified.verdict == "authentic"
 
 
 def test_an_answer_waits_for_the_line_that_asked_and_for_no_person(desk: Desk) -> None:
     """One that came again, after the board was done, stayed for ever: "1 parcel waits for import-keys --received"."""
-    run, one = desk.run(), board(1)
-    request = desk.request(run, one)
+    run, board = desk.run(), make_board(1)
+    request = desk.request(run, board)
     transport, me = FolderTransport(desk.plant.stick), desk.line.identity.fingerprint
     sealed = answer(desk.office, request.octets)
     assert sealed is not None
@@ -425,24 +425,24 @@ def test_an_answer_waits_for_the_line_that_asked_and_for_no_person(desk: Desk) -
     (kept,) = parcels.received(desk.line, "signed")
     assert kept[1] == sealed
     desk.line.plant.parcels.drop(kept[0].id, "in")
-    build(run, one)
+    build(run, board)
     send(desk.office, transport, me, sealed, str(uuid.uuid4()))
     assert desk.plant.sync(desk.line).waiting == 0
     assert parcels.received(desk.line, "signed") == []
 
 
 def test_a_refusal_is_told_with_its_word_and_the_board_is_finished_later(desk: Desk) -> None:
-    run, one = desk.run(), board(1)
+    run, board = desk.run(), make_board(1)
     assert run.job is not None
     desk.office.plant.line.set_job_state(run.job.id, "closed")
     with pytest.raises(OfficeRefusedError, match=r"\(job\): .*closed here\.$"):
-        build(run, one)
+        build(run, board)
     desk.office.plant.line.set_job_state(run.job.id, "open")
-    assert build(run, one).verified.verdict == "authentic"
+    assert build(run, board).verified.verdict == "authentic"
 
 
 def test_who_has_not_sign_is_no_office(desk: Desk) -> None:
-    request = desk.request(desk.run(), board(1))
+    request = desk.request(desk.run(), make_board(1))
     with pytest.raises(PolicyError, match="role 'sign'"):
         answer(desk.line, request.octets)
 
@@ -454,19 +454,19 @@ def test_the_known_request_and_answer_are_read(desk: Desk) -> None:
     )
     request = open_request(documents["sign-request"]["jws"].encode(), points.get)
     assert request.hash == documents["sign-request"]["H"]
-    told = KAT["sign_request"]
-    values = {(int(item[:4], 16), int(item[4:6], 16)): bytes.fromhex(item[6:]) for item in told["values_108"]}
+    sign_request = KAT["sign_request"]
+    values = {(int(item[:4], 16), int(item[4:6], 16)): bytes.fromhex(item[6:]) for item in sign_request["values_108"]}
     hashed = b"TEDS1 sign request\0" + request.nonce + request.line + request.uuid
     hashed += request.epoch.to_bytes(4, "big") + request.sequence.to_bytes(4, "big")
     hashed += b"".join(c.to_bytes(2, "big") + bytes([a]) + digest for (c, a), digest in values.items())
-    assert hashed.hex() == told["hashed"]
-    assert hashlib.sha256(hashed).hexdigest() == told["challenge"]
+    assert hashed.hex() == sign_request["hashed"]
+    assert hashlib.sha256(hashed).hexdigest() == sign_request["challenge"]
     answered = open_answer(documents["signed"]["jws"].encode(), points.get)
     assert (answered.of, answered.sequence) == (request.hash, 1)
 
 
 def test_a_request_from_the_future_waits(desk: Desk) -> None:
-    request = desk.request(desk.run(), board(1))
+    request = desk.request(desk.run(), make_board(1))
     late = replace(request, created=NOW + timedelta(hours=25))
     with pytest.raises(RequestAheadError, match=r"dated this request 20\d\d-.*, and it is 20"):
         answer(desk.office, seal_request(late, desk.line.credentials().key))
@@ -477,11 +477,11 @@ def test_a_request_that_waited_a_day_is_judged_by_the_job_of_that_day(
 ) -> None:
     """Nothing carried for a day: one job ended meanwhile, another began; its unit is the board's first there."""
     begins = NOW + timedelta(hours=23)
-    today, one = desk.run(), board(1)
+    today, board = desk.run(), make_board(1)
     tomorrow = {"not_before": begins, "ends": begins + timedelta(days=2), "title": "tomorrow"}
     with pytest.raises(PolicyError, match="it begins"):
         desk.run(**tomorrow)
-    waiting = desk.request(today, one)
+    waiting = desk.request(today, board)
 
     class NextDay(datetime):
         @classmethod
@@ -491,9 +491,9 @@ def test_a_request_that_waited_a_day_is_judged_by_the_job_of_that_day(
     monkeypatch.setattr(jobs, "datetime", NextDay)
     assert desk.asks(waiting).refused == "job"
     with pytest.raises(PolicyError, match="it ended"):
-        build(today, one)
+        build(today, board)
     run = desk.run(**tomorrow)
-    assert build(run, one).verified.verdict == "authentic"
+    assert build(run, board).verified.verdict == "authentic"
     assert run.job is not None
     assert today.job is not None
     for station, units in ((desk.office, (0, 1)), (desk.line, (1, 1))):

@@ -27,8 +27,8 @@ from teds_provision.teds.image import SECURITY
 from tests.places import free_tcp_port
 
 from .owner import job_of
-from .test_jobs import board, build
-from .test_office import AtHand
+from .test_jobs import build, make_board
+from .test_office import LocalOffice
 from .test_synced_by_database import Office
 
 pytestmark = pytest.mark.system
@@ -46,8 +46,8 @@ def test_an_office_signs_through_the_registry_for_all_readers_of_a_line(plant: O
     north, west = plant.north, plant.member("west", "line")
     north.unlock()
     west.unlock()
-    told = {"registry": plant.plant.roster.registry, "sign": north.fingerprint, "stations": {west.fingerprint: 8}}
-    job = take_job(north, job_of(north, **told, count=8))
+    members = {"registry": plant.plant.roster.registry, "sign": north.fingerprint, "stations": {west.fingerprint: 8}}
+    job = take_job(north, job_of(north, **members, count=8))
     at_office, at_line = plant.transport(north), plant.transport(west)
     send_job(north, at_office, job)
     plant.sync(north, west)
@@ -68,7 +68,7 @@ def test_an_office_signs_through_the_registry_for_all_readers_of_a_line(plant: O
     line = LineRun(west, find_job(west, job.id), office=asks)
     try:
         with ThreadPoolExecutor(8) as readers:
-            built = list(readers.map(lambda number: build(line, board(number)), range(1, 9)))
+            built = list(readers.map(lambda number: build(line, make_board(number)), range(1, 9)))
     finally:
         over.set()
         office.join()
@@ -103,16 +103,16 @@ def test_a_registry_that_was_away_hears_everything_once(plant: Office) -> None:
     north, west = plant.north, plant.member("west", "line")
     north.unlock()
     west.unlock()
-    told = {"registry": plant.plant.roster.registry, "sign": north.fingerprint, "stations": {west.fingerprint: 3}}
-    job = take_job(north, job_of(north, **told))
+    members = {"registry": plant.plant.roster.registry, "sign": north.fingerprint, "stations": {west.fingerprint: 3}}
+    job = take_job(north, job_of(north, **members))
     send_job(north, plant.transport(north), job)
     plant.sync(north, west)
     away = RemoteOffice(west, plant.transport(west, port=free_tcp_port()), 1)
     line = LineRun(west, find_job(west, job.id), office=away)
-    first, second = board(1), board(2)
+    first, second = make_board(1), make_board(2)
     with pytest.raises(RegistryError):
         build(line, first)
-    line.office = AtHand(north)
+    line.office = LocalOffice(north)
     assert build(line, first).verified.verdict == build(line, second).verified.verdict == "authentic"
     with pytest.raises(RegistryError):
         sync(west, away.transport)

@@ -48,8 +48,8 @@ def test_an_event_shares_the_fate_of_its_act(station: Station) -> None:
     with station.transaction():
         station.plant.record_event("named", UUID, name="grip")
     ((_, name, text),) = station.plant.outbox(10)
-    told = json.loads(text)
-    assert (told["id"], told["act"], told["name"]) == (name, "named", "grip")
+    record = json.loads(text)
+    assert (record["id"], record["act"], record["name"]) == (name, "named", "grip")
     assert station.plant.claims.to_judge(10) == [UUID]
 
 

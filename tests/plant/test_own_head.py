@@ -93,7 +93,7 @@ def joined_by(station: Station, url: str | None) -> None:
     station.plant.put_record(replace(joined, url=url))
 
 
-class ReadOnly(Registry):
+class ReadOnlyRegistry(Registry):
     """A registry that is gone when a page is to be appended."""
 
     def append(self, station: str, n: int, previous: str, hash: str, octets: bytes) -> None:
@@ -112,7 +112,7 @@ def test_a_registry_that_forgot_pages_is_refilled_and_that_is_an_alarm(west: Wes
         assert west.sync(connected=False, folder=elsewhere).remarks == [], "it is not what this station joined by"
         assert sync(west.station, FolderTransport(elsewhere)).remarks == [], "a folder need not have them"
         with pytest.raises(LinkError):
-            sync(west.station, ReadOnly(west.stick))
+            sync(west.station, ReadOnlyRegistry(west.stick))
         acknowledge(west.station)
         (remark,) = west.sync().remarks
         assert f"was rolled back: page {newest} was there, and now {left} is the last; it is being refilled" in remark
@@ -123,19 +123,19 @@ def test_a_registry_that_forgot_pages_is_refilled_and_that_is_an_alarm(west: Wes
 
 
 @pytest.mark.parametrize(
-    ("count", "told"),
+    ("count", "message"),
     [
         (1, "1 page that this station wrote before its backup is back"),
         (2, "2 pages that this station wrote before its backup are back"),
     ],
 )
-def test_a_rebuilt_home_takes_back_what_it_wrote_since(west: West, count: int, told: str) -> None:
+def test_a_rebuilt_home_takes_back_what_it_wrote_since(west: West, count: int, message: str) -> None:
     west.page()
     back = west.copy()
     for _ in range(count):
         west.page()
     alarm(back, "fork", back.fingerprint, 2, "a look while a page was missing")
-    assert about_the_backup(west.sync(back)) == [told]
+    assert about_the_backup(west.sync(back)) == [message]
     assert not alarms(back)
     assert not back.plant.restored
     assert west.page(back).remarks == []
@@ -152,10 +152,10 @@ def test_a_rebuilt_home_goes_on_once_it_has_looked_where_its_pages_would_be(
     back = west.copy()
     joined_by(back, url)
     west.write(back)
-    told = about_the_backup(west.sync(back, connected=connected))
+    remarks = about_the_backup(west.sync(back, connected=connected))
     assert back.plant.restored is not ends
     assert west.file(2).exists() is ends
-    assert [remark.partition(" and ")[2] for remark in told] == (
+    assert [remark.partition(" and ")[2] for remark in remarks] == (
         [] if ends else ["publishes nothing new until it has synced with its own registry"]
     )
 

@@ -180,10 +180,10 @@ def test_a_person_takes_in_what_waits_and_nothing_else_than_was_shown(
     plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plant.roster(ROLES)
-    one, other = (board_of(plant["west"], os.urandom(10)).uuid for _ in range(2))
+    first, other = (board_of(plant["west"], os.urandom(10)).uuid for _ in range(2))
     west, south = plant["west"], plant["south"]
     with west.lock("test"):
-        parcels.send_export(west, outgoing.plan_export(west, outgoing.ExportOrder(("south",), (one, other))), now())
+        parcels.send_export(west, outgoing.plan_export(west, outgoing.ExportOrder(("south",), (first, other))), now())
     sync(plant, "west", "south")
     shown = call(tmp_path / "south", "--json", "import-keys", "--received", "--dry-run").json
     assert ([parcel["count"] for parcel in shown["received"]], shown["plan"]) == ([2], True)
@@ -193,16 +193,16 @@ def test_a_person_takes_in_what_waits_and_nothing_else_than_was_shown(
     def and_another_revokes(*what: Any) -> object:
         plan = planned(*what)
         monkeypatch.undo()
-        life.revoke(south, one, "stolen")
+        life.revoke(south, first, "stolen")
         return plan
 
     monkeypatch.setattr(commands_of_parcels, "plan_import", and_another_revokes)
     done = call(tmp_path / "south", "--json", "import-keys", "--received", "--yes")
     assert (done.code, "changed the plan" in done.out) == (6, True)
-    assert (holds(south, one), holds(south, other)) == ([], [])
+    assert (holds(south, first), holds(south, other)) == ([], [])
     done = call(tmp_path / "south", "--json", "import-keys", "--received", "--yes")
     assert (done.code, [parcel["imported"] for parcel in done.json["received"]]) == (0, [[other.hex()]])
-    assert (holds(south, one), holds(south, other)) == ([], [(1, "import")])
+    assert (holds(south, first), holds(south, other)) == ([], [(1, "import")])
     assert call(tmp_path / "south", "--json", "import-keys", "--received").json["received"] == []
 
 
@@ -255,8 +255,8 @@ def test_a_bundle_of_which_nothing_is_taken_is_refused_and_never_sent_again(plan
     [row] = plant["west"].plant.parcels.all("out", "sent")
     claims = plant.views("west")
     with plant["west"].transaction():  # as the fold would have it
-        told = plant["south"].plant.outbox(100)
-        assert any('"refused"' in text and row.about in text for _, _, text in told)
+        events = plant["south"].plant.outbox(100)
+        assert any('"refused"' in text and row.about in text for _, _, text in events)
         from teds_provision.protocol.plant.claim import Claim
 
         chain = plant["west"].plant.pages.chain(plant["south"].fingerprint).id

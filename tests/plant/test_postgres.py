@@ -24,8 +24,8 @@ pytestmark = pytest.mark.system
 
 
 def registry(login: Login, port: int = 0, **more: Any) -> Registry:
-    told = parameters(login.database.url, login.fingerprint, login.secret) | more
-    return Registry(told | ({"port": port} if port else {}), patience=2.0)
+    settings = parameters(login.database.url, login.fingerprint, login.secret) | more
+    return Registry(settings | ({"port": port} if port else {}), patience=2.0)
 
 
 @pytest.fixture

@@ -93,8 +93,8 @@ def join_all(desk: Desk) -> None:
     assert made["version"] == 1
     for name, roles in (("south", ["base"]), ("west", ["line", "sign"])):
         asked = desk.folder / f"{name}.request"
-        told = desk.ask(name, "registry", "request", "--output", asked)
-        assert str(told["role"]) == f"teds_{str(told['fingerprint'])[:16]}"
+        reply = desk.ask(name, "registry", "request", "--output", asked)
+        assert str(reply["role"]) == f"teds_{str(reply['fingerprint'])[:16]}"
         words = [word for role in roles for word in ("--role", role)]
         desk.ask("north", "registry", "add", asked, *words, "--yes")
     desk.ask("north", "registry", "connect", "--files", desk.stick, "--yes")
@@ -149,8 +149,8 @@ def test_a_removed_station_is_told_so_and_the_others_go_on(desk: Desk) -> None:
     desk.ask("north", "registry", "remove", "west", "--stolen", "--last", 1, "--yes")
     assert desk.ask("north", "registry", "status")["to_rotate"] == 1, "at once, before any sync"
     desk.sync("north")
-    told = desk.ask("west", "registry", "sync", "--files", desk.stick, code=6)
-    assert told["error"]["code"] == "not-member"  # type: ignore[index]
+    reply = desk.ask("west", "registry", "sync", "--files", desk.stick, code=6)
+    assert reply["error"]["code"] == "not-member"  # type: ignore[index]
     assert desk.ask("west", "registry", "status", code=6)["members"]
     desk.sync("south")
     refused = desk.run("south", "trust", "remove", "north", "--yes")
@@ -202,8 +202,8 @@ def test_the_doctor_says_whose_clock_is_wrong_until_that_station_dates_a_page_we
             n = 1 + max((number for number, *_ in pages.times(chain.id, 1)), default=0)
             pages.add(chain.id, PageRow(n, f"{n:064x}", "", created, "", b"", b"{}", bytes(64)))
         checks = json.loads(desk.run("south", "--json", "doctor").out)["checks"]
-        said = [check for check in checks if check["name"] == "registry" and "page" in check["why"]]
-        return [f"{item['why']} {item['fix']}" for item in said]
+        findings = [check for check in checks if check["name"] == "registry" and "page" in check["why"]]
+        return [f"{item['why']} {item['fix']}" for item in findings]
 
     assert found("9999-12-31T23:59:59Z") == [
         "west has dated its newest page 9999-12-31T23:59:59Z. Set the clock of west."
@@ -325,16 +325,16 @@ def test_a_fork_stops_the_copy_and_a_person_resumes(desk: Desk) -> None:
     desk.ask("copy", "whitelist", "add", UUID, "--fingerprint", KEY)
     desk.sync("copy")
     desk.ask("west", "whitelist", "add", "00" * 10, "--fingerprint", KEY)
-    told = desk.ask("west", "registry", "sync", "--files", desk.stick, code=4)
-    assert told["error"]["code"] == "fork"  # type: ignore[index]
+    reply = desk.ask("west", "registry", "sync", "--files", desk.stick, code=4)
+    assert reply["error"]["code"] == "fork"  # type: ignore[index]
     assert desk.ask("west", "registry", "status", code=4)["alarms"]
     planned = desk.ask("west", "registry", "resume", "--files", desk.stick, "--dry-run")
     assert (planned["done"], planned["adopts"]) == (0, 1)
     assert desk.ask("west", "registry", "status", code=4)["alarms"], "a plan resumes nothing"
     empty = desk.folder / "empty stick"
     empty.mkdir()
-    told = desk.ask("west", "registry", "sync", "--files", empty, code=4)
-    assert told["error"]["code"] == "fork", "a stick that shows nothing of it resumes nothing"  # type: ignore[index]
+    reply = desk.ask("west", "registry", "sync", "--files", empty, code=4)
+    assert reply["error"]["code"] == "fork", "a stick that shows nothing of it resumes nothing"  # type: ignore[index]
     assert not list(empty.glob("*/1.jws")), "a page from here would prove two histories"
     assert desk.ask("west", "registry", "resume", "--files", desk.stick, "--yes")["done"] == 1
     desk.sync("west")
@@ -352,8 +352,8 @@ def test_a_home_rebuilt_from_a_backup_takes_its_own_pages_back(desk: Desk) -> No
     desk.ask("west", "restore", copy, "--yes")
     assert (desk.folder / "west" / "registry-home").read_text() != home
     desk.ask("west", "whitelist", "add", "00" * 10, "--fingerprint", KEY)
-    told = desk.sync("west")
-    assert "before its backup" in str(told["told"])
+    reply = desk.sync("west")
+    assert "before its backup" in str(reply["told"])
     assert desk.ask("west", "registry", "status")["unsent"] == 0
     desk.sync("north")
     assert len(desk.ask("north", "registry", "log", "--station", "west")["events"]) == 2  # type: ignore[arg-type]
@@ -370,8 +370,8 @@ def test_a_home_rebuilt_from_a_backup_says_nothing_new_by_a_stick_that_knows_les
     shutil.rmtree(desk.folder / "west")
     desk.ask("west", "restore", copy, "--yes")
     desk.ask("west", "whitelist", "add", "00" * 10, "--fingerprint", KEY)
-    told = desk.ask("west", "registry", "sync", "--files", stale)
-    assert "was restored from a backup" in str(told["told"])
+    reply = desk.ask("west", "registry", "sync", "--files", stale)
+    assert "was restored from a backup" in str(reply["told"])
     assert not list(stale.glob("*/1.jws")), "page 1 was said before"
     assert "1 page that this station wrote before its backup is back" in desk.sync("west")["told"]  # type: ignore[operator]
     desk.sync("north")
@@ -389,8 +389,8 @@ def test_a_person_accepts_one_of_two_histories_and_sees_it_first(desk: Desk, tmp
     desk.ask("copy", "whitelist", "add", UUID, "--fingerprint", "cd" * 32)
     desk.ask("copy", "registry", "sync", "--files", other)
     desk.sync("north")
-    told = desk.ask("north", "registry", "sync", "--files", other, code=4)
-    assert [alarm["code"] for alarm in told["alarms"]] == ["two-histories"]  # type: ignore[attr-defined]
+    reply = desk.ask("north", "registry", "sync", "--files", other, code=4)
+    assert [alarm["code"] for alarm in reply["alarms"]] == ["two-histories"]  # type: ignore[attr-defined]
     refused = desk.run("north", "registry", "accept", "west", "--yes")
     assert refused.code == 6
     assert "--page" in refused.err
@@ -400,9 +400,9 @@ def test_a_person_accepts_one_of_two_histories_and_sees_it_first(desk: Desk, tmp
     assert desk.ask("north", "registry", "status", code=4)["alarms"]
     taken = desk.ask("north", "registry", "accept", "west", "--page", branch, "--yes")
     assert (taken["done"], taken["hash"]) == (1, plan["hash"])
-    told = desk.ask("north", "registry", "log", "--station", "west")
-    said = [event for event in told["events"] if event["act"] == "pinned"]  # type: ignore[attr-defined]
-    assert sorted(item["counts"] for item in said) == [False, True], "of two first pages one counts"
+    reply = desk.ask("north", "registry", "log", "--station", "west")
+    pins = [event for event in reply["events"] if event["act"] == "pinned"]  # type: ignore[attr-defined]
+    assert sorted(item["counts"] for item in pins) == [False, True], "of two first pages one counts"
     (node,) = desk.ask("north", "nodes", "--plant")["nodes"]  # type: ignore[misc]
     (pinned,) = node["says"]["pinned_by"].values()
     offered = desk.run("north", "registry", "accept", "west", "--page", "0" * 16, "--yes").err

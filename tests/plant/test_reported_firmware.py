@@ -58,29 +58,29 @@ def look(station: Station, board: FirmwareBoard) -> None:
 
 def shared_with(plants: Plant, station: Station) -> None:
     """North gives a station the keys of all its boards."""
-    for one, other in ((plants.north, station), (station, plants.north)):
-        one.policy.trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
+    for first, other in ((plants.north, station), (station, plants.north)):
+        first.policy.trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
     plants.change(plant.owner.shared(plants.north, Share(("all", ""), (station.fingerprint,))))
     plants.round()
 
 
-def said(station: Station, board: FirmwareBoard) -> dict[str, Any]:
+def identify_reply(station: Station, board: FirmwareBoard) -> dict[str, Any]:
     """What the plant says of a board, by a station."""
     (node,) = plant.status.nodes(station, plant.apply_pages.require_roster(station), board.uuid.hex())
-    says: dict[str, Any] = node["says"]
-    return says
+    member: dict[str, Any] = node["says"]
+    return member
 
 
 def version(station: Station, board: FirmwareBoard) -> tuple[str | None, str] | None:
     """The firmware that is shown, and who saw it; None: no station reports any."""
-    firmware = said(station, board)["firmware"]
+    firmware = identify_reply(station, board)["firmware"]
     return None if firmware is None else (firmware["version"], firmware["by"])
 
 
 def waiting(station: Station) -> list[object]:
     """Firmware that waits for the station's next page."""
     events = [json.loads(text) for _, _, text in station.plant.outbox(1000)]
-    return [told["runs"] for told in events if told["act"] == "firmware"]
+    return [event["runs"] for event in events if event["act"] == "firmware"]
 
 
 # -- what is reported ------------------------------------------------------------------------------------------------
@@ -99,7 +99,7 @@ def test_two_stations_see_what_either_read_last_and_who_read_it(plants: Plant, l
     look(south, board)
     plants.round()
     assert version(south, board) == version(plants.north, board) == ("1.3.0", "south")
-    reports = said(plants.north, board)["firmware_by"]
+    reports = identify_reply(plants.north, board)["firmware_by"]
     assert {name: seen["version"] for name, seen in reports.items()} == {"north": "1.2.0", "south": "1.3.0"}
     assert reports["south"]["image"] == "a2" * 32
     assert (reports["north"]["text"], reports["north"]["build"]) == ("nrf/loadcell", 3)
@@ -182,8 +182,8 @@ def test_a_station_that_joins_brings_what_it_read_with_its_time(plants: Plant) -
     look(plants.north, board)
     (kept,) = plants.north.firmware_reports.all()
     keep_firmware(plants.north, os.urandom(10), FirmwareReading(OLD, sealed=False))
-    told = [members for act, _, members in plant.backlog.backlog(plants.north) if act == "firmware"]
-    assert told == [{"runs": list(OLD.stated), "at": kept.at}]
+    reports = [members for act, _, members in plant.backlog.backlog(plants.north) if act == "firmware"]
+    assert reports == [{"runs": list(OLD.stated), "at": kept.at}]
 
 
 def test_a_stations_clock_ahead_makes_no_event_of_each_reading(plants: Plant) -> None:
@@ -278,7 +278,7 @@ def test_a_station_of_an_earlier_version_goes_on_and_sees_all_after_its_upgrade(
         plants.sync(south)
         south.plant.put_folded_acts(event.FORMS)
         events = [json.loads(text) for _, _, text in plants.north.plant.outbox(1000)]
-    assert [told["act"] for told in events].count("firmware") == 1
+    assert [event["act"] for event in events].count("firmware") == 1
     plants.sync(plants.north)
     with monkeypatch.context() as earlier:
         earlier.delitem(event.FORMS, "firmware")

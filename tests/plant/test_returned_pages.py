@@ -118,9 +118,9 @@ def test_a_datasheet_of_a_removed_signer_is_judged_by_a_station_that_joins_after
 def verdict(station: Station, signer: Station, digest: bytes) -> str:
     rules = station.policy.signer_rules()
     assert rules is not None
-    said = rules.signing(station.ca, signer.point, digest)
-    assert said is not None
-    return said.result
+    request = rules.signing(station.ca, signer.point, digest)
+    assert request is not None
+    return request.result
 
 
 def test_a_row_that_was_lost_is_filled_until_its_station_is_added_again(loss: Loss) -> None:

@@ -160,9 +160,9 @@ def test_two_sessions_of_a_member_share_its_limit(login: Login, author: str) -> 
         f"('\\x{author}', '\\x{login.fingerprint}', 65535, 1024 * 65535::bigint, now())"
     )
     refused: list[str | None] = []
-    with login.connect() as one, login.connect() as two:
-        with one.transaction():
-            restore(one, author, 1, page())
+    with login.connect() as session, login.connect() as two:
+        with session.transaction():
+            restore(session, author, 1, page())
 
             def second() -> None:
                 try:

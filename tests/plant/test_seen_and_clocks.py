@@ -28,9 +28,9 @@ def test_a_report_of_pages_that_are_missing_is_shown_until_a_person_has_seen_it(
         )
 
     report(10_000)
-    said = "witness saw page 10000 of north; the last one here is 0"
-    assert said in made.sync(south).remarks
-    assert said in made.sync(south).remarks
+    message = "witness saw page 10000 of north; the last one here is 0"
+    assert message in made.sync(south).remarks
+    assert message in made.sync(south).remarks
     assert acknowledge(south) == (0, 1)
     assert made.sync(south).remarks == []
     assert acknowledge(south) == (0, 0)

@@ -54,18 +54,18 @@ def synced(station: Station) -> None:
 
 
 def watching(station: Station) -> tuple[PlantWatch, list[dict[str, Any]], list[float]]:
-    live, told, changed = Live(), list[dict[str, Any]](), list[float]()
-    live.on_event = told.append
-    return PlantWatch(station, live, lambda: changed.append(time.monotonic())), told, changed
+    live, published, changed = Live(), list[dict[str, Any]](), list[float]()
+    live.on_event = published.append
+    return PlantWatch(station, live, lambda: changed.append(time.monotonic())), published, changed
 
 
 def test_what_another_station_pushes_arrives_without_waiting_for_the_minute(office: Office) -> None:
     north, south = by_url(office, office.north), by_url(office, office.plant.stations[1])
     synced(north)
-    watch, told, changed = watching(south)
+    watch, published, changed = watching(south)
     watch.start()
     try:
-        until(lambda: any(entry["state"] == "synced" for entry in told), told)
+        until(lambda: any(entry["state"] == "synced" for entry in published), published)
         for _ in range(2):  # the first may come by the sync that follows listening, the second by its notification
             board = board_of(north, os.urandom(10))
             before = len(changed)
@@ -89,13 +89,13 @@ def test_what_another_station_pushes_arrives_without_waiting_for_the_minute(offi
 def test_a_registry_that_is_gone_is_told_once_and_stops_nothing(office: Office, cluster: Cluster) -> None:
     south = by_url(office, office.plant.stations[1])
     cluster.psql(f"alter database {office.database.name} allow_connections false")
-    watch, told, _ = watching(south)
+    watch, published, _ = watching(south)
     watch.start()
     try:
-        until(lambda: any(entry["state"] == "unreachable" for entry in told), told)
+        until(lambda: any(entry["state"] == "unreachable" for entry in published), published)
         watch._wake.set()
         time.sleep(0.3)
-        assert [entry["state"] for entry in told] == ["unreachable"]
+        assert [entry["state"] for entry in published] == ["unreachable"]
     finally:
         watch.stop()
 
@@ -105,10 +105,10 @@ def test_an_alarm_is_told(office: Office) -> None:
 
     south = by_url(office, office.plant.stations[1])
     south.plant.alarms.put(Alarm("junk", office.north.fingerprint, 1, "something is there"))
-    watch, told, _ = watching(south)
+    watch, published, _ = watching(south)
     watch.start()
     try:
-        until(lambda: any(entry["state"] == "alarm" for entry in told), told)
+        until(lambda: any(entry["state"] == "alarm" for entry in published), published)
     finally:
         watch.stop()
 
@@ -119,10 +119,10 @@ def test_a_removed_station_is_told_so_once_and_goes_on_by_itself(office: Office)
     south = by_url(office, office.plant.stations[1])
     office.plant.change(plant.owner.draft_removal(office.north, "south", "retired", None))
     office.sync(office.north)
-    watch, told, _ = watching(south)
+    watch, published, _ = watching(south)
     watch.start()
     try:
-        until(lambda: any(entry["state"] == "removed" for entry in told), told)
-        assert [entry["state"] for entry in told] == ["removed"]
+        until(lambda: any(entry["state"] == "removed" for entry in published), published)
+        assert [entry["state"] for entry in published] == ["removed"]
     finally:
         watch.stop()

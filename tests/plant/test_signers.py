@@ -19,7 +19,7 @@ from teds_provision.station.station import Station
 from teds_provision.teds.image import Image
 from tests.bench import Board, talk
 from tests.plant.stations import Plant
-from tests.station.test_commits import Watched
+from tests.station.test_commits import StatementLog
 
 
 @pytest.fixture
@@ -130,9 +130,9 @@ def test_a_store_of_today_joins_its_owner_retires_it_and_its_datasheets_stay(pla
     image = made_by(west, Board())
     plants.change(plant.owner.add(plants.north, request_of(west), frozenset({"line", "sign"})))
     assert plants.north.plant.roster is not None
-    told = list(plant.backlog.backlog(west))
-    assert {"pinned", "agreed", "signed"} <= {act for act, _, _ in told}
-    plant.owner.join(west, plants.north.plant.roster, url=None, events=told)
+    events = list(plant.backlog.backlog(west))
+    assert {"pinned", "agreed", "signed"} <= {act for act, _, _ in events}
+    plant.owner.join(west, plants.north.plant.roster, url=None, events=events)
     plants.stations.append(west)
     plants.round()
     plants.change(plant.owner.draft_removal(plants.north, "west", "retired", None))
@@ -147,7 +147,7 @@ def test_who_joined_waits_for_the_disk_no_more_often(plants: Plant, tmp_path: Pa
     alone = owner(tmp_path / "alone", "alone")
     waited = []
     for station in (alone, plants.north):
-        watched = Watched(station)
+        watched = StatementLog(station)
         station._store._connection.set_trace_callback(watched.statements.append)
         _, commits = watched.run(Board(bytes([len(waited) + 1] * 10)))
         waited.append((commits, watched.waited))

@@ -58,7 +58,7 @@ class Stranger:
 
     def events(self) -> dict[str, list[dict[str, Any]]]:
         """What each station said, page after page, each the next one's `previous` by its H."""
-        said: dict[str, list[dict[str, Any]]] = {}
+        statements: dict[str, list[dict[str, Any]]] = {}
         last = dict.fromkeys(self.keys, "")
         for station, number, jws in self.office.database.sql(
             "select encode(station, 'hex'), n, jws from registry.page order by station, n"
@@ -66,8 +66,8 @@ class Stranger:
             page = self.opened(jws, self.keys[station])
             assert (page["station"], page["n"], page["previous"]) == (station, int(number), last[station])
             last[station] = hashlib.sha256(jws.rpartition(".")[0].encode()).hexdigest()
-            said.setdefault(station, []).extend(page["events"])
-        return said
+            statements.setdefault(station, []).extend(page["events"])
+        return statements
 
 
 def test_who_has_psql_and_jose_alone_comes_to_the_same_claims(office: Office, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from teds_provision.station.station import Station
 
 from .owner import alone, job_of
 from .proofs import signed_anew
-from .test_jobs import board, build
+from .test_jobs import build, make_board
 
 BOUND = {"facts", "node", "station"}
 """What of the predicate no station changes alone; ``finished`` and ``operator`` it can, and ``verdict`` with steps."""
@@ -112,7 +112,7 @@ def owner(tmp_path: Path) -> Iterator[Station]:
 def document(owner: Station) -> bytes:
     """Evidence of a board that a job made, by an operator with a name."""
     line = LineRun(owner, take_job(owner, job_of(owner)), operator="A. Meier")
-    build(line, board(1))
+    build(line, make_board(1))
     (row,) = owner.plant.line.evidence()
     return row.document
 

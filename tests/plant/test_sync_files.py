@@ -147,8 +147,8 @@ def test_a_copy_of_a_home_at_work_finds_itself_out(plants: Plant) -> None:
     plants.sync(plants.north)
     roster = plants.north.plant.roster
     assert roster is not None
-    said = merged_views(plants.north, roster, [bytes(10), bytes([1] * 10)])
-    assert all(view.pins for view in said.values())
+    views = merged_views(plants.north, roster, [bytes(10), bytes([1] * 10)])
+    assert all(view.pins for view in views.values())
     assert "two-histories" not in alarms(plants.north)
     west.close()
     copy.close()
@@ -229,7 +229,7 @@ def test_a_rebuilt_home_waits_where_somebody_has_seen_more_of_it(plants: Plant) 
     back.close()
 
 
-class Counting(FolderTransport):
+class CountingTransport(FolderTransport):
     """A transport that gives what it is asked for and no page more, as a registry's database does."""
 
     def pages(self, station: str, after: int) -> Iterator[CarriedPage]:
@@ -257,11 +257,11 @@ def test_a_rebuilt_home_compares_its_whole_chain_with_what_is_there(plants: Plan
     assert joined is not None
     assert joined.acknowledged >= 4
     shutil.copytree(other / west.fingerprint, plants.stick / west.fingerprint, dirs_exist_ok=True)
-    sync(west, Counting(plants.stick))  # what it saw there once, it does not read again
+    sync(west, CountingTransport(plants.stick))  # what it saw there once, it does not read again
     west.unlock()
     west.plant.begin_restored()
     with pytest.raises(ForkError):
-        sync(west, Counting(plants.stick))
+        sync(west, CountingTransport(plants.stick))
     assert alarms(west) == ["fork"]
     west.close()
 
@@ -330,7 +330,7 @@ def test_syncs_at_once_in_one_home_write_every_event_once(plants: Plant) -> None
     ends: list[str] = []
     gate = threading.Barrier(len(homes))
 
-    def one(station: Station, uuid: bytes) -> None:
+    def record(station: Station, uuid: bytes) -> None:
         gate.wait()
         pin(station, uuid)
         try:
@@ -339,7 +339,7 @@ def test_syncs_at_once_in_one_home_write_every_event_once(plants: Plant) -> None
         except StoreLockedError:  # another one had it for 10 s
             ends.append("locked")
 
-    threads = [threading.Thread(target=one, args=pair) for pair in zip(homes, nodes, strict=True)]
+    threads = [threading.Thread(target=record, args=pair) for pair in zip(homes, nodes, strict=True)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -347,8 +347,8 @@ def test_syncs_at_once_in_one_home_write_every_event_once(plants: Plant) -> None
     assert len(ends) == len(homes)
     assert set(ends) <= {"done", "locked"}
     plants.sync(plants.north)
-    said = [stated.event["uuid"] for stated in plant.status.log(plants.north)]
-    assert sorted(said) == [uuid.hex() for uuid in nodes]
+    uuids = [stated.event["uuid"] for stated in plant.status.log(plants.north)]
+    assert sorted(uuids) == [uuid.hex() for uuid in nodes]
     assert plants.north.plant.unsent() == 0
     assert alarms(plants.north) == []
     for station in homes:

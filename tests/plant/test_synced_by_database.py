@@ -55,8 +55,8 @@ class Office:
         return made
 
     def transport(self, station: Station, **more: Any) -> PostgresTransport:
-        told = parameters(self.database.url, station.fingerprint, self.secrets[station.fingerprint])
-        return PostgresTransport(Registry(told | more), "the registry", station.fingerprint)
+        settings = parameters(self.database.url, station.fingerprint, self.secrets[station.fingerprint])
+        return PostgresTransport(Registry(settings | more), "the registry", station.fingerprint)
 
     def sync(self, *stations: Station) -> SyncResult:
         done = SyncResult()
@@ -136,8 +136,8 @@ def test_a_database_that_was_lost_is_filled_by_its_members(office: Office, clust
     office.database.sql(registry_sql(office.database.registry))
     for station in (office.north, south):
         office.known(station)
-    told = office.sync(office.north).remarks + office.sync(south).remarks
-    assert any("rolled back" in line for line in told)
+    remarks = office.sync(office.north).remarks + office.sync(south).remarks
+    assert any("rolled back" in line for line in remarks)
     assert office.database.sql("select n, jws from registry.page order by n, jws")[: len(before)] == before
     assert office.database.sql("select count(distinct jws) from registry.roster") == [["1"]]
 
@@ -149,8 +149,8 @@ def test_a_database_of_yesterday_is_brought_up_to_today(office: Office) -> None:
     office.sync(office.north)
     newest = office.north.plant.pages.chains()[office.north.fingerprint].counted[0]
     office.database.sql(mend_sql(office.north.fingerprint, newest))  # as if it had not come yet
-    told = office.sync(office.north).remarks
-    assert any(f"page {newest} was there, and now {newest - 1} is the last" in line for line in told), told
+    remarks = office.sync(office.north).remarks
+    assert any(f"page {newest} was there, and now {newest - 1} is the last" in line for line in remarks), remarks
     assert [alarm.code for alarm in office.north.plant.alarms.all()] == ["rolled-back"]
     office.sync(south)
     assert south.plant.pages.chains()[office.north.fingerprint].counted[0] >= newest
@@ -249,6 +249,6 @@ def test_a_copy_of_a_home_at_work_beside_it_stops_both_until_a_person_decides(of
     office.sync(office.north)
     assert [alarm.code for alarm in office.north.plant.alarms.all()] == []
     events = [stated.event for stated in plant_room.status.log(office.north, of=south.fingerprint)]
-    said = {event["uuid"] for event in events if event["act"] == "pinned"}
-    assert said == {bytes([n] * 10).hex() for n in (1, 2)}
+    uuids = {event["uuid"] for event in events if event["act"] == "pinned"}
+    assert uuids == {bytes([n] * 10).hex() for n in (1, 2)}
     copy.close()

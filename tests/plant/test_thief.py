@@ -345,9 +345,9 @@ def test_a_closed_station_neither_writes_nor_reads_parcels_and_its_connections_e
 
 def test_a_member_reads_all_pages_and_a_reader_all_but_parcels(thief: Connection, hall: Hall) -> None:
     assert thief.execute("select count(*) from registry.page where jws like '%%victim''s first%%'").fetchone() == (1,)
-    said = "set role teds_reader; select count(*) > 0 from registry.page; select count(*) from registry.parcel"
+    query = "set role teds_reader; select count(*) > 0 from registry.page; select count(*) from registry.parcel"
     with pytest.raises(Exception, match="permission denied for table parcel"):
-        hall.database.sql(said)
+        hall.database.sql(query)
 
 
 def test_each_member_has_its_roster_row_and_a_rolled_back_one_is_put_back(hall: Hall) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from teds_provision.protocol.flash import Flash, FlashError
 
 
-class PowerCut(Exception):
+class PowerCutError(Exception):
     """The node died; what it had in RAM is gone."""
 
 
@@ -28,9 +28,9 @@ class RamFlash:
         if self.fail:
             raise FlashError
         if self.die_before:
-            raise PowerCut
+            raise PowerCutError
         if self.garbles:
             return
         self.state = state
         if self.die_after:
-            raise PowerCut
+            raise PowerCutError

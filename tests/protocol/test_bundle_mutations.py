@@ -45,8 +45,8 @@ def test_any_octets_cut_out_and_put_in(at, length, octets):
 @given(st.integers(0, len(SEALED)), st.integers(0, len(SEALED)), st.integers(0, len(SEALED)))
 @example(0, 0, len(SEALED))
 def test_pieces_in_another_order(first, second, third):
-    one, two, three = sorted((first, second, third))
-    content_or_leaf(SEALED[:one] + SEALED[two:three] + SEALED[one:two] + SEALED[three:])
+    here, two, three = sorted((first, second, third))
+    content_or_leaf(SEALED[:here] + SEALED[two:three] + SEALED[here:two] + SEALED[three:])
 
 
 @settings(deadline=None)

@@ -116,7 +116,7 @@ def test_the_proof_of_an_agreement_is_over_the_vectors_transcript() -> None:
 
 
 def test_rotation_from_both_roles_gives_the_vectors_frames() -> None:
-    told = KAT["rotation"]
+    rotation = KAT["rotation"]
     signed = octets("datasheet", "security_teds")
     flash = Flash(
         UUID,
@@ -131,9 +131,9 @@ def test_rotation_from_both_roles_gives_the_vectors_frames() -> None:
         provisioned=True,
     )
     drawn = iter([bytes(8), octets("rotation", "nonceN")])
-    one_time = SoftwareKey(int(told["one_time_node"]["d"], 16))
+    one_time = SoftwareKey(int(rotation["one_time_node"]["d"], 16))
     node = Tim(key("node"), RamFlash(flash), lambda: 0.0, random=lambda n: next(drawn), one_time=lambda: one_time)
-    agreement = StationAgreement(CREDENTIALS, UUID, one_time=SoftwareKey(int(told["one_time"]["d"], 16)))
+    agreement = StationAgreement(CREDENTIALS, UUID, one_time=SoftwareKey(int(rotation["one_time"]["d"], 16)))
     assert agreement.request().encode() == octets("rotation", "request_frame")
     reply = node.handle(agreement.request().encode(), link="nfc", tapped=True)
     assert reply == octets("rotation", "reply_frame")

@@ -129,10 +129,10 @@ HARMLESS = [packet(STATES), packet(ECHO, d="a"), *(packet(command) for command i
 def test_what_is_listed_reaches_the_manager_as_it_is() -> None:
     desk = ManagedDesk()
     passing = [*HARMLESS, START, START_TOO, first(), piece(1)]
-    for one in passing:
-        reply = desk.ask(one)
+    for packet_in in passing:
+        reply = desk.ask(packet_in)
         assert reply.ok
-        assert decode_packet(reply.payload) == one.reply(cbor2.dumps({}))
+        assert decode_packet(reply.payload) == packet_in.reply(cbor2.dumps({}))
     assert desk.manager.got == passing
 
 
@@ -231,10 +231,10 @@ def test_only_an_image_on_trial_is_confirmed() -> None:
 @pytest.mark.parametrize("state", ["on_trial", "pending"])
 def test_the_way_back_is_not_overwritten(state: str) -> None:
     desk = ManagedDesk(**{state: True})
-    for one in (START, START_TOO, first(), piece(5)):
-        assert desk.refuses(one) == Reason.BUSY
-    for one in HARMLESS:
-        assert desk.refuses(one) is None
+    for packet_in in (START, START_TOO, first(), piece(5)):
+        assert desk.refuses(packet_in) == Reason.BUSY
+    for packet_in in HARMLESS:
+        assert desk.refuses(packet_in) is None
     assert desk.ask(packet(RESTART)).ok
 
 
@@ -276,8 +276,8 @@ def test_a_restart_comes_when_its_reply_has_left_and_from_nowhere_else() -> None
 # -- uploads -----------------------------------------------------------------------------------------------------------
 
 
-def of_another(desk: ManagedDesk, session: StationSession, one: SmpPacket, link: str = "can:f1") -> int | None:
-    outer = desk.plain(session.seal(security_command(Function.MANAGE, one.encode())), link=link, tapped=False)
+def of_another(desk: ManagedDesk, session: StationSession, original: SmpPacket, link: str = "can:f1") -> int | None:
+    outer = desk.plain(session.seal(security_command(Function.MANAGE, original.encode())), link=link, tapped=False)
     return session.unseal(outer.payload).reason
 
 
@@ -287,8 +287,8 @@ def test_while_an_upload_lives_nothing_of_others_disturbs_it() -> None:
     other = desk.second_session()
     assert desk.session is not None
     second, desk.session = desk.session, other
-    for one in (first(), piece(1), START, packet(RESTART)):
-        assert of_another(desk, second, one, "can:f2") == Reason.BUSY
+    for packet_in in (first(), piece(1), START, packet(RESTART)):
+        assert of_another(desk, second, packet_in, "can:f2") == Reason.BUSY
     assert of_another(desk, second, packet(STATES), "can:f2") is None
     operate = Command(1, 4, 1, bytes(17))
     for command in (write_teds(0, 1, 0, b"x"), operate):
@@ -340,8 +340,8 @@ def test_what_another_session_has_staged_is_not_lost_by_a_restart() -> None:
     assert desk.sealed(write_teds(0, 1, 0, b"x"), link="can:f1").ok
     first_session = desk.second_session()
     assert desk.session is not None
-    for one in (START, first(), packet(RESTART)):
-        assert of_another(desk, desk.session, one, "can:f2") == Reason.BUSY
+    for packet_in in (START, first(), packet(RESTART)):
+        assert of_another(desk, desk.session, packet_in, "can:f2") == Reason.BUSY
     assert of_another(desk, first_session, START) is None, "one's own staging is one's own matter"
 
 

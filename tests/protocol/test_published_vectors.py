@@ -92,16 +92,16 @@ def test_the_station_sends_and_takes_what_is_published(document: Entry, entry: E
                 found = session.unseal(decode_reply(bytes.fromhex(step["reply"])).payload)
                 assert found.encode().hex() == inner["reply"], step["note"]
         if "agreement" in step:
-            told = step["agreement"]
+            member = step["agreement"]
             command = command_of(inner["command"] if inner else step["command"])
             reply = decode_reply(bytes.fromhex(inner["reply"] if inner else step["reply"]))
-            one_time = SoftwareKey(int(document["keys"][told["one_time"]]["d"], 16))
+            one_time = SoftwareKey(int(document["keys"][member["one_time"]]["d"], 16))
             agreement = StationAgreement(credentials_in(document, command.payload), uuid, one_time=one_time)
             assert agreement.request() == command
-            pinned, teds = document["keys"]["node"]["fingerprint"], bytes.fromhex(told["teds"])
-            agreed = agreement.accept(reply.payload, teds, pinned=pinned, epoch=told["epoch_held"])
-            assert (agreed.key.hex(), agreed.epoch) == (told["K"], told["epoch"])
-            assert agreed.confirm.payload.hex() == told["tagS"]
+            pinned, teds = document["keys"]["node"]["fingerprint"], bytes.fromhex(member["teds"])
+            agreed = agreement.accept(reply.payload, teds, pinned=pinned, epoch=member["epoch_held"])
+            assert (agreed.key.hex(), agreed.epoch) == (member["K"], member["epoch"])
+            assert agreed.confirm.payload.hex() == member["tagS"]
 
 
 # -- transcripts: plain primitives -----------------------------------------------------------------------------------
@@ -141,7 +141,7 @@ def check_open(uuid: bytes, step: Entry) -> tuple[bytes, bytes]:
 
 
 def check_agreement(document: Entry, uuid: bytes, step: Entry) -> None:
-    told, frames = step["agreement"], step.get("inner", step)
+    agreement, frames = step["agreement"], step.get("inner", step)
     request, reply = bytes.fromhex(frames["command"])[6:], bytes.fromhex(frames["reply"])[3:]
     station, signature, ca, one_time = request[:65], request[65:129], request[129:194], request[194:]
     vn.check_signature(ca, b"TEDS1 station key\0" + station, signature)
@@ -149,16 +149,16 @@ def check_agreement(document: Entry, uuid: bytes, step: Entry) -> None:
     nonce, epoch, own, tag, proof = reply[:16], reply[16:20], reply[20:85], reply[85:101], reply[101:]
     node = bytes.fromhex(document["keys"]["node"]["P"])
     secret = next(key["d"] for key in document["keys"].values() if key["P"] == station.hex())
-    assert document["keys"][told["one_time"]]["P"] == one_time.hex()
-    shared = vn.ecdh(document["keys"][told["one_time"]]["d"], own) + vn.ecdh(secret, own)
+    assert document["keys"][agreement["one_time"]]["P"] == one_time.hex()
+    shared = vn.ecdh(document["keys"][agreement["one_time"]]["d"], own) + vn.ecdh(secret, own)
     assert shared == vn.ecdh(step["En"], one_time) + vn.ecdh(step["En"], station)
-    teds = hashlib.sha256(bytes.fromhex(told["teds"])).digest()
+    teds = hashlib.sha256(bytes.fromhex(agreement["teds"])).digest()
     script = hashlib.sha256(b"TEDS1 transcript\0" + request + nonce + epoch + own + uuid + node + teds).digest()
     vn.check_signature(node, b"TEDS1 agree\0" + script, proof)
     okm = vn.hkdf(shared, nonce, b"TEDS1 link key\0" + script, 48)
-    assert okm[:16].hex() == told["K"]
+    assert okm[:16].hex() == agreement["K"]
     assert tag == vn.mac(okm[16:], b"node" + script)
-    assert told["tagS"] == vn.mac(okm[16:], b"station" + script).hex()
+    assert agreement["tagS"] == vn.mac(okm[16:], b"station" + script).hex()
 
 
 def test_proofs_of_reset_verify() -> None:
@@ -261,13 +261,15 @@ def test_bundles_open_or_are_refused_as_published(document: Entry, entry: Entry)
     assert outcome == entry["outcome"], entry["note"]
     if outcome != "opened":
         return
-    told = entry["payload"]
-    assert (opened.bundle.id, opened.bundle.mode) == (told["id"], told["mode"])
-    assert [bundled_node.uuid.hex() for bundled_node in opened.bundle.nodes] == [node["uuid"] for node in told["nodes"]]
+    payload = entry["payload"]
+    assert (opened.bundle.id, opened.bundle.mode) == (payload["id"], payload["mode"])
+    assert [bundled_node.uuid.hex() for bundled_node in opened.bundle.nodes] == [
+        node["uuid"] for node in payload["nodes"]
+    ]
     assert opened.bundle.nodes[0].key.hex() == "346dc7ba01b285e9fedeb955a14398b8"
     assert opened.station_signature is not None
     receipt = open_receipt(entry["receipt_jws"].encode(), trust_store(document, [entry["recipient"]]).get)
-    assert (receipt.id, receipt.bundle_sha256) == (told["id"], opened.sha256)
+    assert (receipt.id, receipt.bundle_sha256) == (payload["id"], opened.sha256)
 
 
 @vn.cases("handover")

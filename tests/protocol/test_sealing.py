@@ -32,7 +32,7 @@ def whole(octets, key=RECEIVER):
     return jose.verify_compact(signed, trusts(SENDER), typ="note", max_octets=LIMIT)
 
 
-def told(read, octets):
+def number_of(read, octets):
     """What a reader gives: signer and payload, or the kind of its refusal."""
     try:
         found = read(octets)
@@ -45,7 +45,7 @@ def told(read, octets):
 def test_what_was_sealed_in_pieces_is_opened_by_either_reader(pieces, size):
     octets, made = seal(pieces)
     signed = jose.decrypt(octets, RECEIVER, cty="JWS", max_octets=LIMIT)
-    assert told(whole, octets) == (fingerprint(SENDER.point), b"".join(pieces))
+    assert number_of(whole, octets) == (fingerprint(SENDER.point), b"".join(pieces))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(envelope, "PIECE", size)
         found = unseal(io.BytesIO(octets))
@@ -64,7 +64,7 @@ def test_both_readers_say_the_same_of_a_changed_file(data):
     changed = octets[:at] + change + octets[at + data.draw(st.integers(0, 40)) :]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(envelope, "PIECE", size)
-        assert told(unseal, changed) == told(whole, changed)
+        assert number_of(unseal, changed) == number_of(whole, changed)
 
 
 @pytest.mark.parametrize("size", [16, 64])
@@ -86,7 +86,7 @@ def test_an_escape_is_read_wherever_a_piece_of_the_file_ends(size, monkeypatch):
     begin = text.index('"ciphertext"') + len('"ciphertext":"') + 1
     for at in range(begin, begin + 2 * size):
         escaped = f"{text[:at]}\\u{ord(text[at]):04x}{text[at + 1 :]}".encode()
-        assert told(unseal, escaped)[1] == NOTE * 9
+        assert number_of(unseal, escaped)[1] == NOTE * 9
 
 
 @pytest.mark.parametrize("value", [None, 7, [], "", "A", "ü" * 40, "A" * 99, "=" * 64])
@@ -116,7 +116,7 @@ def test_a_file_that_changes_while_it_is_read_is_refused(tmp_path):
     path = tmp_path / "bundle"
     path.write_bytes(seal([NOTE * 9000])[0])
 
-    class Turned(io.FileIO):
+    class TurnedFile(io.FileIO):
         """A file in which another process turns one character after it was read once."""
 
         reads = 0
@@ -127,7 +127,7 @@ def test_a_file_that_changes_while_it_is_read_is_refused(tmp_path):
             late = self.reads > 12 and len(piece) > 9
             return piece[:5] + (b"B" if piece[5:6] == b"A" else b"A") + piece[6:] if late else piece
 
-    with Turned(path) as file, pytest.raises(NotAuthenticError):
+    with TurnedFile(path) as file, pytest.raises(NotAuthenticError):
         unseal(file)
 
 
@@ -146,7 +146,7 @@ def test_the_tag_is_looked_at_before_anything_that_came_out():
 def test_a_signed_text_of_another_form_is_no_document(monkeypatch):
     for text in (b"a.b", b"a.b.c.d", b"", b".." * 9000, b"A" * 70000 + b".AA.AA", b"e30.A.AA"):
         sealed = jose.encrypt(text, [RECEIVER.point], cty="JWS")
-        assert told(unseal, sealed) == told(whole, sealed)
+        assert number_of(unseal, sealed) == number_of(whole, sealed)
 
 
 @given(st.binary(max_size=300))

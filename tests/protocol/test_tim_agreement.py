@@ -30,7 +30,7 @@ from teds_provision.protocol.wire_agreement import (
 from teds_provision.teds.codec import security
 
 from .desk import CA, CREDENTIALS, NODE, STATION, UUID, Desk
-from .memory import PowerCut
+from .memory import PowerCutError
 
 OTHER_CA = SoftwareKey(11)
 OFF_CURVE = b"\x04" + bytes(63) + b"\x01"
@@ -164,7 +164,7 @@ def test_power_cut_in_confirm_leaves_all_old_or_all_new(when: str) -> None:
     desk = Desk()
     agreed = half_way(desk)
     setattr(desk.memory, when, True)
-    with pytest.raises(PowerCut):
+    with pytest.raises(PowerCutError):
         desk.plain(agreed.confirm)
     expected = (None, 0) if when == "die_before" else (agreed.key, 1)
     assert (desk.flash.key, desk.flash.epoch) == expected
@@ -212,7 +212,7 @@ def test_the_station_refuses_a_key_that_is_not_signed_for_this_uuid_in_the_agree
 # -- the station's half: the order of its checks -----------------------------------------------------------------------
 
 
-class Answered:
+class AgreementReply:
     """A good reply to a Request, and what the node that made it would say with another En, T or key."""
 
     def __init__(self) -> None:
@@ -246,7 +246,7 @@ TAG_AT = 85
 
 
 def test_the_station_checks_length_point_tag_proof_and_epoch_in_this_order() -> None:
-    answered = Answered()
+    answered = AgreementReply()
     everything = with_en(bent(bent(answered.reply(signer=CA), TAG_AT), 19), OFF_CURVE)
     with pytest.raises(GarbledError, match="164 octets, not 165"):
         answered.accept(everything[:-1], epoch=1)
@@ -264,7 +264,7 @@ def test_the_station_checks_length_point_tag_proof_and_epoch_in_this_order() -> 
 @pytest.mark.parametrize("whose", ["E", "P(station)", "P(node)", "off the curve", "zeros"])
 def test_en_is_a_one_time_key_of_the_node_and_nothing_else(whose: str) -> None:
     """With En = P(node) a thief of the identity key could read what was agreed on before."""
-    answered = Answered()
+    answered = AgreementReply()
     holders = {"E": answered.one_time, "P(station)": STATION, "P(node)": NODE}
     if whose in holders:
         reply = answered.reply(one_time=holders[whose])  # right in everything else
@@ -275,7 +275,7 @@ def test_en_is_a_one_time_key_of_the_node_and_nothing_else(whose: str) -> None:
 
 
 def test_a_high_s_in_the_proof_of_an_agreement_is_refused() -> None:
-    answered = Answered()
+    answered = AgreementReply()
     reply = answered.reply()
     high = GROUP_ORDER - int.from_bytes(reply[-32:], "big")
     with pytest.raises(NotAuthenticError, match="sigN"):
@@ -284,13 +284,13 @@ def test_a_high_s_in_the_proof_of_an_agreement_is_refused() -> None:
 
 def test_a_thief_of_the_station_key_cannot_pose_as_a_node() -> None:
     """Under KeyAgreement 1 he could: ECDH(station, node) was known to him as well."""
-    answered = Answered()
+    answered = AgreementReply()
     with pytest.raises(NotAuthenticError, match="sigN"):
         answered.accept(answered.reply(signer=STATION))
 
 
 def test_the_datasheet_that_the_station_read_is_part_of_what_is_agreed_on() -> None:
-    answered = Answered()
+    answered = AgreementReply()
     reply = answered.reply()
     answered.teds = security.initial(NODE.point, Desk().flash.node_key_signature, sequence=1, key_epoch=0)
     with pytest.raises(TranscriptMismatchError):

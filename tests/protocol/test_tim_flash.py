@@ -32,7 +32,7 @@ from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY
 
 from .desk import CA, META, NAME, NODE, STATION, UUID, Desk, digest
-from .memory import PowerCut
+from .memory import PowerCutError
 
 BLOCKS = {(0, 1): META, (1, 12): NAME}
 
@@ -109,43 +109,43 @@ def test_a_gap_gets_4_and_changes_nothing(desk: Desk) -> None:
 
 
 @dataclass
-class Two:
+class TwoSessions:
     """Two sessions, over NFC and over CAN."""
 
     desk: Desk
     here: StationSession
     there: StationSession
 
-    def one(self, command: Command) -> Reply:
+    def by_nfc(self, command: Command) -> Reply:
         self.desk.session = self.here
         return self.desk.sealed(command)
 
-    def other(self, command: Command) -> Reply:
+    def by_can(self, command: Command) -> Reply:
         self.desk.session = self.there
         return self.desk.sealed(command, link="can:f1")
 
 
 @pytest.fixture
-def two(desk: Desk) -> Two:
+def two(desk: Desk) -> TwoSessions:
     here = desk.session
     there = desk.open(link="can:f1").session
     assert here is not None
     assert there is not None
-    two = Two(desk, here, there)
-    assert two.other(security_command(Function.LIST)).ok  # half-open no longer
+    two = TwoSessions(desk, here, there)
+    assert two.by_can(security_command(Function.LIST)).ok  # half-open no longer
     return two
 
 
 BUSY = refusal(Reason.BUSY)
 
 
-def test_while_something_is_staged_write_and_update_in_another_session_get_17(two: Two) -> None:
-    assert two.one(write_teds(1, 12, 0, NAME)).ok
-    assert two.other(write_teds(0, 1, 0, META)) == BUSY
-    assert two.other(update_teds(0, 128)) == BUSY
-    assert two.other(update_teds(1, 12)) == BUSY
-    assert two.other(query_teds(1, 12)).ok, "to look is free"
-    assert two.one(update_teds(1, 12)).ok, "and it is all there"
+def test_while_something_is_staged_write_and_update_in_another_session_get_17(two: TwoSessions) -> None:
+    assert two.by_nfc(write_teds(1, 12, 0, NAME)).ok
+    assert two.by_can(write_teds(0, 1, 0, META)) == BUSY
+    assert two.by_can(update_teds(0, 128)) == BUSY
+    assert two.by_can(update_teds(1, 12)) == BUSY
+    assert two.by_can(query_teds(1, 12)).ok, "to look is free"
+    assert two.by_nfc(update_teds(1, 12)).ok, "and it is all there"
 
 
 def test_the_17_of_the_staging_area_comes_after_4_3_and_18_and_before_10() -> None:
@@ -155,50 +155,50 @@ def test_the_17_of_the_staging_area_comes_after_4_3_and_18_and_before_10() -> No
     here, there = desk.session, desk.open(link="can:f1").session
     assert here is not None
     assert there is not None
-    two = Two(desk, here, there)
-    assert two.one(write_teds(1, 12, 0, NAME)).ok
-    assert two.other(Command(1, 1, 3, b"\x0c\0\0\0")) == refusal(Reason.BAD_FORM)
-    assert two.other(write_teds(1, 12, 1, b"x")) == refusal(Reason.BAD_FORM), "its own staging is empty"
-    assert two.other(write_teds(0, 13, 0, b"x")) == refusal(Reason.NOT_PERMITTED)
-    assert two.other(write_teds(0, 127, 0, b"x")) == refusal(Reason.NO_SUCH_TEDS)
-    assert two.other(update_teds(0, 127)) == refusal(Reason.NO_SUCH_TEDS)
-    assert two.other(write_teds(1, 12, 0, bytes(1900))) == BUSY
+    two = TwoSessions(desk, here, there)
+    assert two.by_nfc(write_teds(1, 12, 0, NAME)).ok
+    assert two.by_can(Command(1, 1, 3, b"\x0c\0\0\0")) == refusal(Reason.BAD_FORM)
+    assert two.by_can(write_teds(1, 12, 1, b"x")) == refusal(Reason.BAD_FORM), "its own staging is empty"
+    assert two.by_can(write_teds(0, 13, 0, b"x")) == refusal(Reason.NOT_PERMITTED)
+    assert two.by_can(write_teds(0, 127, 0, b"x")) == refusal(Reason.NO_SUCH_TEDS)
+    assert two.by_can(update_teds(0, 127)) == refusal(Reason.NO_SUCH_TEDS)
+    assert two.by_can(write_teds(1, 12, 0, bytes(1900))) == BUSY
 
 
 @pytest.mark.parametrize(("seconds", "reply"), [(59.9, BUSY), (60.0, Reply(True))])
 def test_staging_that_was_not_touched_for_60_seconds_gives_way_to_a_write(
-    two: Two, seconds: float, reply: Reply
+    two: TwoSessions, seconds: float, reply: Reply
 ) -> None:
-    assert two.one(write_teds(1, 12, 0, NAME)).ok
+    assert two.by_nfc(write_teds(1, 12, 0, NAME)).ok
     two.desk.now += 30
-    assert two.one(update_teds(1, 12)).ok  # this touches it
+    assert two.by_nfc(update_teds(1, 12)).ok  # this touches it
     two.desk.now += seconds
-    assert two.other(update_teds(0, 1)) == BUSY, "an Update makes nothing give way"
-    assert two.other(write_teds(0, 1, 0, META)) == reply
+    assert two.by_can(update_teds(0, 1)) == BUSY, "an Update makes nothing give way"
+    assert two.by_can(write_teds(0, 1, 0, META)) == reply
     if reply.ok:
-        assert two.one(update_teds(1, 12)) == BUSY, "what it had is gone"
-        assert two.other(update_teds(0, 1)).ok
+        assert two.by_nfc(update_teds(1, 12)) == BUSY, "what it had is gone"
+        assert two.by_can(update_teds(0, 1)).ok
 
 
-def test_a_write_that_is_refused_makes_nothing_give_way(two: Two) -> None:
-    assert two.one(write_teds(1, 12, 0, NAME)).ok
+def test_a_write_that_is_refused_makes_nothing_give_way(two: TwoSessions) -> None:
+    assert two.by_nfc(write_teds(1, 12, 0, NAME)).ok
     two.desk.now += 60
     two.desk.tim._teds = replace(two.desk.tim._teds, max_teds=10)
-    assert two.other(write_teds(0, 1, 0, META)) == refusal(Reason.TOO_LARGE)
-    assert two.one(update_teds(1, 12)).ok
+    assert two.by_can(write_teds(0, 1, 0, META)) == refusal(Reason.TOO_LARGE)
+    assert two.by_nfc(update_teds(1, 12)).ok
 
 
 @pytest.mark.parametrize("end", ["close", "link", "commit"])
-def test_the_staging_area_is_free_when_its_session_or_its_commit_is_over(two: Two, end: str) -> None:
-    assert two.one(write_teds(1, 12, 0, NAME)).ok
+def test_the_staging_area_is_free_when_its_session_or_its_commit_is_over(two: TwoSessions, end: str) -> None:
+    assert two.by_nfc(write_teds(1, 12, 0, NAME)).ok
     if end == "close":
-        assert two.one(security_command(Function.CLOSE)).ok
+        assert two.by_nfc(security_command(Function.CLOSE)).ok
     elif end == "link":
         two.desk.tim.link_lost("nfc")
     else:
         two.desk.session = two.here
         assert two.desk.commit(BLOCKS).ok
-    assert two.other(write_teds(0, 1, 0, META)).ok
+    assert two.by_can(write_teds(0, 1, 0, META)).ok
 
 
 def test_a_node_takes_no_teds_that_its_list_could_not_name(desk: Desk) -> None:
@@ -375,7 +375,7 @@ def test_power_cut_in_the_commit_leaves_all_old_or_all_new(desk: Desk, when: str
     old = dict(desk.flash.blocks)
     new = {(0, 1): META}
     setattr(desk.memory, when, True)
-    with pytest.raises(PowerCut):
+    with pytest.raises(PowerCutError):
         desk.commit(new)
     assert set(desk.flash.blocks) == (set(old) if when == "die_before" else {(0, 1), SECURITY})
     desk.memory.die_before = desk.memory.die_after = False

@@ -217,10 +217,10 @@ def test_what_flash_took_and_reads_back_as_something_else_gets_11_and_does_not_c
     before = desk.tim.identity()
     desk.memory.garbles = True
     if what == "a datasheet":
-        said = desk.commit({(0, 1): META})
+        reply = desk.commit({(0, 1): META})
     else:
-        said = desk.sealed(address(0x21) if what == "an address" else security_command(Function.RESET, CHALLENGE))
-    assert said.reason == Reason.FLASH_FAILURE
+        reply = desk.sealed(address(0x21) if what == "an address" else security_command(Function.RESET, CHALLENGE))
+    assert reply.reason == Reason.FLASH_FAILURE
     assert desk.tim.identity() == before
     desk.memory.garbles = False
     assert desk.sealed(security_command(Function.RESET, CHALLENGE)).ok

@@ -50,14 +50,14 @@ def board(folder: Path, blocks: Mapping[BlockId, bytes], uuid: bytes = UUID) -> 
 
 
 def adopted(
-    station: Station, node: VirtualNode, order: BuildOrder = ADOPT, says: TedsProvisionError | None = None
+    station: Station, node: VirtualNode, order: BuildOrder = ADOPT, raises: TedsProvisionError | None = None
 ) -> tuple[ProvisionResult, list[FactoryDatasheet]]:
     shown: list[FactoryDatasheet] = []
 
     def ask(brought: FactoryDatasheet) -> None:
         shown.append(brought)
-        if says is not None:
-            raise says
+        if raises is not None:
+            raise raises
 
     with Conversation(on_reader(node), notice=lambda _notice: None) as talk:
         done = provision(station, talk, order, operator=Answers(adopt=ask), reporter=SilentReporter())
@@ -80,7 +80,7 @@ def test_a_board_with_a_good_datasheet_is_in_service_after_a_tap_and_one_yes(sta
 def test_without_a_yes_it_stays_as_it_was(station: Station, tmp_path: Path) -> None:
     node = board(tmp_path / "n", factory())
     with pytest.raises(PolicyError, match="no thanks"):
-        adopted(station, node, says=PolicyError("no thanks"))
+        adopted(station, node, raises=PolicyError("no thanks"))
     with (
         Conversation(on_reader(node), notice=lambda _notice: None) as talk,
         pytest.raises(NotAdoptedError, match="not approved for signing yet"),
@@ -159,7 +159,7 @@ def with_tuple(blocks: dict[BlockId, bytes], block: BlockId, kind: int, value: b
 
 
 @pytest.mark.parametrize(
-    ("blocks", "said"),
+    ("blocks", "message"),
     [
         (named(factory(), 0, "joint\x1b[31m"), "unprintable"),
         (named(factory(), 1, "angle\u202egnp"), "unprintable"),
@@ -187,11 +187,11 @@ def with_tuple(blocks: dict[BlockId, bytes], block: BlockId, kind: int, value: b
     ],
 )
 def test_a_hostile_datasheet_is_never_signed(
-    station: Station, tmp_path: Path, blocks: dict[BlockId, bytes], said: str
+    station: Station, tmp_path: Path, blocks: dict[BlockId, bytes], message: str
 ) -> None:
     node = board(tmp_path / "n", blocks)
     for order in (ADOPT, BuildOrder(adopt=True, accept_calibration="because")):
-        with pytest.raises(BadDataError, match=said):
+        with pytest.raises(BadDataError, match=message):
             adopted(station, node, order)
     assert node.tim.flash.sequence == 0
 

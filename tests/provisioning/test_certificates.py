@@ -38,10 +38,10 @@ def test_the_certificate_teds_is_signed_with_its_calibration_kept_with_it_and_go
 ) -> None:
     done = run(station, board, EXAMPLES / "angle.xml")
     assert done.verified.verdict == "authentic"
-    told = certificate_reference_of(done.image.blocks, 1)
-    assert told is not None
-    assert told == done.certificate
-    assert (told.number, told.date) == ("B2-2026-0042", "2026-10-12")
+    reference = certificate_reference_of(done.image.blocks, 1)
+    assert reference is not None
+    assert reference == done.certificate
+    assert (reference.number, reference.date) == ("B2-2026-0042", "2026-10-12")
     assert any("The certificate has no signature." in text for text in done.warnings)
     kept = run(station, board, None, name="left knee")
     assert kept.image.blocks[CERTIFICATE] == done.image.blocks[CERTIFICATE], "another name leaves the calibration"

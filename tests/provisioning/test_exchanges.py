@@ -128,7 +128,7 @@ def station_of(like: Station, name: str) -> Station:
 
 
 @dataclass
-class Changing(MemoryLink):
+class ChangingLink(MemoryLink):
     """A link on which ``change`` happens to the board as soon as its reply to Update has left."""
 
     change: Callable[[Board], object] = lambda board: None
@@ -159,14 +159,14 @@ def test_a_board_that_has_something_else_after_the_commit_is_noticed(
     def change(board: Board) -> None:
         put(board, block, frame(unframe(board.state.blocks[block]) + b"\xc8\x01\x07"))
 
-    link = Changing(board, change=change)
+    link = ChangingLink(board, change=change)
     with pytest.raises(NotAuthenticError, match=r"reads back differently|not authentic"):
         run(station, talk(board, link), BuildOrder(ANGLE))
     assert run(station, talk(board), BuildOrder(ANGLE)).verified.verdict == "authentic"
 
 
 def test_a_board_that_lacks_a_teds_after_the_commit_is_noticed(station: Station, board: Board) -> None:
-    link = Changing(board, change=lambda board: put(board, (1, 12), None))
+    link = ChangingLink(board, change=lambda board: put(board, (1, 12), None))
     with pytest.raises(NotAuthenticError, match="reads back differently"):
         run(station, talk(board, link), BuildOrder(ANGLE))
 

@@ -267,8 +267,8 @@ def test_doctor_and_nodes_name_what_a_type_does_not_accept_and_what_changed(stat
     board.report = OLD
     look(station, board)
     station.flush()
-    told = {finding.why for finding in nodes(System(station.home)) if finding.result == "warning"}
-    assert told == {
+    warnings = {finding.why for finding in nodes(System(station.home)) if finding.result == "warning"}
+    assert warnings == {
         f"1 with firmware that their type does not accept: {board.uuid.hex()}.",
         f"1 whose firmware changed since calibration: {board.uuid.hex()}.",
     }

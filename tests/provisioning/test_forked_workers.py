@@ -45,14 +45,14 @@ def test_a_result_of_megabytes_comes_whole() -> None:
 
 
 def test_what_the_work_raises_is_raised_here() -> None:
-    class Bound(Exception):
+    class LocalError(Exception):
         """One that cannot be sent: another process does not find its class."""
 
     def work(places: range) -> int:
         if places.start == 9:
             raise BadDataError("Nine is wrong.", hint="Take ten.")
         if places.start == 12:
-            raise Bound("twelve")
+            raise LocalError("twelve")
         return places.start
 
     some = map_ranges(work, RANGES, 2)

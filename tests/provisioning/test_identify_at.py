@@ -24,7 +24,7 @@ from tests.places import free_bus
 pytestmark = pytest.mark.link
 
 
-class Proves(VirtualNode):
+class ProvingNode(VirtualNode):
     """A node that gives its proof once every node of ``all_asked`` was asked for one; None: it gives none."""
 
     all_asked: threading.Barrier | None = None
@@ -37,7 +37,7 @@ class Proves(VirtualNode):
         return super().request(link, frame, tapped=tapped)
 
 
-class Told(SilentReporter):
+class CollectingReporter(SilentReporter):
     """What a person is told meanwhile."""
 
     def __init__(self) -> None:
@@ -56,7 +56,7 @@ def bus(
     for number in range(count + without):
         uuid = bytes([0x8D, number]) * 5
         FlashFile.create(folder / str(number), uuid=uuid)
-        node = Proves(folder / str(number))
+        node = ProvingNode(folder / str(number))
         node.tim.take_can_address(0x20 + number)
         node.all_asked = barrier if number < count else None
         server.add(node)
@@ -73,7 +73,7 @@ def bus(
 def test_the_nodes_of_a_bus_are_asked_side_by_side(station: Station, tmp_path: Path) -> None:
     """One after the other, each that is mute held up all the others for 40 s."""
     with bus(tmp_path, 4, threading.Barrier(4)) as (spec, uuids):
-        came = list(identify_at(station, LinkSettings("can", can=spec, timeout=PATIENCE), Told()))
+        came = list(identify_at(station, LinkSettings("can", can=spec, timeout=PATIENCE), CollectingReporter()))
     assert [arrival.uuid.hex() for arrival in came] == uuids
     assert all(arrival.result is not None for arrival in came)
 
@@ -88,7 +88,7 @@ def test_a_node_that_starts_meanwhile_is_found_while_somebody_listens(station: S
         began = time.monotonic()
         try:
             links = LinkSettings("can", can=spec, timeout=PATIENCE, listen=6)
-            came = list(identify_at(station, links, Told()))
+            came = list(identify_at(station, links, CollectingReporter()))
         finally:
             starts.join()
             late.stop()
@@ -97,9 +97,9 @@ def test_a_node_that_starts_meanwhile_is_found_while_somebody_listens(station: S
 
 
 def test_a_node_without_a_proof_is_told_of_beside_the_others(station: Station, tmp_path: Path) -> None:
-    told = Told()
+    recorder = CollectingReporter()
     with bus(tmp_path, 1, threading.Barrier(1), without=1) as (spec, (good, bad)):
-        came = list(identify_at(station, LinkSettings("can", can=spec, timeout=PATIENCE), told))
+        came = list(identify_at(station, LinkSettings("can", can=spec, timeout=PATIENCE), recorder))
     assert [arrival.uuid.hex() for arrival in came] == [good]
-    (notice,) = [notice for notice in told.notices if notice.kind == "unfinished"]
+    (notice,) = [notice for notice in recorder.notices if notice.kind == "unfinished"]
     assert bad in notice.text

@@ -73,7 +73,7 @@ def test_an_unknown_key_is_not_tried_twice(board: Board) -> None:
     assert link.count == 2
 
 
-class Disturbed(MemoryLink):
+class DisturbedLink(MemoryLink):
     """A bus on which an octet of some requests is changed on the way: ``at`` are their numbers, ``octet`` which one."""
 
     def __init__(self, board: Board, at: set[int], octet: int) -> None:
@@ -90,7 +90,7 @@ class Disturbed(MemoryLink):
 @pytest.mark.parametrize(("octet", "what"), [(6, "keyId"), (20, "Es"), (5, "the length")])
 def test_an_open_that_was_disturbed_on_a_bus_is_tried_once_more(board: Board, octet: int, what: str) -> None:
     key = keyed(board)
-    with talk(board, Disturbed(board, {2}, octet)) as node:
+    with talk(board, DisturbedLink(board, {2}, octet)) as node:
         node.open(key)
         assert node.sealed, what
 
@@ -98,16 +98,16 @@ def test_an_open_that_was_disturbed_on_a_bus_is_tried_once_more(board: Board, oc
 def test_a_refusal_of_a_plain_question_on_a_bus_counts_when_it_comes_twice(board: Board) -> None:
     """A disturbed octet made of "read TEDS 128" another one, which the node does not have: no word of the node's."""
     question = read_teds(*SECURITY, 0)
-    with talk(board, Disturbed(board, {1}, 6)) as node:
+    with talk(board, DisturbedLink(board, {1}, 6)) as node:
         assert node.request_idempotent(question, "to read") == node.request_idempotent(question, "to read")
-    link = Disturbed(board, {1, 2}, 6)
+    link = DisturbedLink(board, {1, 2}, 6)
     with talk(board, link) as node, pytest.raises(NodeRefusedError):
         node.request_idempotent(question, "to read")
     assert link.count == 2
 
 
 def test_a_request_that_was_disturbed_on_a_bus_is_sent_once_more(board: Board) -> None:
-    link = Disturbed(board, {1}, 80)  # an octet of field 104
+    link = DisturbedLink(board, {1}, 80)  # an octet of field 104
     link.tapped = True  # a node that was built without NFC, in factory state
     agreement = StationAgreement(
         Credentials(STATION, CA.sign(station_key_message(STATION.point)), CA.point), board.uuid

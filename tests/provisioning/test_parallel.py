@@ -57,7 +57,7 @@ def test_an_error_is_raised_where_the_result_is_read_and_the_others_go_on() -> N
     def work(item: int) -> int:
         return 12 // item
 
-    done = {each.item: each for each in ParallelWork([0, 3, 4], work, at_once=2, name="node").results()}
+    done = {result.item: result for result in ParallelWork([0, 3, 4], work, at_once=2, name="node").results()}
 
     with pytest.raises(ZeroDivisionError):
         done[0].result()

@@ -138,13 +138,13 @@ def test_power_cut_at_every_flash_commit(station: Station, board: Board, when: s
 
 
 def test_a_session_lost_in_the_middle_starts_the_staging_over(station: Station, board: Board) -> None:
-    class Forgetful(MemoryLink):
+    class ForgetfulLink(MemoryLink):
         def exchange(self, frame: bytes) -> bytes:
             if self.count == 14:
                 board.tim.link_lost(self.via)
             return super().exchange(frame)
 
-    assert run(station, board, Forgetful(board)).verified.verdict == "authentic"
+    assert run(station, board, ForgetfulLink(board)).verified.verdict == "authentic"
 
 
 def test_a_node_that_is_always_busy_ends_with_the_link(
@@ -263,27 +263,27 @@ def test_a_wrong_order_changes_nothing(station: Station, board: Board, tmp_path:
 
 def test_a_run_writes_as_little_as_its_promises_need(station: Station, board: Board) -> None:
     """At most 8 durable commits for a whole provisioning; an idle one writes at most 4 rows and commits twice."""
-    said: list[str] = []
+    statements: list[str] = []
     changes, rows = ("INSERT", "UPDATE", "DELETE", "REPLACE"), set[str]()
 
-    def told(statement: str) -> None:  # the trace repeats a statement that returns rows
-        if not (said and said[-1] == statement):
-            said.append(statement)
+    def note_statement(statement: str) -> None:  # the trace repeats a statement that returns rows
+        if not (statements and statements[-1] == statement):
+            statements.append(statement)
 
     def commits() -> int:
         made, dirty = 0, False
-        for statement in said:
+        for statement in statements:
             dirty = dirty or statement.startswith(changes)
             if statement.startswith("COMMIT"):
                 made, dirty = made + dirty, False
         return made
 
-    station._store._connection.set_trace_callback(told)
+    station._store._connection.set_trace_callback(note_statement)
     run(station, board)
     assert 0 < commits() <= 8
-    said.clear()
+    statements.clear()
     run(station, board, order=BuildOrder())
-    rows = {statement for statement in said if statement.startswith(changes)}
+    rows = {statement for statement in statements if statement.startswith(changes)}
     assert commits() <= 2
     assert 0 < len(rows) <= 4, rows
 
@@ -311,6 +311,6 @@ def test_nothing_is_read_twice_that_says_nothing_new(station: Station, board: Bo
 
 
 def test_what_is_said_of_several_channels_is_one_sentence() -> None:
-    each = [f"Channel {number} has no calibration: raw values cannot be turned into N." for number in (1, 2, 3)]
-    assert merged(each) == ("Channels 1 to 3 have no calibration: raw values cannot be turned into N.",)
-    assert merged(each[::2]) == ("Channels 1, 3 have no calibration: raw values cannot be turned into N.",)
+    messages = [f"Channel {number} has no calibration: raw values cannot be turned into N." for number in (1, 2, 3)]
+    assert merged(messages) == ("Channels 1 to 3 have no calibration: raw values cannot be turned into N.",)
+    assert merged(messages[::2]) == ("Channels 1, 3 have no calibration: raw values cannot be turned into N.",)

@@ -9,7 +9,7 @@ from teds_provision.provisioning.conversation import refused
 
 def test_every_reason_is_told_in_words() -> None:
     for reason in Reason:
-        told = refused(reason, "to do it")
-        assert f"(reason {int(reason)})" in told.message
+        error = refused(reason, "to do it")
+        assert f"(reason {int(reason)})" in error.message
         assert reason in REASONS
     assert "without a known reason (99)" in refused(99, "to do it").message

@@ -56,8 +56,8 @@ def test_a_profile_that_changed_since_is_told_and_asked(station: Station, board:
     (here / "own.toml").write_text(CELL.replace("\n", "\n# a comment changes nothing\n", 1))
     assert not any("has changed since" in text for text in build(station, board.uuid, BuildOrder(name="a")).warnings)
     (here / "own.toml").write_text(CELL.replace("high-limit = 500.0", "high-limit = 400.0"))
-    told = build(station, board.uuid, BuildOrder(name="a")).warnings
-    assert any("has changed since this node's datasheet was built" in text for text in told)
+    warnings = build(station, board.uuid, BuildOrder(name="a")).warnings
+    assert any("has changed since this node's datasheet was built" in text for text in warnings)
     station.datasheets.drop_draft(board.uuid)
     reset(station, board)
     with pytest.raises(UnrequestedChangeError):

@@ -45,11 +45,11 @@ def read(station: Station, folder: Path, text: str | bytes) -> BatchSheet:
 
 def test_a_mistake_of_many_lines_is_told_once_with_all_of_them(station: Station, tmp_path: Path) -> None:
     rows = "".join(f",b{number},none.csv\n" for number in range(30))
-    with pytest.raises(BadDataError) as told:
+    with pytest.raises(BadDataError) as caught:
         read(station, tmp_path, f"uuid,name,calibration\n{rows}")
-    assert told.value.message.count("There is no calibration file") == 1
-    assert told.value.message.startswith("boards.csv:2, 3, 4, ")
-    assert "and 10 more: There is no" in told.value.message
+    assert caught.value.message.count("There is no calibration file") == 1
+    assert caught.value.message.startswith("boards.csv:2, 3, 4, ")
+    assert "and 10 more: There is no" in caught.value.message
 
 
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
@@ -121,21 +121,21 @@ def test_rows_go_to_boards_in_the_order_of_the_taps_and_to_a_spare_at_last(stati
 def test_two_runs_of_one_sheet_lose_each_other_no_board_and_share_no_row(station: Station, tmp_path: Path) -> None:
     """Each wrote the whole sheet as it knew it: what the other had done was open again."""
     sheet = read(station, tmp_path, "name\na\nb\nc\n")
-    one, other = Progress(station.home, sheet), Progress(station.home, sheet)
+    here, other = Progress(station.home, sheet), Progress(station.home, sheet)
     first, second, third = sheet.rows
-    one.assign_row(first, board_of(1))
+    here.assign_row(first, board_of(1))
     assert other.row_for(board_of(2), "") is first, "it does not know yet"
     with pytest.raises(NodeBusyError, match="by another run of this sheet"):
         other.assign_row(first, board_of(2))
     assert other.row_for(board_of(2), "") is second
     other.assign_row(second, board_of(2))
     other.note(second, BoardResult(board_of(2), 1.0, error=NodeSilentError("It was pulled."), row=2))
-    one.note(first, BoardResult(board_of(1), 1.0, error=NodeSilentError("It was pulled."), row=1))
-    one.assign_row(third, board_of(3))
+    here.note(first, BoardResult(board_of(1), 1.0, error=NodeSilentError("It was pulled."), row=1))
+    here.assign_row(third, board_of(3))
     again = Progress(station.home, sheet)
     assert [again.board_of(row) for row in sheet.rows] == [board_of(number).hex() for number in (1, 2, 3)]
     assert [again.rows[number].result for number in (1, 2)] == ["failed", "failed"]
-    assert one.rows[2].result == "failed"
+    assert here.rows[2].result == "failed"
 
 
 def test_a_spare_gets_no_row_before_those_that_had_no_board(station: Station, tmp_path: Path) -> None:
@@ -223,10 +223,10 @@ def test_a_row_finished_by_an_older_version_is_done_again_if_its_board_differs(
 ) -> None:
     progress = finished(station, tmp_path, "name\na\n")
     (kept,) = (station.home / "batches").glob("*.json")
-    told = json.loads(kept.read_text())
+    record = json.loads(kept.read_text())
     for member in ("content", "again"):
-        del told["rows"]["1"][member]
-    kept.write_text(json.dumps(told))
+        del record["rows"]["1"][member]
+    kept.write_text(json.dumps(record))
     asked: list[bytes] = []
 
     def has_it(row: SheetRow, uuid: bytes) -> bool:

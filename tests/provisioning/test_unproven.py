@@ -95,9 +95,9 @@ def test_the_very_datasheet_of_the_node_without_a_session_is_unproven(
     attacker = Attacker(board, recorded, state, reason)
     verified = looked_at(station, attacker)
     assert verified.verdict == "unproven"
-    with pytest.raises(UnprovenError) as told:
+    with pytest.raises(UnprovenError) as caught:
         require_authentic(verified)
-    assert told.value.exit_code == 5
+    assert caught.value.exit_code == 5
     assert (Function.RESET in attacker.asked) == (state == NodeState.FACTORY)
     after = station.nodes.get(board.uuid)
     assert before is not None
@@ -175,11 +175,11 @@ def test_a_copied_uuid_costs_its_own_node_alone(board: Board) -> None:
     """One stranger with somebody's UUID had hidden every node of the bus from `identify` and `provision --all`."""
     here, there = (replace(contact(board, MemoryLink(board, via="can")), address=at) for at in (0x11, 0x22))
     other = replace(contact(Board(uuid=bytes(10))), address=0x33)
-    told: list[Notice] = []
-    assert drop_duplicate_uuids([here, other, there], told.append) == [other]
-    assert [notice.uuid for notice in told] == [board.uuid]
+    notices: list[Notice] = []
+    assert drop_duplicate_uuids([here, other, there], notices.append) == [other]
+    assert [notice.uuid for notice in notices] == [board.uuid]
     with pytest.raises(AddressConflictError):
-        drop_duplicate_uuids([here, there], told.append)
+        drop_duplicate_uuids([here, there], notices.append)
 
 
 def test_a_stranger_without_the_key_judges_by_signatures(station: Station, board: Board, tmp_path) -> None:  # type: ignore[no-untyped-def]
@@ -276,14 +276,16 @@ def test_a_refusal_in_a_session_is_the_nodes_own_word(station: Station, board: B
     assert came_under_key(refusal.value)
 
 
-@pytest.mark.parametrize("said", [refusal(Reason.NOT_PERMITTED), refusal(Reason.BAD_TAG), Reply(True, bytes(40))])
-def test_no_plain_answer_in_a_session_is_the_nodes_own_word(station: Station, board: Board, said: Reply) -> None:
+@pytest.mark.parametrize(
+    "plain_reply", [refusal(Reason.NOT_PERMITTED), refusal(Reason.BAD_TAG), Reply(True, bytes(40))]
+)
+def test_no_plain_answer_in_a_session_is_the_nodes_own_word(station: Station, board: Board, plain_reply: Reply) -> None:
     """A second board at its address says so, or any other device; opened again, it says so again."""
     run(station, board)
     heard = False
 
     def second_board(_count: int, reply: bytes) -> bytes:
-        return said.encode() if heard else reply
+        return plain_reply.encode() if heard else reply
 
     with talk(board, MemoryLink(board, tamper=second_board)) as node:
         require_session(station, node)

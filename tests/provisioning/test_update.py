@@ -36,7 +36,7 @@ from teds_provision.station.station import Station
 from teds_provision.teds.image import SECURITY
 from tests.bench import PASSPHRASE
 
-from .update_bench import Owner, StationKilled, UpdateBench
+from .update_bench import Owner, StationKilledError, UpdateBench
 
 
 @pytest.fixture(scope="module")
@@ -258,7 +258,7 @@ def _reply_lost(bench: UpdateBench, at: int) -> None:
 def _station_killed(bench: UpdateBench, at: int) -> None:
     def cut(number: int) -> None:
         if number == at:
-            raise StationKilled
+            raise StationKilledError
 
     bench.cut = cut
 
@@ -266,7 +266,7 @@ def _station_killed(bench: UpdateBench, at: int) -> None:
 def _station_killed_after(bench: UpdateBench, at: int) -> None:
     def answered(number: int) -> None:
         if number == at:
-            raise StationKilled
+            raise StationKilledError
 
     bench.answered = answered
 
@@ -312,7 +312,7 @@ def interrupted(owner: Owner, folder: Path, interruption: Callable[[UpdateBench,
     flash, old, new = bench.node.tim.flash, "1.0.0", owner.long
     interruption(bench, at)
     first = "killed"
-    with suppress(StationKilled):
+    with suppress(StationKilledError):
         first = bench.update(new, wait=2.0).result
     bench.cut = bench.answered = lambda number: None
     assert bench.node.tim.flash == flash, "key, datasheet, address, epoch and sequence"
@@ -373,27 +373,27 @@ class HostileManager:
         return self._reply(packet, self.uploads)
 
 
-def said(**values: object) -> Callable[[SmpPacket, int], bytes]:
+def reply_with(**values: object) -> Callable[[SmpPacket, int], bytes]:
     return lambda packet, number: packet.reply(cbor2.dumps(values)).encode()
 
 
 HOSTILE: dict[str, tuple[Callable[[SmpPacket, int], bytes], type[Exception], int]] = {
-    "an offset that never moves": (said(off=0), NotAuthenticError, 3),
+    "an offset that never moves": (reply_with(off=0), NotAuthenticError, 3),
     "an offset that goes to and fro": (
         lambda packet, number: packet.reply(cbor2.dumps({"off": 100 + number % 2})).encode(),
         NotAuthenticError,
         5,
     ),
-    "an offset beyond the image": (said(off=10**6), NotAuthenticError, 1),
-    "a negative offset": (said(off=-1), NotAuthenticError, 1),
-    "no offset": (said(), NotAuthenticError, 1),
-    "an offset that is text": (said(off="9"), NotAuthenticError, 1),
+    "an offset beyond the image": (reply_with(off=10**6), NotAuthenticError, 1),
+    "a negative offset": (reply_with(off=-1), NotAuthenticError, 1),
+    "no offset": (reply_with(), NotAuthenticError, 1),
+    "an offset that is text": (reply_with(off="9"), NotAuthenticError, 1),
     "a CBOR tag": (
         lambda packet, number: packet.reply(bytes.fromhex("a1636f6666c24101")).encode(),
         NotAuthenticError,
         1,
     ),
-    "a floating number": (said(off=1.5), NotAuthenticError, 1),
+    "a floating number": (reply_with(off=1.5), NotAuthenticError, 1),
     "something after the map": (lambda packet, number: packet.reply(b"\xa0\xa0").encode(), NotAuthenticError, 1),
     "no map": (lambda packet, number: packet.reply(b"\xff").encode(), NotAuthenticError, 1),
     "half a packet": (lambda packet, number: packet.reply(b"\xa0").encode()[:5], NotAuthenticError, 1),
@@ -402,10 +402,10 @@ HOSTILE: dict[str, tuple[Callable[[SmpPacket, int], bytes], type[Exception], int
         NotAuthenticError,
         1,
     ),
-    "other octets than were sent": (said(off=9728, match=False), NotAuthenticError, 1),
-    "SMP's error of version 1": (said(rc=8), PolicyError, 1),
-    "SMP's error of version 2": (said(err={"group": 1, "rc": 30}), PolicyError, 1),
-    "an error that nobody knows": (said(err={"group": 1, "rc": 250}), PolicyError, 1),
+    "other octets than were sent": (reply_with(off=9728, match=False), NotAuthenticError, 1),
+    "SMP's error of version 1": (reply_with(rc=8), PolicyError, 1),
+    "SMP's error of version 2": (reply_with(err={"group": 1, "rc": 30}), PolicyError, 1),
+    "an error that nobody knows": (reply_with(err={"group": 1, "rc": 250}), PolicyError, 1),
 }
 
 
@@ -415,7 +415,7 @@ def test_a_board_that_answers_nonsense_ends_the_update_soon(bench: UpdateBench, 
     manager = HostileManager(bench, reply)
     image = owner.long
     if hostile == "other octets than were sent":
-        manager._reply = said(off=len(image.octets), match=False)
+        manager._reply = reply_with(off=len(image.octets), match=False)
     done = bench.update(image)
     assert (done.result, type(done.error)) == ("refused", error), done.error
     assert manager.uploads <= most

@@ -85,10 +85,10 @@ def test_a_folder_gives_a_line_for_each_image_and_totals(home: Path, tmp_path: P
         write(folder / "good", f"{number}.json", signed(number))
     done = call(home, "--json", "verify", folder)
     assert done.code == 0, done.err
-    *each, last = lines(done.out)
-    assert [entry["verdict"] for entry in each] == ["authentic"] * 3
-    assert [entry["uuid"] for entry in each] == [bytes([0] * 9 + [number]).hex() for number in range(3)]
-    assert {entry["scope"] for entry in each} == {"image"}
+    *rows, last = lines(done.out)
+    assert [entry["verdict"] for entry in rows] == ["authentic"] * 3
+    assert [entry["uuid"] for entry in rows] == [bytes([0] * 9 + [number]).hex() for number in range(3)]
+    assert {entry["scope"] for entry in rows} == {"image"}
     assert last == {"totals": {"files": 3, "authentic": 3}}
 
 
@@ -107,9 +107,9 @@ def test_each_fault_is_told_in_its_line_and_the_worst_one_ends_the_command(home:
     for name, image in faults.items():
         write(folder, name, image)
     done = call(home, "--json", "verify", folder)
-    *each, last = lines(done.out)
-    assert [Path(str(entry["file"])).name for entry in each] == list(faults)
-    codes = [entry.get("error", {}).get("code") for entry in each]  # type: ignore[union-attr, attr-defined]
+    *rows, last = lines(done.out)
+    assert [Path(str(entry["file"])).name for entry in rows] == list(faults)
+    codes = [entry.get("error", {}).get("code") for entry in rows]  # type: ignore[union-attr, attr-defined]
     assert codes == [None, "refused", "not-authentic", "bad-data", "not-authentic", "not-authentic"]
     assert last["totals"] == {"files": 6, "authentic": 2, "not authentic": 2, "unreadable": 1, "unsigned": 1}
     assert done.code == 4
@@ -133,11 +133,11 @@ def test_an_image_of_key_agreement_1_is_refused_by_name_alone_and_among_others(h
 
 
 def test_people_see_a_line_each_and_a_sum(home: Path, tmp_path: Path) -> None:
-    one, other = (write(tmp_path / "images", f"{number}.json", signed(number)) for number in (1, 2))
-    done = call(home, "verify", one, other)
+    first, other = (write(tmp_path / "images", f"{number}.json", signed(number)) for number in (1, 2))
+    done = call(home, "verify", first, other)
     assert done.code == 0
     assert done.out.splitlines()[-1] == "2 images: 2 authentic."
-    assert str(one) in done.out
+    assert str(first) in done.out
 
 
 def test_the_same_verdicts_come_from_one_process_and_from_several(
@@ -170,8 +170,8 @@ def test_a_process_that_is_killed_ends_the_command_with_an_error(
     monkeypatch.setattr(verify_command, "_json", killed)
     done = call(home, "--json", "verify", tmp_path / "images")
     assert done.code == 1
-    *each, last = lines(done.out)
-    assert 0 < len(each) <= 100
+    *rows, last = lines(done.out)
+    assert 0 < len(rows) <= 100
     assert last["error"]["code"] == "failed"  # type: ignore[index]
     assert "ended by signal 9" in last["error"]["message"]  # type: ignore[index]
 
@@ -226,8 +226,8 @@ def test_images_that_are_verified_together_are_decoded_once_each(tmp_path: Path)
     station = make_station(tmp_path / "home")
     work = many._Work(snapshot_trust(station), lambda found: found.path.name, names)
     security.decode.cache_clear()
-    told, totals = work.judge(range(40))
-    assert (len(told), totals.files) == (40, 40)
+    verdicts, totals = work.judge(range(40))
+    assert (len(verdicts), totals.files) == (40, 40)
     assert security.decode.cache_info().misses == 40
     station.close()
 
@@ -249,8 +249,8 @@ def test_images_without_a_calibration_load_no_guard(home: Path, tmp_path: Path) 
 def test_a_folder_without_images_is_said_and_doubles_count_once(tmp_path: Path) -> None:
     with pytest.raises(NotFoundError, match="no image"):
         json_files([tmp_path], "image")
-    one = write(tmp_path, "1.json", signed(1))
-    assert json_files([one, tmp_path, one], "image") == [str(one)]
+    image = write(tmp_path, "1.json", signed(1))
+    assert json_files([image, tmp_path, image], "image") == [str(image)]
 
 
 def test_images_of_a_folder_come_by_name_folders_in_their_place_links_to_files_too(tmp_path: Path) -> None:

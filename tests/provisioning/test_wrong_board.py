@@ -114,15 +114,19 @@ def test_a_chosen_topic_name_of_another_quantity_is_warned_about(
     same = build(station, uuid, order(tmp_path, ANGLE), keep_draft=False)
     assert not any("topic" in warning for warning in same.warnings)
     built = build(station, uuid, BuildOrder(FORCE, retype=True, drop_calibration=True), keep_draft=False)
-    [told] = [warning for warning in built.warnings if "topic" in warning]
-    assert told.startswith("The chosen topic name 'crane/slew' stays with channel 1, which was in rad and is in N now.")
-    assert told.endswith(f"names set {uuid.hex()[:8]} 1 NAME")
+    [warning] = [warning for warning in built.warnings if "topic" in warning]
+    assert warning.startswith(
+        "The chosen topic name 'crane/slew' stays with channel 1, which was in rad and is in N now."
+    )
+    assert warning.endswith(f"names set {uuid.hex()[:8]} 1 NAME")
 
 
 def test_at_a_terminal_a_yes_to_the_differences_is_enough(station: Station, angle: VirtualNode, tmp_path: Path) -> None:
     asked: list[tuple[str, ...]] = []
     with pytest.raises(WrongBoardError, match="does not match"):
-        given(station, on_reader(angle), order(tmp_path, GRIPPER), retype=lambda _uuid, told: asked.append(told))
+        given(
+            station, on_reader(angle), order(tmp_path, GRIPPER), retype=lambda _uuid, question: asked.append(question)
+        )
     assert len(asked) == 1, "once, not before and after the key agreement"
     assert any("is a sensor, not an actuator" in text for text in asked[0])
 
@@ -191,8 +195,8 @@ def test_the_check_shows_one_real_reading_and_claims_nothing(
     assert 0 <= sample["value"] < 6.2832
     with Conversation(on_reader(angle), notice=lambda _notice: None) as node:
         require_session(station, node)
-        told = OperationReply.decode(node.request(OPERATION, "to tell its mode"))
-    assert (told.measuring, told.channels[1]) == (False, (ChannelState(0), 0)), "nothing is claimed"
+        reply = OperationReply.decode(node.request(OPERATION, "to tell its mode"))
+    assert (reply.measuring, reply.channels[1]) == (False, (ChannelState(0), 0)), "nothing is claimed"
 
 
 def test_reason_6_and_23_of_operate_have_words_of_their_own(

@@ -32,7 +32,7 @@ from tests.firmware_images import make_key, sign
 PROFILE = "tactile-finger-sensor"
 
 
-class StationKilled(BaseException):
+class StationKilledError(BaseException):
     """The station's process was killed."""
 
 

@@ -62,8 +62,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         north, south = folder / "north", folder / "south"
-        said = run("--home", north, "init", "--name", "north", "--keystore", "file")
-        (folder / "north.pem").write_text(said[said.index("-----BEGIN") :])
+        outcome = run("--home", north, "init", "--name", "north", "--keystore", "file")
+        (folder / "north.pem").write_text(outcome[outcome.index("-----BEGIN") :])
         request, certificate = folder / "south.request", folder / "south.cert"
         run("--home", south, "init", "--name", "south", "--keystore", "file", "--request", request)
         run("--home", north, "trust", "ca", "sign", request, "--output", certificate, "--yes")

@@ -68,9 +68,9 @@ def test_the_commands_on_files_run(tmp_path: Path, station: Station, board: Boar
     done = run_elsewhere(station.home, *lines)
     for words, outcome in zip(lines, done, strict=True):
         assert outcome.code == 0, f"{words}\n{outcome.err}"
-    told = {words[1]: outcome for words, outcome in zip(lines, done, strict=True) if words[0] == "--json"}
-    assert told["verify"].json["verdict"] == "authentic"
-    assert json.loads(told["evidence"].out.splitlines()[0])["good"] is True
+    outcomes = {words[1]: outcome for words, outcome in zip(lines, done, strict=True) if words[0] == "--json"}
+    assert outcomes["verify"].json["verdict"] == "authentic"
+    assert json.loads(outcomes["evidence"].out.splitlines()[0])["good"] is True
     assert all(path.stat().st_size > 100 for path in converted)
     assert "lab" in done[-3].out
 
@@ -100,8 +100,8 @@ def test_two_commands_never_change_a_store_at_once(tmp_path: Path) -> None:
         assert first.stdout is not None
         assert first.stdout.readline() == "held\n"
         with start() as second:
-            said, _ = second.communicate()
-        assert said.startswith(f"The store is locked by pid {first.pid} (trust add) since ")
+            output, _ = second.communicate()
+        assert output.startswith(f"The store is locked by pid {first.pid} (trust add) since ")
         first.kill()
     with start() as third:
         assert third.communicate()[0] == "held\n", "a killed holder leaves no lock behind"

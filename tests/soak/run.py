@@ -76,7 +76,7 @@ class Crowd:
         self._wire.bus.shutdown()
 
 
-def said(text: str) -> None:
+def report(text: str) -> None:
     """One line of progress."""
     print(f"{time.strftime('%H:%M:%S')}  {text}", flush=True)
 
@@ -157,7 +157,7 @@ class Soak:
 
     def measured(self, why: str, names: str = "abs", seconds: float = ROUND) -> None:
         """All are measured, now."""
-        said(f"{why}: measured after {soon(lambda: self.fresh(names), why, seconds):.1f} s")
+        report(f"{why}: measured after {soon(lambda: self.fresh(names), why, seconds):.1f} s")
 
     def memory(self) -> int:
         """Resident memory of the service in KiB."""
@@ -192,7 +192,7 @@ class Soak:
         for part in self.shown.rglob("*"):
             if part.is_file() and part.name not in kept:  # the operator makes room
                 part.unlink()
-        said(f"disk freed: recorded again after {soon(lambda: self.sink()['state'] == 'running', 'the disk'):.1f} s")
+        report(f"disk freed: recorded again after {soon(lambda: self.sink()['state'] == 'running', 'the disk'):.1f} s")
 
     def pull(self) -> None:
         """Pull the adapter, and plug it in again."""
@@ -224,8 +224,8 @@ class Soak:
             over.set()
             asking.join()
             crowd.close()
-        took = time.monotonic() - began
-        said(f"{crowd.made} nodes invented in {took:.0f} s, {crowd.answers} of them answered; {known} are shown")
+        seconds = time.monotonic() - began
+        report(f"{crowd.made} nodes invented in {seconds:.0f} s, {crowd.answers} of them answered; {known} are shown")
         assert known <= 1000, "invented nodes pile up"
         self.measured("crowd gone")
 
@@ -235,11 +235,11 @@ class Soak:
         read = 0
         for part in sorted(self.shown.rglob("*.csv")):
             with contextlib.suppress(Exception):  # the part that is being written
-                told = stamps(part)
-                assert told == sorted(told), part
-                assert not told or any(abs(told[-1] - offset - now) < 86_400 for offset in (0.0, HOUR)), part
-                read += len(told)
-        said(f"{read} values in {len(list(self.shown.glob('*.csv')))} parts that are left")
+                times = stamps(part)
+                assert times == sorted(times), part
+                assert not times or any(abs(times[-1] - offset - now) < 86_400 for offset in (0.0, HOUR)), part
+                read += len(times)
+        report(f"{read} values in {len(list(self.shown.glob('*.csv')))} parts that are left")
 
     def close(self) -> None:
         """End it all."""
@@ -265,13 +265,13 @@ def main(arguments: list[str]) -> int:
                     trouble()
                 rounds += 1
                 memory.append(soak.memory())
-                said(f"round {rounds}: {memory[-1] // 1024} MiB")
+                report(f"round {rounds}: {memory[-1] // 1024} MiB")
             soak.check()
             assert memory[-1] <= GROWTH * memory[0], f"its memory grew: {memory}"
             soak._over.set()
             soak._reader.join()
             outcome = soak.service.end()
-            said(json.dumps({"rounds": rounds, "memory": memory, "end": str(outcome)[-200:]}))
+            report(json.dumps({"rounds": rounds, "memory": memory, "end": str(outcome)[-200:]}))
         finally:
             soak.close()
     return 0

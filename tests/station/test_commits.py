@@ -27,7 +27,7 @@ _CHANGES = ("INSERT", "UPDATE", "DELETE", "REPLACE")
 
 
 @dataclass
-class Watched:
+class StatementLog:
     """What SQLite was told to do."""
 
     station: Station
@@ -60,8 +60,8 @@ class Watched:
 
 
 @pytest.fixture
-def watched(tmp_path: Path) -> Iterator[Watched]:
-    watched = Watched(make_station(tmp_path / "home"))
+def watched(tmp_path: Path) -> Iterator[StatementLog]:
+    watched = StatementLog(make_station(tmp_path / "home"))
     watched.station._store._connection.set_trace_callback(watched.statements.append)
     yield watched
     watched.station.close()
@@ -78,7 +78,7 @@ def synced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_a_whole_provisioning_is_eight_commits_at_most_and_waits_for_the_disk_three_times(
-    watched: Watched, synced: list[str]
+    watched: StatementLog, synced: list[str]
 ) -> None:
     """The pending key before Confirm, the sequence before the signature leaves, and the verdict with all before it."""
     _, commits = watched.run(Board())
@@ -88,27 +88,27 @@ def test_a_whole_provisioning_is_eight_commits_at_most_and_waits_for_the_disk_th
 
 
 def test_the_key_is_on_the_disk_before_its_confirmation_leaves_and_the_sequence_before_the_signature(
-    watched: Watched, monkeypatch: pytest.MonkeyPatch
+    watched: StatementLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The signature is in the TEDS that is written last; the others may go while the disk is waited for."""
-    told: list[str] = []
+    steps: list[str] = []
     plain, send = os.fdatasync, Conversation.request
     slowly = threading.Event()
 
     def synced(descriptor: int) -> None:
         slowly.wait(0.2)  # nobody sets it: a slow disk
         plain(descriptor)
-        told.append("on the disk")
+        steps.append("on the disk")
 
     def sent(node: Conversation, command: Command, doing: str, *, within: float | None = None) -> bytes:
-        told.append(doing)
+        steps.append(doing)
         return send(node, command, doing, within=within)
 
     def stated(statement: str) -> None:
         if statement == "COMMIT":
             if threading.current_thread() is not threading.main_thread():
                 slowly.wait(0.2)
-            told.append("commit")
+            steps.append("commit")
 
     monkeypatch.setattr("os.fdatasync", synced)
     monkeypatch.setattr(Conversation, "request", sent)
@@ -121,15 +121,15 @@ def test_the_key_is_on_the_disk_before_its_confirmation_leaves_and_the_sequence_
             operator=AcceptingOperator(),
             reporter=SilentReporter(),
         )
-        told.append("told")
-    of_teds = [doing for doing in told if doing.startswith(("TEDS", "on the disk", "the commit"))]
+        steps.append("told")
+    of_teds = [doing for doing in steps if doing.startswith(("TEDS", "on the disk", "the commit"))]
     assert of_teds[-3:] == ["on the disk", "TEDS 128 of channel 0", "the commit"]
     assert "TEDS 1 of channel 0" in of_teds[:-3]
-    assert told[told.index("the key confirmation") - 1] == "commit"
-    assert told[-4:-1] == ["to report its mode", "commit", "told"]
+    assert steps[steps.index("the key confirmation") - 1] == "commit"
+    assert steps[-4:-1] == ["to report its mode", "commit", "told"]
 
 
-def test_a_run_that_ends_early_is_on_the_disk_all_the_same(watched: Watched, synced: list[str]) -> None:
+def test_a_run_that_ends_early_is_on_the_disk_all_the_same(watched: StatementLog, synced: list[str]) -> None:
     """Identify is written to the log and not waited for: the next step was to do that."""
     link = MemoryLink(Board(), lose_request=3)
     with pytest.raises(LinkError), talk(link.board, link) as node:
@@ -144,7 +144,7 @@ def test_a_run_that_ends_early_is_on_the_disk_all_the_same(watched: Watched, syn
 
 
 def test_what_comes_later_is_on_the_disk_with_the_next_entry_or_when_it_is_asked_for(
-    watched: Watched, synced: list[str]
+    watched: StatementLog, synced: list[str]
 ) -> None:
     station, node = watched.station, NodeRecord(bytes(10))
     store = station._store
@@ -161,14 +161,14 @@ def test_what_comes_later_is_on_the_disk_with_the_next_entry_or_when_it_is_asked
     assert synced == ["store.sqlite3-wal"]
 
 
-def test_a_step_by_itself_never_comes_later(watched: Watched) -> None:
+def test_a_step_by_itself_never_comes_later(watched: StatementLog) -> None:
     """Only a run of steps may leave one to the next; ``identify`` alone waits."""
     with watched.station.durable("identify", more_follows=True):
         watched.station.audit("identify", None, "done")
     assert "PRAGMA synchronous=NORMAL" not in watched.statements
 
 
-def test_the_stations_facts_are_never_older_than_the_store(watched: Watched) -> None:
+def test_the_stations_facts_are_never_older_than_the_store(watched: StatementLog) -> None:
     """They are remembered: another process, and a change that was taken back, must be seen."""
     here = watched.station
     there = Station.open(here.home, ask=lambda prompt, confirm: pytest.fail("no secret is needed"))
@@ -187,7 +187,7 @@ def test_the_stations_facts_are_never_older_than_the_store(watched: Watched) -> 
         there.close()
 
 
-def test_a_provisioning_with_nothing_to_do_writes_four_rows_and_waits_twice_for_the_disk(watched: Watched) -> None:
+def test_a_provisioning_with_nothing_to_do_writes_four_rows_and_waits_twice_for_the_disk(watched: StatementLog) -> None:
     board = Board()
     watched.run(board)
     for _ in range(2):
@@ -196,7 +196,9 @@ def test_a_provisioning_with_nothing_to_do_writes_four_rows_and_waits_twice_for_
         assert commits <= 2
 
 
-def test_a_run_does_not_wait_for_what_another_thread_has_written_since(watched: Watched, synced: list[str]) -> None:
+def test_a_run_does_not_wait_for_what_another_thread_has_written_since(
+    watched: StatementLog, synced: list[str]
+) -> None:
     """Eight readers on one store would wait for each other's steps."""
     other_is_going, this_is_done = threading.Event(), threading.Event()
 
@@ -222,7 +224,7 @@ def test_a_run_does_not_wait_for_what_another_thread_has_written_since(watched: 
 
 
 def test_what_is_not_waited_for_does_not_bring_what_came_before_onto_the_disk(
-    watched: Watched, synced: list[str]
+    watched: StatementLog, synced: list[str]
 ) -> None:
     """Two readers: the second one's step that comes later said nothing about the first one's."""
     with watched.station.run():
@@ -233,7 +235,7 @@ def test_what_is_not_waited_for_does_not_bring_what_came_before_onto_the_disk(
         assert synced == ["store.sqlite3-wal"]
 
 
-def test_nothing_that_a_provisioning_or_a_look_up_asks_reads_a_whole_table(watched: Watched) -> None:
+def test_nothing_that_a_provisioning_or_a_look_up_asks_reads_a_whole_table(watched: StatementLog) -> None:
     """They cost the same with a hundred thousand nodes; the list of trusted stations is short, and read whole."""
     station, board = watched.station, Board()
     watched.run(board)
@@ -252,7 +254,9 @@ def test_nothing_that_a_provisioning_or_a_look_up_asks_reads_a_whole_table(watch
     assert {name for name in whole if not name.endswith("FROM audit ORDER BY seq DESC LIMIT 1")} == set()
 
 
-def test_what_a_run_asks_of_the_store_comes_after_the_steps_that_it_takes_behind_its_back(watched: Watched) -> None:
+def test_what_a_run_asks_of_the_store_comes_after_the_steps_that_it_takes_behind_its_back(
+    watched: StatementLog,
+) -> None:
     station, free = watched.station, threading.Event()
 
     def slow() -> None:
@@ -272,7 +276,7 @@ def test_what_a_run_asks_of_the_store_comes_after_the_steps_that_it_takes_behind
     assert "durable steps" not in {thread.name for thread in threading.enumerate()}
 
 
-def test_a_step_that_fails_behind_a_run_fails_the_run(watched: Watched) -> None:
+def test_a_step_that_fails_behind_a_run_fails_the_run(watched: StatementLog) -> None:
     """At what it asks of the store next, or at its end; never in silence."""
     station, went_on = watched.station, []
 
@@ -298,7 +302,7 @@ def test_a_step_that_fails_behind_a_run_fails_the_run(watched: Watched) -> None:
     assert went_on == ["at the end"]
 
 
-def test_what_is_done_behind_a_run_is_done_by_the_same_person(watched: Watched) -> None:
+def test_what_is_done_behind_a_run_is_done_by_the_same_person(watched: StatementLog) -> None:
     before = ACTOR.set("token lab")
     try:
         with watched.station.run():

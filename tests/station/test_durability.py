@@ -67,19 +67,19 @@ def kill_after(process: subprocess.Popen[str], seconds: float) -> list[str]:
 @pytest.mark.slow
 def test_a_writer_killed_at_any_instant_loses_nothing_it_had_committed(home: Path) -> None:
     moments = random.Random(1451)
-    said = 0
+    last_number = 0
     for _ in range(12):
         lines = kill_after(python(WRITER, home), moments.uniform(0, 0.05))
-        said = int(lines[-1])
+        last_number = int(lines[-1])
         with Station.inspect(home) as store:
             node = store.nodes.get(NODE)
             assert node is not None
-            assert node.sequence in (said, said + 1)  # it may have died between the commit and the word
+            assert node.sequence in (last_number, last_number + 1)  # it may have died between the commit and the word
             assert [key.key_id for key in store.keys.keys_of(NODE)] == [f"{node.sequence:016x}"]
             verdict = store.audit_log.check()
             assert (verdict.intact, verdict.count) == (True, node.sequence)
             assert store.damage() is None
-    assert said > 20
+    assert last_number > 20
 
 
 @pytest.mark.slow

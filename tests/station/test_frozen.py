@@ -64,11 +64,11 @@ def mounted(home: Path, script: str, *words: str) -> subprocess.CompletedProcess
 
 @pytest.mark.parametrize(("script", "word"), [(READ_ONLY, "cannot be written"), (FULL, "no space")])
 def test_everything_is_read_and_nothing_is_written(home: Path, script: str, word: str) -> None:
-    said = mounted(home, script, sys.executable, "-c", READER, str(home))
-    assert said.returncode == 0, said.stderr
-    first, second = said.stdout.splitlines()[:2]
-    assert first.startswith("2 True"), said.stdout
-    assert second.startswith("7 "), said.stdout
+    outcome = mounted(home, script, sys.executable, "-c", READER, str(home))
+    assert outcome.returncode == 0, outcome.stderr
+    first, second = outcome.stdout.splitlines()[:2]
+    assert first.startswith("2 True"), outcome.stdout
+    assert second.startswith("7 "), outcome.stdout
     if first.endswith("True"):  # SQLite may manage on a full disk without us, and then says so when it writes
         assert word in second
 
@@ -78,10 +78,10 @@ def test_commands_that_read_work_on_a_read_only_disk(tmp_path: Path, words: list
     from tests.bench import make_station
 
     make_station(tmp_path / "home").close()
-    said = mounted(
+    outcome = mounted(
         tmp_path / "home", READ_ONLY, sys.executable, "-m", "teds_provision", "--home", str(tmp_path / "home"), *words
     )
-    assert said.returncode == 0, said.stderr
+    assert outcome.returncode == 0, outcome.stderr
 
 
 def test_nothing_of_the_copy_is_left(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,11 +81,11 @@ def test_a_tombstone_says_where_a_node_went(station: Station) -> None:
 
 
 def test_holders_are_listed_per_node_and_in_all(station: Station) -> None:
-    one, two = Holder(NODE, "ab" * 32), Holder(bytes(10), "cd" * 32, mode="move")
-    station.keys.put_holder(one)
-    station.keys.put_holder(two)
-    assert station.keys.holders(NODE) == [one]
-    assert station.keys.holders() == [two, one]
+    first, second = Holder(NODE, "ab" * 32), Holder(bytes(10), "cd" * 32, mode="move")
+    station.keys.put_holder(first)
+    station.keys.put_holder(second)
+    assert station.keys.holders(NODE) == [first]
+    assert station.keys.holders() == [second, first]
     assert station.keys.remove_holder(NODE, "ab" * 32)
     assert not station.keys.remove_holder(NODE, "ab" * 32)
 

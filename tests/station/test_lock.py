@@ -110,10 +110,10 @@ print(NodeLock(Path(sys.argv[1]), bytes(range(10))).is_taken)
 
 def test_of_two_threads_and_two_processes_one_works_on_a_node_at_a_time(place: Path) -> None:
     """A lock of the process would let its own threads in, and be gone once any of them closes the file."""
-    told, worked = threading.Event(), threading.Event()
+    notified, worked = threading.Event(), threading.Event()
 
     def work() -> None:
-        with NodeLock(place, NODE, notice=lambda _: told.set()):
+        with NodeLock(place, NODE, notice=lambda _: notified.set()):
             worked.set()
 
     def taken_elsewhere() -> str:
@@ -125,7 +125,7 @@ def test_of_two_threads_and_two_processes_one_works_on_a_node_at_a_time(place: P
     with NodeLock(place, NODE):
         other = threading.Thread(target=work)
         other.start()
-        assert told.wait(PATIENCE), "it waits for the first, and says so"
+        assert notified.wait(PATIENCE), "it waits for the first, and says so"
         assert NodeLock(place, NODE).is_taken  # opens and closes the file
         assert taken_elsewhere() == "True"
         with NodeLock(place, bytes(10)):

@@ -156,8 +156,8 @@ def test_a_row_under_no_mac_another_rows_or_a_wrong_octet_is_named(home: Home, t
 
 def test_a_note_of_a_restored_home_is_named_when_it_is_changed(home: Home) -> None:
     ((column, mac_column),) = OTHERS.values()
-    ((said, mac),) = home.rows("plant", column, mac_column)
-    for name, value in ((column, said), (mac_column, mac)):
+    ((note, mac),) = home.rows("plant", column, mac_column)
+    for name, value in ((column, note), (mac_column, mac)):
         for other in changed(value):
             home.put("plant", name, other, ((name, value),))
             broken = home.broken()

@@ -57,10 +57,10 @@ def opened(home: Path) -> Iterator[Open]:
     """Open the station of ``home`` as a new process would; everything is closed at the end."""
     stations: list[Station] = []
 
-    def open_one(said: list[str] | None = None, ask: Callable[[str, bool], str] = ask) -> Station:
+    def open_one(collect: list[str] | None = None, ask: Callable[[str, bool], str] = ask) -> Station:
         forget_vaults()
-        told: list[str] = [] if said is None else said
-        stations.append(Station.open(home, ask=ask, notify=told.append))
+        messages: list[str] = [] if collect is None else collect
+        stations.append(Station.open(home, ask=ask, notify=messages.append))
         return stations[-1]
 
     yield open_one
@@ -76,10 +76,10 @@ def behind_its_back(home: Path, *statements: str) -> None:
 
 
 def test_an_untouched_store_says_nothing(opened: Open) -> None:
-    said: list[str] = []
-    station = opened(said)
+    messages: list[str] = []
+    station = opened(messages)
     station.unlock()
-    assert said == []
+    assert messages == []
     assert list(station.row_macs.all_broken()) == []
     assert station.pins.pinned(NODE) == fingerprint(POINT)
     assert {record.name for record in station.policy.trusted()} == {"peer", "owner"}
@@ -120,10 +120,10 @@ def test_a_changed_ca_or_station_key_or_no_seal_key_stops_the_vault(home: Path, 
 )
 def test_changed_trust_is_named_and_does_not_count(home: Path, opened: Open, statement: str) -> None:
     behind_its_back(home, statement.replace("POINT", POINT.hex()))
-    said: list[str] = []
-    station = opened(said)
+    messages: list[str] = []
+    station = opened(messages)
     station.unlock()
-    assert "peer" in said[0]
+    assert "peer" in messages[0]
     assert "peer" not in {record.name for record in station.policy.trusted()}
     assert OTHER not in station.policy.trusted_stations()
     assert list(station.row_macs.all_broken()) == ["trust in peer"]
@@ -146,14 +146,14 @@ def test_a_planted_end_of_trust_and_a_planted_lifting_do_not_count(home: Path, o
         f"INSERT INTO ended_cas VALUES('{fingerprint(OTHER)}', 't', zeroblob(16))",
         f"INSERT INTO lifted VALUES('{statement}', 't', NULL)",
     )
-    said: list[str] = []
-    station = opened(said)
+    messages: list[str] = []
+    station = opened(messages)
     station.unlock()
     assert station.policy.counts(OTHER)
     assert not station.policy.was_lifted("a ban")
     assert [
         sentence
-        for sentence in said
+        for sentence in messages
         if "another program added" in sentence.lower() and fingerprint(OTHER)[:16] in sentence
     ]
     assert len(list(station.row_macs.all_broken())) == 2
@@ -174,12 +174,12 @@ def test_an_end_of_trust_and_a_lifting_that_a_person_made_hold(opened: Open) -> 
     station.policy.deny(RevocationRecord(NODE, None, "lost", "a ban", "2026-11-21T00:00:00Z"))
     assert station.policy.lift(NODE)
     station.close()
-    said: list[str] = []
-    station = opened(said)
+    messages: list[str] = []
+    station = opened(messages)
     station.unlock()
     assert not station.policy.counts(OTHER)
     assert station.policy.was_lifted("a ban")
-    assert not said
+    assert not messages
     assert not list(station.row_macs.all_broken())
 
 

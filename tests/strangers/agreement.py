@@ -49,7 +49,7 @@ KeyAgreement 1 in the reply alone
 )
 
 
-class No(Exception):
+class RefusalError(Exception):
     """A refusal."""
 
     def __init__(self, reason: int) -> None:
@@ -119,18 +119,18 @@ class Node:
         class_, function, payload = frame[2], frame[3], frame[6:]
         try:
             if (class_, function) == (1, 2):
-                said = self.read(payload)
+                reply = self.read(payload)
             elif (function, inside) == (5, True):
-                said = b""  # Close
+                reply = b""  # Close
             else:
-                said = {1: self.request, 2: self.confirm, 3: self.open, 4: self.sealed, 7: self.hello, 8: self.prove}[
+                reply = {1: self.request, 2: self.confirm, 3: self.open, 4: self.sealed, 7: self.hello, 8: self.prove}[
                     function
                 ](payload)
-        except No as refusal:
+        except RefusalError as refusal:
             return bytes([0, 0, 1, refusal.reason])
         if (class_, function, inside) == (128, 2, False):
             self.keys = None
-        return b"\1" + len(said).to_bytes(2, "big") + said
+        return b"\1" + len(reply).to_bytes(2, "big") + reply
 
     def hello(self, _payload: bytes) -> bytes:
         return b"\1" + self.uuid + struct.pack(">BIIHB", bool(self.key), self.epoch, 0, 512, 0)
@@ -140,7 +140,7 @@ class Node:
 
     def read(self, payload: bytes) -> bytes:
         if payload[:1] != b"\x80":
-            raise No(18)
+            raise RefusalError(18)
         self.reads += payload[1:] == bytes(4)
         at = int.from_bytes(payload[1:], "big")
         return payload[1:] + self.security()[at : at + 466]
@@ -205,38 +205,38 @@ class Node:
 
     def confirm(self, payload: bytes) -> bytes:
         if self.pending is None:
-            raise No(2)
+            raise RefusalError(2)
         key, tag, number = self.pending
         self.pending = None
         if payload != tag:
-            raise No(12)
+            raise RefusalError(12)
         self.key, self.epoch = key, number
         return b""
 
     def open(self, payload: bytes) -> bytes:
         if not self.key:
-            raise No(2)
+            raise RefusalError(2)
         if not payload:
             return self.c.to_bytes(8, "big")
         es, proof = payload[8:73], payload[73:]
         if proof != mac(self.key, b"station open", self.uuid, self.c.to_bytes(8, "big"), es):
-            raise No(12)
+            raise RefusalError(12)
         own = ec.generate_private_key(CURVE)
         self.keys, self.counter = Keys.of(self.key, self.uuid, own, es, es, point(own)), 0
         return point(own) + self.keys.tag(self.key, es, point(own))
 
     def sealed(self, payload: bytes) -> bytes:
         if self.keys is None:
-            raise No(2)
+            raise RefusalError(2)
         try:
             counter, inner = unseal(self.keys.down, payload)
         except (InvalidTag, ValueError):
-            raise No(12) from None
+            raise RefusalError(12) from None
         return seal(self.keys.up, counter, self.handle(inner, inside=True))
 
 
 @dataclass
-class Agreed:
+class StationAgreement:
     """What a station of strangers has after a good reply to Request."""
 
     key: bytes
@@ -258,7 +258,7 @@ class Station:
 
     def take(
         self, payload: bytes, one_time: ec.EllipticCurvePrivateKey, reply: bytes, uuid: bytes, teds: bytes
-    ) -> Agreed:
+    ) -> StationAgreement:
         """Check a reply to Request and make tagS; raises AssertionError, InvalidSignature."""
         assert len(reply) == 165
         nonce, epoch, en, tag, proof = reply[:16], reply[16:20], reply[20:85], reply[85:101], reply[101:]
@@ -270,7 +270,7 @@ class Station:
         key, m = okm(shared(one_time, en) + shared(self.key, en), nonce, script)
         assert tag == mac(m, b"node", script)
         holds(node, b"TEDS1 agree\0" + script, proof)
-        return Agreed(key, int.from_bytes(epoch, "big"), mac(m, b"station", script))
+        return StationAgreement(key, int.from_bytes(epoch, "big"), mac(m, b"station", script))
 
     def open(self, key: bytes, uuid: bytes, c: bytes) -> tuple[bytes, ec.EllipticCurvePrivateKey]:
         """The payload of Open."""

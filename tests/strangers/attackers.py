@@ -23,9 +23,9 @@ IDENTIFY = bytes([0, 0, 128, 7, 0, 0])
 
 def identity(uuid: bytes, *, state: int = 2, epoch: int = 1, sequence: int = 1, most: int = 2048, can_at: int) -> bytes:
     """The reply frame to Identify."""
-    said = b"\1" + uuid + bytes([state]) + epoch.to_bytes(4, "big") + sequence.to_bytes(4, "big")
-    said += most.to_bytes(2, "big") + bytes([can_at])
-    return b"\1" + len(said).to_bytes(2, "big") + said
+    octets = b"\1" + uuid + bytes([state]) + epoch.to_bytes(4, "big") + sequence.to_bytes(4, "big")
+    octets += most.to_bytes(2, "big") + bytes([can_at])
+    return b"\1" + len(octets).to_bytes(2, "big") + octets
 
 
 @dataclass
@@ -135,8 +135,8 @@ def posing(air: Air, nodes: range, uuid_of: Callable[[int], bytes]) -> Iterator[
             yield station, node, data, fd
 
 
-def always_new(nodes: range, said: list[bytes]) -> Attack:
-    """At each of these addresses: a new UUID every time, put into ``said``, and an Announce of it."""
+def always_new(nodes: range, replies: list[bytes]) -> Attack:
+    """Answer each time with a new UUID, which is added to ``replies``, and announce it, at each of these addresses."""
 
     def attack(air: Air) -> None:
         def announce() -> None:
@@ -145,8 +145,8 @@ def always_new(nodes: range, said: list[bytes]) -> Attack:
                     air.put(0x1CFF0000 | node, bytes([1, 0]) + os.urandom(4) + bytes(2))
 
         def new(_node: int) -> bytes:
-            said.append(os.urandom(10))
-            return said[-1]
+            replies.append(os.urandom(10))
+            return replies[-1]
 
         threading.Thread(target=announce, daemon=True).start()
         for _ in posing(air, nodes, new):
@@ -244,8 +244,8 @@ def announces(address: int | None = None, crc: int | None = None) -> Attack:
 
     def make(n: int) -> tuple[int, bytes]:
         at = 1 + n % 239 if address is None else address
-        said = os.urandom(4) if crc is None else crc.to_bytes(4, "big")
-        return 0x1CFF0000 | at, bytes([1, n % 3]) + said + bytes(2)
+        crc_octets = os.urandom(4) if crc is None else crc.to_bytes(4, "big")
+        return 0x1CFF0000 | at, bytes([1, n % 3]) + crc_octets + bytes(2)
 
     return flood(make)
 

@@ -179,7 +179,7 @@ class Liar(Node):
                     self.wire.put(0x18DA0000 | station << 8 | self.address, head, False)
 
 
-class Bent:
+class BentWire:
     """A wire that sends its ISO-TP frames in another way."""
 
     def __init__(self, node: Liar) -> None:
@@ -191,9 +191,9 @@ class Bent:
 
     def _flow(self, peer: int, fd: bool) -> None:
         if self.node.lies("block size 1", "long gaps"):
-            said = bytes([0x30, 1, 0]) if self.node.lies("block size 1") else bytes([0x30, 16, 127])
+            flow_control = bytes([0x30, 1, 0]) if self.node.lies("block size 1") else bytes([0x30, 16, 127])
             self.wire.coming[peer].since = 15 if self.node.lies("block size 1") else 0
-            self.wire.put(0x18DA0000 | peer << 8 | self.wire.own, padded(said, fd), fd)
+            self.wire.put(0x18DA0000 | peer << 8 | self.wire.own, padded(flow_control, fd), fd)
         else:
             self.flow(peer, fd)
 
@@ -222,7 +222,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
     node = Liar(json.loads(Path(sys.argv[1]).read_text()))
     assert node.fault in LIES, node.fault
-    Bent(node)
+    BentWire(node)
     lying_ticks(node)
     print(json.dumps({"ready": True}), flush=True)
     node.loop()

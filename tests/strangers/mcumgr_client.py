@@ -42,11 +42,11 @@ def main() -> None:
         call("keep what runs", client.image_set_state, None, True)
         call("upload", client.image_upload, octets)
         call("keep what never ran", client.image_set_state, digest, True)
-        call("try", lambda: [each.version for each in client.image_set_state(digest)])
+        call("try", lambda: [slot.version for slot in client.image_set_state(digest)])
     else:
-        call("keep", lambda: [each.version for each in client.image_set_state(None, True)])
+        call("keep", lambda: [slot.version for slot in client.image_set_state(None, True)])
     call(
-        "images", lambda: [[each.slot, each.version, each.confirmed, each.pending] for each in client.image_get_state()]
+        "images", lambda: [[slot.slot, slot.version, slot.confirmed, slot.pending] for slot in client.image_get_state()]
     )
     if part == "before":
         call("restart", client.os_system_reset)

@@ -33,7 +33,7 @@ HURRY, HURRIED = 10**10, 50
 """A node that sends from the future is ahead by so many ns at most, and sends so many messages a turn until it is."""
 
 
-class No(Exception):
+class RefusalError(Exception):
     """A refusal."""
 
     def __init__(self, reason: int) -> None:
@@ -43,7 +43,7 @@ class No(Exception):
 
 def need(good: object, reason: int) -> None:
     if not good:
-        raise No(reason)
+        raise RefusalError(reason)
 
 
 @dataclass
@@ -92,7 +92,9 @@ class Node:
         self.given = given
         self.uuid, self.key = bytes.fromhex(given["uuid"]), bytes.fromhex(given["key"])
         self.identity = ec.derive_private_key(int(given["identity"], 16), CURVE)
-        self.teds = {tuple(map(int, name.split(","))): bytes.fromhex(said) for name, said in given["teds"].items()}
+        self.teds = {
+            tuple(map(int, name.split(","))): bytes.fromhex(content) for name, content in given["teds"].items()
+        }
         self.channels = {int(number): facts for number, facts in given["channels"].items()}
         self.fault = given.get("fault", "")
         self.began = time.monotonic_ns() - 10**9
@@ -140,10 +142,10 @@ class Node:
         try:
             need(len(frame) >= 6 and len(frame) - 6 == int.from_bytes(frame[4:6], "big"), 4)
             channel, class_, function = struct.unpack(">HBB", frame[:4])
-            said = self.run(peer, channel, class_, function, frame[6:], session)
-        except No as refusal:
+            answer = self.run(peer, channel, class_, function, frame[6:], session)
+        except RefusalError as refusal:
             return bytes([0, 0, 1, refusal.reason])
-        return b"\1" + len(said).to_bytes(2, "big") + said
+        return b"\1" + len(answer).to_bytes(2, "big") + answer
 
     def run(
         self, peer: int, channel: int, class_: int, function: int, payload: bytes, session: Session | None
@@ -220,7 +222,7 @@ class Node:
                 self.sessions[peer] = self.half.pop(peer)
             session.last, session.heard = counter, self.tick()
             return seal(session.keys.up, counter, self.answer(peer, inner, session))
-        raise No(12)
+        raise RefusalError(12)
 
     # -- inner commands ------------------------------------------------------------------------------------------------
 
@@ -259,9 +261,9 @@ class Node:
 
     def make_safe(self, channel: int) -> None:
         self.safe[channel], self.points[channel] = True, bytes(len(self.points[channel]))
-        self.tell(channel)
+        self.print_state(channel)
 
-    def tell(self, channel: int) -> None:
+    def print_state(self, channel: int) -> None:
         print(
             json.dumps({"channel": channel, "raw": self.points[channel].hex(), "safe": self.safe[channel]}), flush=True
         )
@@ -324,7 +326,7 @@ class Node:
         for channel, octets in values.items():
             self.points[channel], self.safe[channel] = octets, False
             session.claims[channel] = self.tick()
-            self.tell(channel)
+            self.print_state(channel)
 
     def set_many(self, session: Session, payload: bytes) -> bytes:
         values: dict[int, bytes] = {}
@@ -377,22 +379,22 @@ class Node:
 
     def triggered(self, station: int, token: bytes, at: float) -> None:
         # The mark is the tick at the frame's end: by the kernel's time stamp, not by when this thread came to it.
-        now, one = self.tick() - max(0, round((time.time() - at) * 1e9)), self.sessions.get(station)
-        if one is None:
+        now, session = self.tick() - max(0, round((time.time() - at) * 1e9)), self.sessions.get(station)
+        if session is None:
             return
         c = hashlib.sha256(b"TEDS1 trigger\0" + token).digest()[:16]
-        for action, (wanted, until) in list(one.armed.items()):
+        for action, (wanted, until) in list(session.armed.items()):
             if wanted != c or now > until:
                 continue
-            del one.armed[action]
-            one.mark = now
-            for stream in one.streams.values():
+            del session.armed[action]
+            session.mark = now
+            for stream in session.streams.values():
                 if action == 1 and stream.start is None:
                     stream.start = now + 10**7
             if action == 2:
-                moving = [n for n in one.claims if n in self.points]
+                moving = [n for n in session.claims if n in self.points]
                 self.stopped |= dict.fromkeys(moving, True)
-                self.let_go(one, moving)
+                self.let_go(session, moving)
 
     # -- streams -------------------------------------------------------------------------------------------------------
 
@@ -489,37 +491,37 @@ class Node:
         return struct.pack(">HH", session.runs, length)
 
     def drive_frame(self, station: int, data: bytes) -> None:
-        one = self.sessions.get(station)
-        if one is None or one.drive is None or not data:
+        session = self.sessions.get(station)
+        if session is None or session.drive is None or not data:
             return
-        channels, key, length = one.drive
+        channels, key, length = session.drive
         if data[0] == 0:
-            one.coming, one.segment = b"", 0
-        elif data[0] != one.segment:
-            one.segment = -1
-        if one.segment < 0:
+            session.coming, session.segment = b"", 0
+        elif data[0] != session.segment:
+            session.segment = -1
+        if session.segment < 0:
             return
-        one.coming += data[1:]
-        one.segment = one.segment % 7 + 1
-        if len(one.coming) < length:
+        session.coming += data[1:]
+        session.segment = session.segment % 7 + 1
+        if len(session.coming) < length:
             return
-        octets, one.coming, one.segment = one.coming[:length], b"", -1
+        octets, session.coming, session.segment = session.coming[:length], b"", -1
         try:
             counter, plain = opened(key, octets)
         except InvalidTag:
             return
-        if counter <= one.driven:
+        if counter <= session.driven:
             return
-        one.driven = counter
+        session.driven = counter
         left = (int.from_bytes(plain[:4], "big") - self.tick() // 1000) % 2**32
-        if left * 1000 > min(one.dead_men[n] for n in channels):
+        if left * 1000 > min(session.dead_men[n] for n in channels):
             return
         values, rest = {}, plain[4:]
         for n in channels:
             size = len(self.points[n])
             values[n], rest = rest[:size], rest[size:]
         if all(self.bears(n, octets) for n, octets in values.items()):
-            self.apply(one, values)
+            self.apply(session, values)
 
     def loop(self) -> None:
         """Until it is ended."""

@@ -54,13 +54,13 @@ def run_client(ask: Ask, image: Path, part: str) -> dict[str, Any]:
             carrier = threading.Thread(target=_carry, args=(own, ask, ended), daemon=True)
             carrier.start()
             try:
-                told, _ = client.communicate(timeout=300)
+                output, _ = client.communicate(timeout=300)
             finally:
                 client.kill()
                 ended.set()
                 carrier.join()
     assert client.returncode == 0
-    gave: dict[str, Any] = json.loads(told)
+    gave: dict[str, Any] = json.loads(output)
     return gave
 
 

@@ -17,7 +17,7 @@ from tests.strangers.crypto import CURVE, Keys, key_id, mac, message, opened, po
 from tests.strangers.wire import Wire, pieces
 
 
-class Refused(Exception):
+class NodeRefusalError(Exception):
     """The node's reason."""
 
     def __init__(self, reason: int, outer: bool = False) -> None:
@@ -115,7 +115,7 @@ class Station:
         status, length = reply[0], int.from_bytes(reply[1:3], "big")
         assert length == len(reply) - 3, reply.hex()
         if not status:
-            raise Refused(reply[3], outer)
+            raise NodeRefusalError(reply[3], outer)
         return reply[3:]
 
     def plain(self, channel: int, class_: int, function: int, payload: bytes = b"") -> bytes:
@@ -172,9 +172,9 @@ class Station:
         self.do(channel, 4, 2)
 
     def states(self) -> tuple[int, dict[int, tuple[int, int]]]:
-        said = self.do(0, 128, 19)
-        rest = said[1:]
-        return said[0], {rest[at]: (rest[at + 1], rest[at + 2]) for at in range(0, len(rest), 3)}
+        reply = self.do(0, 128, 19)
+        rest = reply[1:]
+        return reply[0], {rest[at]: (rest[at + 1], rest[at + 2]) for at in range(0, len(rest), 3)}
 
     def clock(self) -> dict[str, int]:
         names = ("received", "sent", "mark", "step", "drift", "last")
@@ -224,8 +224,8 @@ def identify(group: str, port: int, *, fd: bool, own: int = 0xF7, seconds: float
     found: list[dict[str, Any]] = []
 
     def take(peer: int, body: bytes, _fd: bool) -> None:
-        said = body[4:]
-        found.append({"address": peer, "uuid": said[1:11], "state": said[11], "can": said[22]})
+        reply = body[4:]
+        found.append({"address": peer, "uuid": reply[1:11], "state": reply[11], "can": reply[22]})
 
     wire = Wire(group, port, own, fd, take, lambda _frame: None)
     wire.put(0x18DBFF00 | own, bytes([7, 0x42]) + Station.command(0, 128, 7))

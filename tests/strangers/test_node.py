@@ -28,7 +28,7 @@ KINDS = {ChannelKind.SENSOR: "sensor", ChannelKind.EVENT_SENSOR: "event sensor",
 
 
 @dataclass
-class Stranger:
+class StrangerNode:
     """A node of the hall, played by a stranger's firmware."""
 
     hall: Hall
@@ -72,7 +72,7 @@ class Stranger:
         plan.write_text(json.dumps(given))
         return plan
 
-    def start(self, fault: str = "", *, program: str = "tests.strangers.node", **more: Any) -> Stranger:
+    def start(self, fault: str = "", *, program: str = "tests.strangers.node", **more: Any) -> StrangerNode:
         self.process = self.hall.desk.start(self.plan(fault, **more), program=(sys.executable, "-m", program))
         self.process.wait_for('"ready": true')
         return self
@@ -83,7 +83,7 @@ class Stranger:
             self.process.end()
             self.process = None
 
-    def told(self) -> list[dict[str, Any]]:
+    def states(self) -> list[dict[str, Any]]:
         assert self.process is not None
         self.process.read(0.1)
         return [line for line in events(self.process.out) if "safe" in line]
@@ -97,8 +97,8 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
 
 
 @contextmanager
-def played(hall: Hall, name: str, address: int, *, fd: bool) -> Iterator[Stranger]:
-    made = Stranger(hall, name, fd, address)
+def played(hall: Hall, name: str, address: int, *, fd: bool) -> Iterator[StrangerNode]:
+    made = StrangerNode(hall, name, fd, address)
     try:
         yield made
     finally:
@@ -106,25 +106,25 @@ def played(hall: Hall, name: str, address: int, *, fd: bool) -> Iterator[Strange
 
 
 @pytest.fixture(params=[False, True], ids=["classic", "fd"])
-def angle(hall: Hall, request: pytest.FixtureRequest) -> Iterator[Stranger]:
+def angle(hall: Hall, request: pytest.FixtureRequest) -> Iterator[StrangerNode]:
     with played(hall, "a", 0x31, fd=request.param) as made:
         yield made
 
 
 @pytest.fixture
-def fd_angle(hall: Hall) -> Iterator[Stranger]:
+def fd_angle(hall: Hall) -> Iterator[StrangerNode]:
     with played(hall, "a", 0x31, fd=True) as made:
         yield made
 
 
 @pytest.fixture
-def classic_angle(hall: Hall) -> Iterator[Stranger]:
+def classic_angle(hall: Hall) -> Iterator[StrangerNode]:
     with played(hall, "a", 0x31, fd=False) as made:
         yield made
 
 
 @pytest.fixture
-def gripper(hall: Hall) -> Iterator[Stranger]:
+def gripper(hall: Hall) -> Iterator[StrangerNode]:
     with played(hall, "g", 0x32, fd=True) as made:
         yield made
 
@@ -134,12 +134,12 @@ def steps(line: dict[str, Any]) -> set[int]:
     return {(after - before) % 65536 for before, after in itertools.pairwise(raw)}
 
 
-def measured(node: Stranger, *words: object, code: int = 0) -> list[dict[str, Any]]:
+def measured(node: StrangerNode, *words: object, code: int = 0) -> list[dict[str, Any]]:
     return node.hall.measure(node.uuid, *words, can=node.can, code=code)
 
 
 @pytest.mark.realtime  # the bound of the clock is what the best exchange took
-def test_it_is_verified_sampled_and_measured(angle: Stranger) -> None:
+def test_it_is_verified_sampled_and_measured(angle: StrangerNode) -> None:
     angle.start()
     station = angle.hall.station
     assert station.ask("verify", angle.uuid, "--via", "can", "--can", angle.can)["verdict"] == "authentic"
@@ -162,7 +162,7 @@ def test_it_is_verified_sampled_and_measured(angle: Stranger) -> None:
 
 
 @pytest.mark.parametrize("words", [["--kind", "free"], ["--trigger"], ["--test-pattern"]], ids=lambda words: words[-1])
-def test_other_kinds_of_streams(fd_angle: Stranger, words: list[str]) -> None:
+def test_other_kinds_of_streams(fd_angle: StrangerNode, words: list[str]) -> None:
     fd_angle.start()
     lines = measured(fd_angle, "--rate", 50, "--duration", 1, *words)
     [stream] = lines[-1]["nodes"][0]["streams"]
@@ -170,7 +170,7 @@ def test_other_kinds_of_streams(fd_angle: Stranger, words: list[str]) -> None:
     assert {step for line in of(lines) for step in steps(line)} <= ({1} if "--test-pattern" in words else {20})
 
 
-def test_a_stranger_among_our_own(fd_angle: Stranger, gripper: Stranger) -> None:
+def test_a_stranger_among_our_own(fd_angle: StrangerNode, gripper: StrangerNode) -> None:
     """Two strangers' nodes and two of our stations on one bus: none disturbs another."""
     fd_angle.start()
     gripper.start()
@@ -195,7 +195,7 @@ def test_a_stranger_among_our_own(fd_angle: Stranger, gripper: Stranger) -> None
     succeeds(4, disturbed, because="two measurements of a node that takes turns with them")
 
 
-def test_a_strangers_actuator_is_set_and_left_safe(gripper: Stranger) -> None:
+def test_a_strangers_actuator_is_set_and_left_safe(gripper: StrangerNode) -> None:
     gripper.start()
     station = gripper.hall.station
 
@@ -204,7 +204,7 @@ def test_a_strangers_actuator_is_set_and_left_safe(gripper: Stranger) -> None:
         acting = station.start("--json", "set", gripper.uuid, 1, 0.05, "--dead-man", 500, "--can", gripper.can)
         acting.wait_for('"applied"')
         time.sleep(1.0)
-        safe = bool(gripper.told()[-1]["safe"])
+        safe = bool(gripper.states()[-1]["safe"])
         state = station.ask("mode", gripper.uuid, "--can", f"{gripper.can}&source=0xF5")["channels"][0]
         acting.signal(signal.SIGTERM)
         ended = acting.end().out.splitlines()[-1]
@@ -214,11 +214,11 @@ def test_a_strangers_actuator_is_set_and_left_safe(gripper: Stranger) -> None:
     acting = station.start("--json", "set", gripper.uuid, 1, 0.05, "--dead-man", 500, "--can", gripper.can)
     acting.wait_for('"applied"')
     acting.process.kill()
-    until(lambda: gripper.told()[-1]["safe"])
+    until(lambda: gripper.states()[-1]["safe"])
     station.ask("set", gripper.uuid, 1, 99, "--can", gripper.can, code=6)
 
 
-def test_a_node_that_is_reset_in_the_middle_is_measured_on(fd_angle: Stranger) -> None:
+def test_a_node_that_is_reset_in_the_middle_is_measured_on(fd_angle: StrangerNode) -> None:
     fd_angle.start()
     running = fd_angle.hall.begin(fd_angle.uuid, "--rate", 50)
     running.wait_for('"index":20')
@@ -242,7 +242,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_counted_and_no_value_is_false(classic_angle: Stranger, fault: str) -> None:
+def test_a_fault_is_counted_and_no_value_is_false(classic_angle: StrangerNode, fault: str) -> None:
     """Classic frames, four a message, so that segments can be missing."""
     node = classic_angle.start(fault)
     running = node.hall.begin(node.uuid, "--rate", 400, "--duration", 2, can=node.can)
@@ -255,7 +255,7 @@ def test_a_fault_is_counted_and_no_value_is_false(classic_angle: Stranger, fault
     assert FAULTS[fault](stream), (stream, outcome.err)
 
 
-def test_what_a_slow_node_sends_from_the_future_is_bad_too(classic_angle: Stranger) -> None:
+def test_what_a_slow_node_sends_from_the_future_is_bad_too(classic_angle: StrangerNode) -> None:
     """It sent one message a turn: on a busy machine turns took longer than messages, and all of them had come true."""
     node = classic_angle.start("from the future", pause=0.05)
     outcome = node.hall.begin(node.uuid, "--rate", 400, "--duration", 2, can=node.can).end()
@@ -264,7 +264,7 @@ def test_what_a_slow_node_sends_from_the_future_is_bad_too(classic_angle: Strang
 
 
 @pytest.mark.parametrize("fault", ["clock runs back", "clock at the end of time"])
-def test_no_sample_has_the_time_of_a_clock_that_lies(fd_angle: Stranger, fault: str) -> None:
+def test_no_sample_has_the_time_of_a_clock_that_lies(fd_angle: StrangerNode, fault: str) -> None:
     """`sample` gave the hour at which the node had started, or ended with a bug."""
     fd_angle.start(fault, program="tests.strangers.liar")
     before = time.time()
@@ -274,7 +274,7 @@ def test_no_sample_has_the_time_of_a_clock_that_lies(fd_angle: Stranger, fault: 
 
 @pytest.mark.parametrize("lie", ["counter far ahead", "ticks at the end of time", "every message twice"])
 def test_a_node_that_lies_about_its_messages_gives_no_value_twice_or_at_a_false_time(
-    fd_angle: Stranger, lie: str
+    fd_angle: StrangerNode, lie: str
 ) -> None:
     fd_angle.start(lie, program="tests.strangers.liar")
     before = time.time()
@@ -287,7 +287,7 @@ def test_a_node_that_lies_about_its_messages_gives_no_value_twice_or_at_a_false_
 
 
 @pytest.mark.parametrize("fault", ["another length", "another start", "clock runs back"])
-def test_a_node_that_contradicts_itself_is_reported(fd_angle: Stranger, fault: str) -> None:
+def test_a_node_that_contradicts_itself_is_reported(fd_angle: StrangerNode, fault: str) -> None:
     fd_angle.start(fault)
     lines = measured(fd_angle, "--rate", 50, "--duration", 1, code=0 if fault == "clock runs back" else 4)
     whys = [line["why"] for line in lines if line["event"] == "status" and line["why"]]
@@ -302,7 +302,7 @@ def test_a_node_that_contradicts_itself_is_reported(fd_angle: Stranger, fault: s
 
 
 def test_a_node_that_is_busy_for_ever_is_told_until_when_and_holds_up_nobody(
-    fd_angle: Stranger, gripper: Stranger
+    fd_angle: StrangerNode, gripper: StrangerNode
 ) -> None:
     fd_angle.start("busy for ever", program="tests.strangers.liar")
     gripper.start()

@@ -16,7 +16,7 @@ import pytest
 from tests.e2e.desk import Links, Running
 from tests.node.measuring_station import KEY, keyed_node
 from tests.places import new_uuid
-from tests.strangers.station import Refused, Station, identify
+from tests.strangers.station import NodeRefusalError, Station, identify
 from tests.strangers.wire import of_spec
 
 pytestmark = pytest.mark.link
@@ -62,9 +62,9 @@ def floor(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Floor]:
 
 
 def refused(reason: int, what: Callable[[], object]) -> None:
-    with pytest.raises(Refused) as said:
+    with pytest.raises(NodeRefusalError) as caught:
         what()
-    assert said.value.reason == reason
+    assert caught.value.reason == reason
 
 
 def of_kind(station: Station, bit: int) -> list[int]:
@@ -252,8 +252,8 @@ def test_clock_trigger_and_marks(floor: Floor) -> None:
     station.wire.turn(0.5)
     asked = time.monotonic_ns()
     second = station.clock()
-    told = time.monotonic_ns()
-    assert asked - d - MS < second["sent"] - first["sent"] < told - a + MS, "it runs as ours does"
+    sent_at = time.monotonic_ns()
+    assert asked - d - MS < second["sent"] - first["sent"] < sent_at - a + MS, "it runs as ours does"
     station.operate(0, lease=30)
     waiting = station.subscribe(0, 0, 2, 10 * MS, {1: 2}, start=2**64 - 1)
     assert station.stop(0) == 0

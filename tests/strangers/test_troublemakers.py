@@ -17,7 +17,7 @@ import pytest
 from tests.e2e.desk import ANGLE
 from tests.measure.hall import Hall, events, of, states
 from tests.pace import until
-from tests.strangers.test_node import Stranger
+from tests.strangers.test_node import StrangerNode
 from tests.strangers.troublemaker import TROUBLES
 
 pytestmark = pytest.mark.link
@@ -41,7 +41,7 @@ UNDISTURBED = ["", "goes on after Stop", "announces itself as others", "empty fr
 
 
 @dataclass
-class Seen:
+class NodeEvents:
     """What the measurement said of one node."""
 
     lines: list[dict[str, Any]]
@@ -61,16 +61,16 @@ class Seen:
 
 
 @pytest.fixture(scope="module")
-def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Seen]]:
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, NodeEvents]]:
     names = {f"t{number}": name for number, name in enumerate(ORDER)}
     hall = Hall(tmp_path_factory.mktemp("troubles"), dict.fromkeys(names, ANGLE))
     try:
-        nodes = {name: Stranger(hall, place, True, 0x41 + int(place[1:])) for place, name in names.items()}
+        nodes = {name: StrangerNode(hall, place, True, 0x41 + int(place[1:])) for place, name in names.items()}
         others = [nodes[name].uuid for name in ("", VICTIM)]
         plans = [node.plan("" if name == VICTIM else name, others=others) for name, node in nodes.items()]
         crowd = hall.desk.start(*plans, program=(sys.executable, "-m", "tests.strangers.troublemaker"))
         crowd.wait_for('"ready": true')
-        found: dict[str, Seen] = {}
+        found: dict[str, NodeEvents] = {}
         for names_of, words in (([name for name in ORDER if name not in FREE], ()), (["", *FREE], ("--kind", "free"))):
             found |= measured(hall, {name: nodes[name].uuid for name in names_of}, *words)
         yield found
@@ -78,14 +78,14 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Seen]]:
         hall.close()
 
 
-def measured(hall: Hall, uuids: dict[str, str], *words: object) -> dict[str, Seen]:
+def measured(hall: Hall, uuids: dict[str, str], *words: object) -> dict[str, NodeEvents]:
     running = hall.begin(*uuids.values(), "--rate", RATE, *words)
 
     def enough() -> bool:
         running.read(0.1)
         lines = events(running.out)
-        told = {name: states([line for line in lines if line.get("uuid") == uuid]) for name, uuid in uuids.items()}
-        again = told.get("claims go", []).count("running") > 1 and "refused" in told["datasheet goes"]
+        states_of = {name: states([line for line in lines if line.get("uuid") == uuid]) for name, uuid in uuids.items()}
+        again = states_of.get("claims go", []).count("running") > 1 and "refused" in states_of["datasheet goes"]
         rest = "claims go" not in uuids or again
         return rest and len(of(lines, uuids[""])) > 6 * RATE
 
@@ -94,17 +94,18 @@ def measured(hall: Hall, uuids: dict[str, str], *words: object) -> dict[str, See
     lines = events(running.end().out)
     ends = {node["uuid"]: node for node in lines[-1]["nodes"]}
     return {
-        name: Seen([line for line in lines if line.get("uuid") == uuid], ends[uuid]) for name, uuid in uuids.items()
+        name: NodeEvents([line for line in lines if line.get("uuid") == uuid], ends[uuid])
+        for name, uuid in uuids.items()
     }
 
 
-def test_every_trouble_is_here(seen: dict[str, Seen]) -> None:
+def test_every_trouble_is_here(seen: dict[str, NodeEvents]) -> None:
     assert set(seen) == {*TROUBLES, VICTIM}
     assert len(TROUBLES) > 20
 
 
 @pytest.mark.parametrize("name", ORDER)
-def test_every_value_that_was_published_is_what_the_sensor_showed_then(seen: dict[str, Seen], name: str) -> None:
+def test_every_value_that_was_published_is_what_the_sensor_showed_then(seen: dict[str, NodeEvents], name: str) -> None:
     samples = seen[name].samples
     assert bool(samples) != (name in NOTHING)
     for (before, low, error), (after, high, other) in itertools.pairwise(samples):
@@ -115,30 +116,30 @@ def test_every_value_that_was_published_is_what_the_sensor_showed_then(seen: dic
             assert abs(apart - (high - low) % 65536) <= bounds, "milliseconds by stamp and by sensor"
 
 
-def test_a_bound_of_the_error_is_claimed_where_the_clock_is_good(seen: dict[str, Seen]) -> None:
+def test_a_bound_of_the_error_is_claimed_where_the_clock_is_good(seen: dict[str, NodeEvents]) -> None:
     known = [error for name in UNDISTURBED for _, _, error in seen[name].samples]
     assert known
     assert None not in known
 
 
 @pytest.mark.parametrize("name", COUNTED)
-def test_what_is_not_believed_is_counted(seen: dict[str, Seen], name: str) -> None:
+def test_what_is_not_believed_is_counted(seen: dict[str, NodeEvents], name: str) -> None:
     assert seen[name].count(COUNTED[name]) > 0, seen[name].end
 
 
 @pytest.mark.parametrize("name", [*UNDISTURBED, VICTIM])
-def test_who_keeps_to_the_rules_is_measured_on(seen: dict[str, Seen], name: str) -> None:
-    one = seen[name]
-    assert "lost" not in states(one.lines)
-    assert one.count("samples") + one.count("lost") + one.count("late") >= 3 * RATE
-    assert name in COUNTED or one.count("bad") == 0
+def test_who_keeps_to_the_rules_is_measured_on(seen: dict[str, NodeEvents], name: str) -> None:
+    result = seen[name]
+    assert "lost" not in states(result.lines)
+    assert result.count("samples") + result.count("lost") + result.count("late") >= 3 * RATE
+    assert name in COUNTED or result.count("bad") == 0
 
 
-def test_a_datasheet_that_changed_under_its_session_gives_no_value_in_the_next_one(seen: dict[str, Seen]) -> None:
-    one = seen["datasheet goes"]
-    assert states(one.lines).count("running") == 1
-    assert one.end["error"]["code"] == "not-authentic"
+def test_a_datasheet_that_changed_under_its_session_gives_no_value_in_the_next_one(seen: dict[str, NodeEvents]) -> None:
+    result = seen["datasheet goes"]
+    assert states(result.lines).count("running") == 1
+    assert result.end["error"]["code"] == "not-authentic"
 
 
-def test_claims_that_a_node_lost_are_claimed_again(seen: dict[str, Seen]) -> None:
+def test_claims_that_a_node_lost_are_claimed_again(seen: dict[str, NodeEvents]) -> None:
     assert states(seen["claims go"].lines).count("running") > 1

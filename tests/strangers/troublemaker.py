@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.strangers.crypto import message
-from tests.strangers.node import No, Node, Session, Stream
+from tests.strangers.node import Node, RefusalError, Session, Stream
 from tests.strangers.wire import pieces
 
 SECOND = 10**9
@@ -58,8 +58,8 @@ class Troublemaker(Node):
 
     def resealed(self, sent: Sent, counter: int, plain: bytes) -> None:
         """Another counter or plaintext under the key of the run."""
-        one, number, stream, _ = sent
-        self.put(one, number, message(stream.key, counter, plain), stream)
+        session, number, stream, _ = sent
+        self.put(session, number, message(stream.key, counter, plain), stream)
 
     def stop(self, session: Session, payload: bytes) -> bytes:
         stream = session.streams.get(payload[0]) if payload else None
@@ -78,7 +78,7 @@ class Troublemaker(Node):
 
     def clock(self, session: Session, payload: bytes) -> bytes:
         if self.fault == "Clock is refused later" and self.sent > LATER:
-            raise No(22)
+            raise RefusalError(22)
         return super().clock(session, payload)
 
     def hello(self, payload: bytes) -> bytes:
@@ -104,13 +104,13 @@ class Troublemaker(Node):
 
 
 def longer(node: Troublemaker, sent: Sent) -> None:
-    one, number, stream, octets = sent
-    node.put(one, number, octets + bytes(8), stream)
+    session, number, stream, octets = sent
+    node.put(session, number, octets + bytes(8), stream)
 
 
 def shorter(node: Troublemaker, sent: Sent) -> None:
-    one, number, stream, octets = sent
-    node.put(one, number, octets[: len(octets) // 2], stream)
+    session, number, stream, octets = sent
+    node.put(session, number, octets[: len(octets) // 2], stream)
 
 
 def twice_the_instants(node: Troublemaker, sent: Sent) -> None:
@@ -123,11 +123,11 @@ def no_instants(node: Troublemaker, sent: Sent) -> None:
 
 
 def empty_frames(node: Troublemaker, sent: Sent) -> None:
-    one, number, stream, octets = sent
-    identifier = 0x1CFF0000 | ((one.station & 7) * 32 + number * 8) << 8 | node.address
+    session, number, stream, octets = sent
+    identifier = 0x1CFF0000 | ((session.station & 7) * 32 + number * 8) << 8 | node.address
     for size in (0, 1, 4):
         node.wire.put(identifier, bytes(size), node.fd)
-    node.put(one, number, octets, stream)
+    node.put(session, number, octets, stream)
 
 
 def begins_again(node: Troublemaker, sent: Sent) -> None:
@@ -152,50 +152,50 @@ def leaps(node: Troublemaker, sent: Sent) -> None:
 
 
 def of_another_stream(node: Troublemaker, sent: Sent) -> None:
-    one, number, stream, octets = sent
-    node.put(one, (number + 1) % 4, octets, stream)
+    session, number, stream, octets = sent
+    node.put(session, (number + 1) % 4, octets, stream)
 
 
 def to_another_station(node: Troublemaker, sent: Sent) -> None:
-    one, number, _, octets = sent
+    session, number, _, octets = sent
     for segment, data in pieces(octets, node.fd):
-        identifier = 0x1CFF0000 | ((one.station % 7 + 1) * 32 + number * 8 + segment) << 8 | node.address
+        identifier = 0x1CFF0000 | ((session.station % 7 + 1) * 32 + number * 8 + segment) << 8 | node.address
         node.wire.put(identifier, data, node.fd)
 
 
 def from_another_node(node: Troublemaker, sent: Sent) -> None:
     """Under the address of the node before it, whose stream is heard too."""
-    one, number, _, octets = sent
+    session, number, _, octets = sent
     for segment, data in pieces(octets, node.fd):
-        identifier = 0x1CFF0000 | ((one.station & 7) * 32 + number * 8 + segment) << 8 | (node.address - 1)
+        identifier = 0x1CFF0000 | ((session.station & 7) * 32 + number * 8 + segment) << 8 | (node.address - 1)
         node.wire.put(identifier, data, node.fd)
 
 
 def claims_go(node: Troublemaker, sent: Sent) -> None:
     """Now and then it loses its claims, and says nothing."""
-    one, number, stream, octets = sent
-    node.put(one, number, octets, stream)
+    session, number, stream, octets = sent
+    node.put(session, number, octets, stream)
     if stream.counter == LATER:
-        node.let_go(one, list(one.claims))
+        node.let_go(session, list(session.claims))
 
 
 def datasheet_goes(node: Troublemaker, sent: Sent) -> None:
     """Its datasheet is another one under a session that streams, then the claims are gone."""
-    one, number, stream, octets = sent
-    node.put(one, number, octets, stream)
+    session, number, stream, octets = sent
+    node.put(session, number, octets, stream)
     if stream.counter == LATER:
         signed = node.teds[0, 128]
         node.teds[0, 128] = signed[:-8] + bytes([signed[-8] ^ 1]) + signed[-7:]
-        node.let_go(one, list(one.claims))
+        node.let_go(session, list(session.claims))
 
 
 def ticks(change: Callable[[int, int], int]) -> Callable[[Troublemaker, Sent], None]:
     """Streams that run free, whose ticks the node writes: ``change`` of tick and counter."""
 
     def trouble(node: Troublemaker, sent: Sent) -> None:
-        one, number, stream, octets = sent
+        session, number, stream, octets = sent
         if not stream.kind:
-            node.put(one, number, octets, stream)
+            node.put(session, number, octets, stream)
             return
         assert stream.start is not None
         tick = stream.start + stream.counter * stream.n * stream.period

@@ -39,7 +39,7 @@ def frames_of(body: bytes, fd: bool) -> list[bytes]:
 
 
 @dataclass
-class Incoming:
+class IncomingMessage:
     """A message that comes in."""
 
     length: int
@@ -58,7 +58,7 @@ class Wire:
     fd: bool
     take: Callable[[int, bytes, bool], None]
     other: Callable[[can.Message], None]
-    coming: dict[int, Incoming] = field(default_factory=dict)
+    coming: dict[int, IncomingMessage] = field(default_factory=dict)
     leaving: dict[int, list[bytes]] = field(default_factory=dict)
     leaving_fd: dict[int, bool] = field(default_factory=dict)
 
@@ -100,20 +100,20 @@ class Wire:
             body = data[1 : 1 + low] if low else data[2 : 2 + data[1]]
             self.take(peer, body, fd)
         elif kind == 1:
-            self.coming[peer] = Incoming((low << 8 | data[1]), data[2:])
+            self.coming[peer] = IncomingMessage((low << 8 | data[1]), data[2:])
             self._flow(peer, fd)
         elif kind == 2 and peer in self.coming:
-            one = self.coming[peer]
-            if low != (one.number + 1) % 16:
+            received = self.coming[peer]
+            if low != (received.number + 1) % 16:
                 del self.coming[peer]
                 return
-            one.number, one.since = one.number + 1, one.since + 1
-            one.octets += data[1:]
-            if len(one.octets) >= one.length:
+            received.number, received.since = received.number + 1, received.since + 1
+            received.octets += data[1:]
+            if len(received.octets) >= received.length:
                 del self.coming[peer]
-                self.take(peer, one.octets[: one.length], fd)
-            elif one.since == BLOCK:
-                one.since = 0
+                self.take(peer, received.octets[: received.length], fd)
+            elif received.since == BLOCK:
+                received.since = 0
                 self._flow(peer, fd)
         elif kind == 3 and low == 0 and self.leaving.get(peer):
             rest = self.leaving[peer]

@@ -26,7 +26,7 @@ class Air:
     def __init__(self, running: Any) -> None:
         self._running = running
 
-    def say(self, words: Any) -> Any:
+    def ask(self, words: Any) -> Any:
         """One line there, one back."""
         self._running.stdin.write(json.dumps(words) + "\n")
         self._running.stdin.flush()
@@ -36,12 +36,12 @@ class Air:
 def provision(bench: Bench, *words: object) -> dict[str, Any]:
     began = time.monotonic()
     done = bench.run("provision", "--profile", ANGLE, "--yes", "--via", "ble", *words, "--timeout", "120")
-    said = json.loads(done.out) if done.out else {}
-    steps = {step["name"]: step["result"] for step in said.get("steps", [])}
+    record = json.loads(done.out) if done.out else {}
+    steps = {step["name"]: step["result"] for step in record.get("steps", [])}
     return {
         "code": done.code,
-        "verdict": said.get("verdict"),
-        "uuid": said.get("uuid"),
+        "verdict": record.get("verdict"),
+        "uuid": record.get("uuid"),
         "steps": steps,
         "took": round(time.monotonic() - began, 1),
         "said": (done.out + done.err)[-600:],
@@ -51,14 +51,14 @@ def provision(bench: Bench, *words: object) -> dict[str, Any]:
 def power_on() -> dict[str, Any]:
     """bluetoothd starts with the adapter off."""
     until = time.monotonic() + 60
-    said = ""
+    output = ""
     while time.monotonic() < until:
-        said = sh("bluetoothctl", "power", "on")
+        output = sh("bluetoothctl", "power", "on")
         found = adapters()
         if found and found[0].powered:
             return {"adapters": [[adapter.name, adapter.powered, adapter.central] for adapter in found]}
         time.sleep(1)
-    return {"error": f"the adapter does not come up: {said}"}
+    return {"error": f"the adapter does not come up: {output}"}
 
 
 def main() -> None:
@@ -79,12 +79,12 @@ def main() -> None:
     ):
         air = Air(running)
         wanted = {"nodes": [str(node) for node in nodes], "in_c": [str(nodes[2])], "vhci": True}
-        addresses = air.say(wanted)["nodes"]
+        addresses = air.ask(wanted)["nodes"]
         with process("/usr/libexec/bluetooth/bluetoothd", "-n"):
             look("power", power_on)
             look("first", lambda: provision(bench, "--ble", f"hci0?address={addresses[0]}"))
             look("again", lambda: provision(bench, "--name", "left", uuids[0], "--ble", "auto"))
-            air.say(["cut", 1, 20])
+            air.ask(["cut", 1, 20])
             look("reconnect", lambda: provision(bench, "--name", "right", "--ble", f"hci0?address={addresses[1]}"))
             look("in-c", lambda: provision(bench, "--name", "in C", "--ble", f"hci0?address={addresses[2]}"))
             look("all", lambda: identify(bench, uuids))
@@ -93,10 +93,10 @@ def main() -> None:
 
 def identify(bench: Bench, uuids: list[str]) -> dict[str, Any]:
     done = bench.run("identify", "--via", "ble", "--timeout", "120")
-    said = json.loads(done.out)
-    found = sorted(node["uuid"] for node in said.get("nodes", [said]) if "uuid" in node)
-    told = said.get("error") or done.err[-500:]
-    return {"code": done.code, "found": found, "expected": sorted(uuids), "told": told}
+    record = json.loads(done.out)
+    found = sorted(node["uuid"] for node in record.get("nodes", [record]) if "uuid" in node)
+    error = record.get("error") or done.err[-500:]
+    return {"code": done.code, "found": found, "expected": sorted(uuids), "told": error}
 
 
 if __name__ == "__main__":

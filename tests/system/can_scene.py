@@ -64,8 +64,8 @@ def two_stations(bench: Bench, node: dict[str, Any]) -> dict[str, Any]:
     with process(*program(*words)) as second:
         measured = measure(bench, node, CAN, 20)
         out, _ = second.communicate(timeout=120)
-    said = json.loads(out)
-    return {**measured, "second": second.returncode, "second_saw": said.get("uuid"), "uuid": node["uuid"]}
+    record = json.loads(out)
+    return {**measured, "second": second.returncode, "second_saw": record.get("uuid"), "uuid": node["uuid"]}
 
 
 def candump(node: dict[str, Any]) -> dict[str, Any]:

@@ -19,13 +19,13 @@ from typing import Any
 
 from teds_provision.cli import main as command_line
 from tests.bench import PASSPHRASE, make_station
-from tests.system.machine import tell
+from tests.system.machine import report
 
 FOLDER = Path(tempfile.mkdtemp(prefix="scene"))
 
 
 @dataclass
-class Ended:
+class Outcome:
     """A command that ran: exit code, output, what was told on stderr."""
 
     code: int
@@ -50,7 +50,7 @@ class Bench:
         self.home = FOLDER / name
         make_station(self.home, name).close()
 
-    def run(self, *words: object) -> Ended:
+    def run(self, *words: object) -> Outcome:
         """Run a command in this process."""
         read, write = os.pipe()
         os.write(write, PASSPHRASE.encode() + b"\n")
@@ -63,7 +63,7 @@ class Bench:
         finally:
             os.close(read)
         out.flush()
-        return Ended(code, out.buffer.getvalue().decode(), err.getvalue())  # type: ignore[attr-defined]
+        return Outcome(code, out.buffer.getvalue().decode(), err.getvalue())  # type: ignore[attr-defined]
 
 
 @contextmanager
@@ -89,11 +89,11 @@ def look(name: str, what: Callable[[], dict[str, Any]]) -> None:
     """Do one thing of the scene and tell how it came out; what it raises is told, and the scene goes on."""
     began = time.monotonic()
     try:
-        told = what()
+        state = what()
     except BaseException as error:  # noqa: BLE001 - told to the test
-        tell(name, error=repr(error)[:2000], trace=traceback.format_exc()[-3000:])
+        report(name, error=repr(error)[:2000], trace=traceback.format_exc()[-3000:])
         return
-    tell(name, seconds=round(time.monotonic() - began, 1), **told)
+    report(name, seconds=round(time.monotonic() - began, 1), **state)
 
 
 def sh(*words: str) -> str:

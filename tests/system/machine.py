@@ -80,11 +80,11 @@ class Machine:
         self.output = console.read_text(errors="replace").replace("\r", "")
         for line in self.output.splitlines():
             if line.startswith(MARK):
-                told = json.loads(line.removeprefix(MARK))
-                self.results[told.pop("name")] = told
+                record = json.loads(line.removeprefix(MARK))
+                self.results[record.pop("name")] = record
 
 
-def tell(name: str, **what: Any) -> None:
+def report(name: str, **what: Any) -> None:
     """Inside: say how one thing came out."""
     sys.__stdout__.write(f"\n{MARK}{json.dumps({'name': name, **what})}\n")  # type: ignore[union-attr]
     sys.__stdout__.flush()  # type: ignore[union-attr]

@@ -195,15 +195,15 @@ finite = st.floats(-1e6, 1e6, width=32)
 
 @st.composite
 def calibrations(draw: st.DrawFn) -> Calibration:
-    inputs, cells, each = [], 1, 1
+    inputs, cells, terms = [], 1, 1
     for _ in range(draw(st.integers(1, 3))):
         segments, degree = draw(st.integers(1, 4)), draw(st.integers(0, 3))
         boundaries = sorted(draw(st.sets(finite, min_size=segments + 1, max_size=segments + 1)))
         offsets = draw(st.lists(finite, min_size=segments, max_size=segments))
         channel, key = draw(st.integers(0, 65535)), draw(st.integers(0, 255))
         inputs.append(CalibrationInput(channel, degree, tuple(boundaries), tuple(offsets), key))
-        cells, each = cells * segments, each * (degree + 1)
-    coefficients = draw(st.lists(finite, min_size=cells * each, max_size=cells * each))
+        cells, terms = cells * segments, terms * (degree + 1)
+    coefficients = draw(st.lists(finite, min_size=cells * terms, max_size=cells * terms))
     number = st.none() | finite
     low, high = sorted(draw(st.tuples(finite, finite)))
     moment = st.datetimes(datetime(1970, 1, 1), datetime(2105, 1, 1)).map(

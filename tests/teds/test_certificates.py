@@ -71,10 +71,14 @@ def test_points_of_raw_values_become_the_calibration_and_its_certificate_teds(an
     assert made.date == datetime(2026, 10, 12, tzinfo=UTC)
     assert made.interval == angle.channels[0].calibration.interval
     blocks = angle.build(UUID, calibration={1: made}).blocks
-    told = read_certificate_reference(blocks[1, AccessCode.CERTIFICATE])
-    assert (told.number, told.laboratory, told.date) == ("B2-2026-0042", "Bench 2, robot laboratory", "2026-10-12")
-    assert told.sha256 == read_certificate(path.read_bytes(), str(path)).sha256
-    assert Sheet.from_blocks(blocks).calibrations[1].certificate == told
+    reference = read_certificate_reference(blocks[1, AccessCode.CERTIFICATE])
+    assert (reference.number, reference.laboratory, reference.date) == (
+        "B2-2026-0042",
+        "Bench 2, robot laboratory",
+        "2026-10-12",
+    )
+    assert reference.sha256 == read_certificate(path.read_bytes(), str(path)).sha256
+    assert Sheet.from_blocks(blocks).calibrations[1].certificate == reference
     without = angle.build(UUID, calibration={1: replace(made, certificate=None)}).blocks
     assert (1, AccessCode.CERTIFICATE) not in without, "a calibration of another origin has no certificate"
 
@@ -86,9 +90,9 @@ def test_indications_in_the_channels_unit_become_raw_numbers_by_the_profile(temp
     assert made.points == pytest.approx([pytest.approx(pair) for pair in wanted])
     assert made.uncertainty == pytest.approx(0.06, abs=1e-6), "the largest one"
     plain = replace(temperature, channels=(_without_indication(temperature),))
-    with pytest.raises(BadDataError, match="nothing states which raw number gives an indication") as told:
+    with pytest.raises(BadDataError, match="nothing states which raw number gives an indication") as caught:
         read_certified(TEMPERATURE, "c.xml", plain, LEFT)
-    assert "indication = [slope, intercept]" in told.value.hint
+    assert "indication = [slope, intercept]" in caught.value.hint
 
 
 def _without_indication(profile: Profile):  # type: ignore[no-untyped-def]
@@ -113,10 +117,10 @@ def test_the_date_that_a_person_names_goes_before_the_interval(tmp_path: Path, a
 
 
 def test_as_found_beside_as_left_is_never_guessed(temperature: Profile) -> None:
-    with pytest.raises(UnclearItemError, match=r"2 results of c\.xml fit channel 1: as-found .*as-left") as told:
+    with pytest.raises(UnclearItemError, match=r"2 results of c\.xml fit channel 1: as-found .*as-left") as caught:
         read_certified(TEMPERATURE, "c.xml", temperature)
-    assert [item.id for item in told.value.items] == ["as-found", "as-left"]
-    assert "--item" in told.value.hint
+    assert [item.id for item in caught.value.items] == ["as-found", "as-left"]
+    assert "--item" in caught.value.hint
     found = read_certified(TEMPERATURE, "c.xml", temperature, CertificateChoice(item="as-found"))[1]
     assert found.points[0] == pytest.approx(((0.64 + 40) * 128, 0.02))
     asked: list[str] = []
@@ -164,9 +168,9 @@ def test_two_indications_of_one_table_are_two_items(angle: Profile) -> None:
 
 def test_a_channel_must_be_named_where_the_type_has_several() -> None:
     hand = load_profile("tactile-finger-sensor")
-    with pytest.raises(BadDataError, match=r"say which one c\.xml is for") as told:
+    with pytest.raises(BadDataError, match=r"say which one c\.xml is for") as caught:
         read_certified(ANGLE, "c.xml", hand)
-    assert "--calibration 1=c.xml" in told.value.hint
+    assert "--calibration 1=c.xml" in caught.value.hint
     force = changed(ANGLE, (r"\degree", r"\newton"))
     made = read_certified(force, "c.xml", hand, CertificateChoice(channel=2))
     assert list(made) == [2]
@@ -281,9 +285,9 @@ _BOMB = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&
     ],
 )
 def test_a_hostile_or_broken_certificate_is_refused_with_its_place(octets: bytes, why: str, angle: Profile) -> None:
-    with pytest.raises(BadDataError, match=r"c\.xml") as told:
+    with pytest.raises(BadDataError, match=r"c\.xml") as caught:
         read_certified(octets, "c.xml", angle)
-    assert why in told.value.message
+    assert why in caught.value.message
 
 
 def test_the_largest_certificates_that_are_read_cost_seconds(angle: Profile) -> None:
@@ -311,12 +315,12 @@ def test_columns_of_unequal_length_make_no_points(angle: Profile) -> None:
 
 def test_a_number_too_long_for_a_teds_is_refused_and_a_long_name_is_cut(angle: Profile) -> None:
     long = changed(ANGLE, ("Bench 2, robot laboratory", "Laboratorium für Größen " * 8))
-    told = read_certified(long, "c.xml", angle)[1].certificate
-    assert told is not None
-    held = read_certificate_reference(told.encode())
+    certificate = read_certified(long, "c.xml", angle)[1].certificate
+    assert certificate is not None
+    held = read_certificate_reference(certificate.encode())
     assert held.laboratory.endswith("…")
     assert held.laboratory.startswith("Laboratorium für")
-    assert held.encode() == told.encode()
+    assert held.encode() == certificate.encode()
     with pytest.raises(BadDataError):
         read_certified(changed(ANGLE, ("B2-2026-0042", "9" * 180)), "c.xml", angle)
     with pytest.raises(BadDataError, match="form of the profile"):
@@ -395,13 +399,13 @@ def test_our_certificates_are_valid_by_the_schema() -> None:
 
     folder = Path(SCHEMAS or "")
 
-    class Shipped(etree.Resolver):  # type: ignore[misc]
+    class ShippedSchemas(etree.Resolver):  # type: ignore[misc]
         def resolve(self, url: str, _: object, context: object) -> object:
             name = "xmldsig.xsd" if "xmldsig" in url else "dsi_2_1_0.xsd" if "SI_Format" in url else None
             return None if name is None else self.resolve_filename(str(folder / name), context)
 
     parser = etree.XMLParser(no_network=True)
-    parser.resolvers.add(Shipped())
+    parser.resolvers.add(ShippedSchemas())
     schema = etree.XMLSchema(etree.parse(str(folder / "dcc_3_2_1.xsd"), parser))
     for text in (written(), written(laboratory=Laboratory()), ANGLE.decode()):
         assert schema.validate(etree.fromstring(text.encode())), schema.error_log

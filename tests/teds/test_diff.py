@@ -76,15 +76,15 @@ def test_a_bend_is_told_where_it_is_largest(finger: Profile) -> None:
 
 def test_a_change_of_method_date_and_uncertainty_is_told(finger: Profile) -> None:
     moment = datetime(2026, 10, 31, 12, tzinfo=UTC)
-    one = line(0, 1e-4, date=moment, interval=180 * 86400.0, uncertainty=0.1)
+    yearly = line(0, 1e-4, date=moment, interval=180 * 86400.0, uncertainty=0.1)
     other = replace(
         fit([(0, 0.0), (30000, 3.0), (65535, 6.5535)], "table", channel=1), unit=parse_unit("N"), uncertainty=0.05
     )
-    told = " ".join(texts(diff_blocks(*(finger.build(UUID, calibration={1: c}).blocks for c in (one, other)))))
-    assert "linear -> table of 2 segments" in told
-    assert "LstCalDt removed (was 2026-10-31 12:00:00 UTC)" in told
-    assert "CalInrvl removed (was 180 days)" in told
-    assert "stated uncertainty 0.1 -> 0.05" in told
+    text = " ".join(texts(diff_blocks(*(finger.build(UUID, calibration={1: c}).blocks for c in (yearly, other)))))
+    assert "linear -> table of 2 segments" in text
+    assert "LstCalDt removed (was 2026-10-31 12:00:00 UTC)" in text
+    assert "CalInrvl removed (was 180 days)" in text
+    assert "stated uncertainty 0.1 -> 0.05" in text
 
 
 def test_blocks_added_and_removed_are_told(finger: Profile) -> None:
@@ -106,12 +106,12 @@ def test_fields_of_a_channel_are_told_in_its_unit() -> None:
         "SPeriod": 2e-3,
     }
     other = replace(profile, channels=(replace(channel, fields=fields),))
-    told = texts(diff_blocks(profile.build(UUID).blocks, other.build(UUID, name="joint 3").blocks))
-    assert "node: name magnetic angular position sensor -> joint 3." in told
-    assert "channel 1 (angle): high limit 360 ° -> 180 °." in told
-    assert "channel 1 (angle): stated uncertainty 1 ° -> 0.5 °." in told
-    assert "channel 1 (angle): sampling period 100 µs -> 2 ms." in told
-    assert len(told) == 4
+    text = texts(diff_blocks(profile.build(UUID).blocks, other.build(UUID, name="joint 3").blocks))
+    assert "node: name magnetic angular position sensor -> joint 3." in text
+    assert "channel 1 (angle): high limit 360 ° -> 180 °." in text
+    assert "channel 1 (angle): stated uncertainty 1 ° -> 0.5 °." in text
+    assert "channel 1 (angle): sampling period 100 µs -> 2 ms." in text
+    assert len(text) == 4
 
 
 def test_fields_added_and_removed_and_repeated_are_told() -> None:
@@ -120,9 +120,9 @@ def test_fields_added_and_removed_and_repeated_are_told() -> None:
     other = ("VGroup", (("GrpType", 1), ("MemList", [3])))
     old = {(0, 1): teds.compose(1, [*meta, group])}
     new = {(0, 1): teds.compose(1, [*meta, ("SHoldOff", 2.0), group, other])}
-    told = texts(diff_blocks(old, new))
-    assert "node: slow-access time-out added: 2 s." in told
-    assert "node: VGroup 2, MemList added: 3." in told
+    text = texts(diff_blocks(old, new))
+    assert "node: slow-access time-out added: 2 s." in text
+    assert "node: VGroup 2, MemList added: 3." in text
     assert "node: VGroup 2, MemList removed (was 3)." in texts(diff_blocks(new, old))
 
 

@@ -75,9 +75,9 @@ def test_a_profile_names_what_it_cannot_hold():
     )
     calibration = teds.compose(5, {"LowLimit": 0.0, "HiLimit": 1.0, "OError": 0.1})
     blocks = [*channel, TedsBlock(1, 5, calibration), TedsBlock(0, 16, octets_of(_vector("x24_security")))]
-    said = " ".join(lost(blocks, "toml"))
-    assert "CalTEDS of channel 1 (calibrations come from a file of their own)" in said
-    assert "SecurityTEDS2024 of channel 0" in said
+    losses = " ".join(lost(blocks, "toml"))
+    assert "CalTEDS of channel 1 (calibrations come from a file of their own)" in losses
+    assert "SecurityTEDS2024 of channel 0" in losses
     text = write_blocks(blocks, "toml")
     assert "# Not held here: CalTEDS of channel 1" in text
     assert read_blocks(text.encode()) == channel
@@ -87,8 +87,8 @@ def test_a_field_without_a_key_is_named_by_a_profile():
     path = PROFILES[0].parent / "load-cell.toml"
     others = [block for block in read_blocks(path.read_bytes(), path=path) if block.access_code != 1]
     fields = [("UUID", bytes(10)), ("OholdOff", 1.0), ("TestTime", 0.0), ("MaxChan", 7), ("200", b"own")]
-    said = lost([TedsBlock(0, 1, teds.compose(1, fields)), *others], "toml")
-    assert said == ("MetaTEDS of channel 0: MaxChan, type 200.",)
+    losses = lost([TedsBlock(0, 1, teds.compose(1, fields)), *others], "toml")
+    assert losses == ("MetaTEDS of channel 0: MaxChan, type 200.",)
 
 
 def test_teds_without_a_channel_make_no_profile_and_that_is_said():
@@ -394,8 +394,8 @@ def test_the_page_names_every_format():
 def test_any_teds_give_a_profile_that_names_its_losses(blocks, data):
     blocks = [damaged(block, data) for block in blocks]
     text = write_blocks(blocks, "toml")
-    said = lost(blocks, "toml")
-    assert text.count("# Not held here: ") == len(said)
+    losses = lost(blocks, "toml")
+    assert text.count("# Not held here: ") == len(losses)
 
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])

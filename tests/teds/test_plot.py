@@ -109,11 +109,13 @@ try:
 except TedsProvisionError as error:
     print(error.exit_code, error.message, error.hint)
 """
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path).stdout
-    assert "matplotlib" in told
-    assert told.startswith("1 ")
-    assert f"{sys.executable} -m pip install " in told
-    assert "[plot]" in told
+    output = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
+    ).stdout
+    assert "matplotlib" in output
+    assert output.startswith("1 ")
+    assert f"{sys.executable} -m pip install " in output
+    assert "[plot]" in output
 
 
 def test_a_picture_names_the_node(tmp_path: Path) -> None:

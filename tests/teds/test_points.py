@@ -118,6 +118,6 @@ def test_remarks_are_no_values(tmp_path: Path) -> None:
         fit_points("raw, value, # a\n0, 1, 2, 3\n", "x.csv")
     file = tmp_path / "x.csv"
     file.write_text(text)
-    told = spawn("--json", "calibrate", "fit", file, "--method", "linear").json
-    assert (told["method"], told["rms"], told["unit"]) == ("linear", pytest.approx(0, abs=1e-6), "N")
-    assert [row["raw"] for row in told["residuals"]] == [0, 5]
+    report = spawn("--json", "calibrate", "fit", file, "--method", "linear").json
+    assert (report["method"], report["rms"], report["unit"]) == ("linear", pytest.approx(0, abs=1e-6), "N")
+    assert [row["raw"] for row in report["residuals"]] == [0, 5]

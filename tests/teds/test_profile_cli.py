@@ -48,9 +48,9 @@ def test_check_exits_8_and_names_every_mistake(workspace: Path, capsys: pytest.C
     assert error["code"] == "bad-data"
     assert "bad.toml:3: channel.1.unit" in error["message"]
     assert run(["--home", "home", "profile", "check", "bad.toml"]) == 8
-    told = capsys.readouterr().err
-    assert "bad.toml:3: channel.1.unit" in told
-    assert "bad.toml:4: channel.1.foo" in told
+    stderr = capsys.readouterr().err
+    assert "bad.toml:3: channel.1.unit" in stderr
+    assert "bad.toml:4: channel.1.foo" in stderr
     assert json_of(capsys, "profile", "check", "gripper", "load-cell")["profiles"][1]["ok"] is True
 
 

@@ -62,10 +62,10 @@ def test_every_shipped_profile_gives_a_sheet_that_says_what_the_profile_says() -
         if profile.abstract:
             continue
         sheet = Sheet.from_image(Image(UUID, profile.build(UUID, now=WHEN).blocks))
-        said = [(c.number, c.name, c.type, c.units, c.raw_range) for c in profile.channels]
+        expected = [(c.number, c.name, c.type, c.units, c.raw_range) for c in profile.channels]
         read = [(c.number, c.name, c.kind, c.units, c.sample.raw_range if c.sample else None) for c in sheet.channels]
-        if [row[:4] for row in said] != [row[:4] for row in read] or sheet.errors:
-            wrong.append((profile.name, said, read, sheet.errors))
+        if [row[:4] for row in expected] != [row[:4] for row in read] or sheet.errors:
+            wrong.append((profile.name, expected, read, sheet.errors))
         if sheet.meta.name != profile.tim_name or sheet.meta.channels != len(profile.channels):
             wrong.append((profile.name, sheet.meta))
     assert not wrong

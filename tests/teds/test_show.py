@@ -32,8 +32,8 @@ def texts(shown):
 
 
 def test_limits_are_in_the_unit_that_people_use_and_a_difference_leaves_the_offset_out():
-    said = texts(shown_of(3, {"PhyUnits": KELVIN, "LowLimit": 273.15, "HiLimit": 373.15, "OError": 0.5}))
-    assert (said["LowLimit"], said["HiLimit"], said["OError"]) == ("0 °C", "100 °C", "0.5 °C")
+    text = texts(shown_of(3, {"PhyUnits": KELVIN, "LowLimit": 273.15, "HiLimit": 373.15, "OError": 0.5}))
+    assert (text["LowLimit"], text["HiLimit"], text["OError"]) == ("0 °C", "100 °C", "0.5 °C")
 
 
 def test_times_are_in_a_unit_that_suits():

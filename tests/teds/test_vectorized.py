@@ -88,8 +88,8 @@ def test_every_value_that_a_channel_can_have_is_calibrated_beforehand(number: in
     assert first is not None
     assert first.sample is not None
     narrow = replace(first, sample=replace(first.sample, bits=15), high=2.0)
-    one = ChannelInterpreter(replace(known, channels=(narrow,)), number)
-    many = ManyChannels.side_by_side([one], [True])
+    narrowed = ChannelInterpreter(replace(known, channels=(narrow,)), number)
+    many = ManyChannels.side_by_side([narrowed], [True])
     assert many is not None
     octets = np.arange(65536).astype(">u2")
     computed = many.values(many.raw(octets.tobytes()))
@@ -97,10 +97,10 @@ def test_every_value_that_a_channel_can_have_is_calibrated_beforehand(number: in
     value, valid = many.values(many.raw(octets.tobytes()))
     np.testing.assert_array_equal(valid, computed[1])
     np.testing.assert_array_equal(value, computed[0])
-    alone = one.values(one.reader.raw(octets.view(np.uint8).reshape(-1, 2)))
+    alone = narrowed.values(narrowed.reader.raw(octets.view(np.uint8).reshape(-1, 2)))
     assert 0 < np.count_nonzero(alone.valid) < 65536
     np.testing.assert_array_equal(valid[:, 0], alone.valid)
-    np.testing.assert_array_equal(value[:, 0], one.unit.to_si(alone.value))
+    np.testing.assert_array_equal(value[:, 0], narrowed.unit.to_si(alone.value))
 
 
 @given(st.lists(st.lists(st.integers(0, 255), min_size=4, max_size=4), min_size=1, max_size=6), st.booleans())
@@ -132,11 +132,11 @@ def test_tables_are_shared_by_channels_of_one_curve_and_are_few(monkeypatch: pyt
         assert many is not None
         return many
 
-    one, same, other, third = channel(2), channel(2), channel(3), channel(4)
-    for many in (one, same, other, third):
+    first, same, other, third = channel(2), channel(2), channel(3), channel(4)
+    for many in (first, same, other, third):
         many.calibrate_all()
-    assert one._known is not None
-    assert same._known is one._known
+    assert first._known is not None
+    assert same._known is first._known
     assert other._known is not None
     assert third._known is None
     value, _ = third.values(third.raw(b"\xff\xff"))

@@ -153,9 +153,9 @@ def test_what_is_no_trace_is_bad_data(octets: bytes, tmp_path: Path) -> None:
 
 
 def test_a_trace_is_private_and_never_over_another_file(tmp_path: Path) -> None:
-    told: list[str] = []
+    messages: list[str] = []
     path = tmp_path / "t.trace"
-    trace = open_trace(path, told.append)
+    trace = open_trace(path, messages.append)
     trace.message("nfc", "out", b"\1", "Sealed", uuid=NODE, sealed=True)
     trace.close()
     trace.frame("can", "out", b"\2", identifier=1)  # after its end: nothing, and no error
@@ -163,7 +163,7 @@ def test_a_trace_is_private_and_never_over_another_file(tmp_path: Path) -> None:
     (record,) = read_trace(path)
     assert record.command == "Sealed, not opened"
     with pytest.raises(UsageError):
-        open_trace(path, told.append)
+        open_trace(path, messages.append)
     with pytest.raises(NotFoundError):
-        open_trace(tmp_path / "none" / "t", told.append)
-    assert not told
+        open_trace(tmp_path / "none" / "t", messages.append)
+    assert not messages

@@ -63,9 +63,9 @@ def wait_until(holds: Callable[[], bool], seconds: float = 60) -> None:
 def test_asked_once_and_closed_by_lock(home: Path) -> None:
     assert opens(home) == 7
     assert not run(home, "lock").json["was_open"]
-    said = run(home, "unlock", "--for", "10m", passphrase=PASSPHRASE)
-    assert said.code == 0, said
-    assert said.json["unlocked"]
+    outcome = run(home, "unlock", "--for", "10m", passphrase=PASSPHRASE)
+    assert outcome.code == 0, outcome
+    assert outcome.json["unlocked"]
     assert (home / agent.SOCKET).stat().st_mode & 0o777 == 0o600
     assert 500 < (agent.seconds_left(home) or 0) <= 600
     assert [opens(home) for _ in range(2)] == [0, 0]
@@ -90,7 +90,7 @@ def test_it_ends_by_itself_at_the_time(home: Path) -> None:
 def test_a_pin_that_is_held_is_not_spent_on_the_last_attempt() -> None:
     from pkcs11 import TokenFlag
 
-    class Shown:
+    class ShownToken:
         flags = TokenFlag(0)
 
     asked: list[str] = []
@@ -100,9 +100,9 @@ def test_a_pin_that_is_held_is_not_spent_on_the_last_attempt() -> None:
         return "typed"
 
     give, uri = selection._holding(b"held", person), Pkcs11Uri("/m.so", token="t")
-    assert ask_pin(cast(Any, Shown), uri, give) == "held"
-    Shown.flags = TokenFlag.USER_PIN_FINAL_TRY
-    assert ask_pin(cast(Any, Shown), uri, give) == "typed"
+    assert ask_pin(cast(Any, ShownToken), uri, give) == "held"
+    ShownToken.flags = TokenFlag.USER_PIN_FINAL_TRY
+    assert ask_pin(cast(Any, ShownToken), uri, give) == "typed"
     assert len(asked) == 1
 
 

@@ -288,9 +288,9 @@ def test_init_killed_at_any_instant_can_be_run_again(tmp_path: Path) -> None:
         assert process.stdout.readline() == "ready\n"
         time.sleep(attempt * 0.0007)
         process.send_signal(signal.SIGKILL)
-        said, _ = process.communicate()
+        output, _ = process.communicate()
         vault = FileVault.create(home, STORE, Person(), costs=THROWAWAY)
-        assert said in ("", vault.identity().point.hex() + "\n")
+        assert output in ("", vault.identity().point.hex() + "\n")
 
 
 def test_a_change_killed_at_any_instant_leaves_the_old_or_the_new(tmp_path: Path, vault: FileVault) -> None:

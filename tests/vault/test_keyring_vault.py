@@ -117,7 +117,7 @@ def test_a_forbidden_backend_is_named_in_the_reason(monkeypatch: pytest.MonkeyPa
     assert "keyring.backends.null.Keyring" in why
 
 
-class InMemory:
+class MemoryKeyring:
     """A keyring of two processes at once: each opens it, and both write."""
 
     def __init__(self) -> None:
@@ -135,16 +135,16 @@ class InMemory:
 
 def test_what_is_written_is_made_from_what_lies_in_the_keyring_now(monkeypatch: pytest.MonkeyPatch) -> None:
     """The CA key was dropped by writing back what was read before another process changed the master key."""
-    name = f"{InMemory.__module__}.{InMemory.__qualname__}"
-    backend = InMemory()
+    name = f"{MemoryKeyring.__module__}.{MemoryKeyring.__qualname__}"
+    backend = MemoryKeyring()
     monkeypatch.setitem(keyring_vault.ALLOWED, name, "a keyring in memory")
     monkeypatch.setattr(keyring_vault, "_viable", lambda: iter([(name, backend)]))
-    one = KeyringVault.create(STORE)
+    vault = KeyringVault.create(STORE)
     other = KeyringVault.open(STORE)
-    wrapped = one.wrap(bytes(16), context=b"x")
+    wrapped = vault.wrap(bytes(16), context=b"x")
     other.add_master()
-    assert one.drop_ca()
-    one.add_master()
+    assert vault.drop_ca()
+    vault.add_master()
     now = KeyringVault.open(STORE)
     assert (now.masters(), now.ca()) == ((1, 2, 3), None)
     assert now.unwrap(wrapped, context=b"x") == bytes(16)
@@ -207,8 +207,8 @@ class Session:
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
         assert process.returncode == 0, errors
-        said: dict[str, Any] = json.loads(output)
-        return said
+        record: dict[str, Any] = json.loads(output)
+        return record
 
 
 _PRELUDE = """
@@ -305,19 +305,19 @@ def test_the_ca_key_leaves_and_comes_back_and_the_master_key_changes(session: Se
 
 @pytest.mark.system
 def test_the_keyring_of_another_user_has_no_entry(session: Session) -> None:
-    said = session.run('attempt(lambda: open_vault(home, store, "keyring", never))')
-    assert said["error"] == "VaultError"
-    assert "no entry" in said["message"]
-    assert "restore" in said["hint"]
+    results = session.run('attempt(lambda: open_vault(home, store, "keyring", never))')
+    assert results["error"] == "VaultError"
+    assert "no entry" in results["message"]
+    assert "restore" in results["hint"]
 
 
 @pytest.mark.system
 def test_a_keyring_that_stays_locked_is_not_taken_and_not_waited_for(session: Session) -> None:
     session.run(MAKE)
-    said = session.run('attempt(lambda: open_vault(home, store, "keyring", never))', password="another password")
-    assert said["error"] == "VaultError"
-    assert "locked" in said["message"]
-    assert "Unlock it" in said["hint"]
+    results = session.run('attempt(lambda: open_vault(home, store, "keyring", never))', password="another password")
+    assert results["error"] == "VaultError"
+    assert "locked" in results["message"]
+    assert "Unlock it" in results["hint"]
     fallen = session.run(
         'vault, why = create_vault(home, "77" * 16, None, ask, costs=THROWAWAY); say(kind=vault.kind, why=why)',
         password="another password",
@@ -328,9 +328,9 @@ def test_a_keyring_that_stays_locked_is_not_taken_and_not_waited_for(session: Se
 
 @pytest.mark.system
 def test_a_secret_service_that_nobody_unlocked_is_locked(session: Session) -> None:
-    said = session.run('attempt(lambda: create_vault(home, store, "keyring", never))', password=None)
-    assert said["error"] in ("VaultError", "KeyringUnavailableError")
-    assert said["hint"]
+    results = session.run('attempt(lambda: create_vault(home, store, "keyring", never))', password=None)
+    assert results["error"] in ("VaultError", "KeyringUnavailableError")
+    assert results["hint"]
 
 
 @pytest.mark.system
@@ -342,18 +342,18 @@ def test_a_bus_without_a_secret_service_has_no_keyring(session: Session) -> None
         '<policy context="default"><allow send_destination="*" eavesdrop="true"/><allow eavesdrop="true"/>'
         '<allow own="*"/></policy></busconfig>'
     )
-    said = session.run(
+    results = session.run(
         'attempt(lambda: create_vault(home, store, "keyring", never))',
         password=None,
         bus=("--config-file", str(config)),
     )
-    assert said["error"] == "KeyringUnavailableError"
-    assert "--keystore file" in said["hint"]
+    assert results["error"] == "KeyringUnavailableError"
+    assert "--keystore file" in results["hint"]
 
 
 @pytest.mark.system
 def test_an_entry_that_is_not_ours_is_damage_and_stays(session: Session) -> None:
-    said = session.run("""
+    results = session.run("""
         import contextlib, io, keyring
         keyring.set_password("teds-provision", f"station/{store}", "something else")
         output = io.StringIO()
@@ -362,14 +362,14 @@ def test_an_entry_that_is_not_ours_is_damage_and_stays(session: Session) -> None
         kept = keyring.get_password("teds-provision", f"station/{store}")
         say(**json.loads(output.getvalue()), kept=kept)
     """)
-    assert said["error"] == "VaultError"
-    assert said["kept"] == "something else"
-    assert "something else" not in said["message"] + said["hint"]
+    assert results["error"] == "VaultError"
+    assert results["kept"] == "something else"
+    assert "something else" not in results["message"] + results["hint"]
 
 
 @pytest.mark.system
 def test_a_service_that_dies_is_a_failure_with_a_cure(session: Session) -> None:
-    said = session.run("""
+    results = session.run("""
         import os, signal, subprocess
         vault, _ = create_vault(home, store, "keyring", never)
         for name in os.listdir("/proc"):
@@ -385,5 +385,5 @@ def test_a_service_that_dies_is_a_failure_with_a_cure(session: Session) -> None:
                     os.kill(int(name), signal.SIGKILL)
         attempt(vault.drop_ca)
     """)
-    assert said["error"] in ("VaultError", "KeyringUnavailableError")
-    assert said["hint"]
+    assert results["error"] in ("VaultError", "KeyringUnavailableError")
+    assert results["hint"]

@@ -108,11 +108,11 @@ class World:
         running = self.stack[-1]
         assert running.locks == 0, f"{running.name} asks {prompt!r} and holds the store"
         new = NEW if self.passphrase == PASSPHRASE else PASSPHRASE
-        said = new if "New passphrase" in prompt else OF_THE_CA if "CA key's file" in prompt else self.passphrase
-        said = PASSPHRASE if "of the backup" in prompt else said
+        answer = new if "New passphrase" in prompt else OF_THE_CA if "CA key's file" in prompt else self.passphrase
+        answer = PASSPHRASE if "of the backup" in prompt else answer
         running.asked.append(prompt)
         running.waits(f"question {len(running.asked)}")
-        return said
+        return answer
 
 
 @pytest.fixture(scope="module")
@@ -167,9 +167,9 @@ def world(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
     forget_vaults()
 
 
-def opened(home: Path, said: str, *, use_agent: bool = True) -> Station:
+def opened(home: Path, message: str, *, use_agent: bool = True) -> Station:
     forget_vaults()
-    station = Station.open(home, ask=lambda prompt, confirm: said)
+    station = Station.open(home, ask=lambda prompt, confirm: message)
     station.use_agent = use_agent
     return station
 

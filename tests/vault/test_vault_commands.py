@@ -30,7 +30,7 @@ NODES = [number.to_bytes(10, "big") for number in range(1, 5)]
 NEW = "four other random words"
 
 
-class Killed(BaseException):
+class KilledError(BaseException):
     """The process died here."""
 
 
@@ -43,7 +43,7 @@ def dying_at(step: int) -> Iterator[list[int]]:
         def run(*args: object, **more: object) -> object:
             count[0] += 1
             if count[0] == step:
-                raise Killed
+                raise KilledError
             return real(*args, **more)
 
         return run
@@ -56,8 +56,8 @@ def dying_at(step: int) -> Iterator[list[int]]:
 
 
 def asking(*answers: str) -> Callable[[str, bool], str]:
-    said = list(answers)
-    return lambda prompt, confirm: said.pop(0)
+    remaining = list(answers)
+    return lambda prompt, confirm: remaining.pop(0)
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_rewrap_cut_at_every_durable_write_loses_no_key(home: Path) -> None:
         with dying_at(step):
             try:
                 rewrap(station)
-            except Killed:
+            except KilledError:
                 came = True
         station.close()
         again = opened(home)
@@ -156,7 +156,7 @@ def test_a_new_passphrase_cut_at_every_durable_write_opens_with_the_old_or_the_n
         with dying_at(step):
             try:
                 vault.new_passphrase(asking(NEW), costs=THROWAWAY)()
-            except Killed:
+            except KilledError:
                 came = True
         fits = []
         for passphrase in (PASSPHRASE, NEW):
@@ -252,7 +252,7 @@ def test_a_process_that_is_handed_the_master_key_loses_no_key_wherever_rewrap_is
             with dying_at(step):
                 try:
                     rewrap(other)
-                except Killed:
+                except KilledError:
                     came = True
             other.close()
             assert keys(long_running) == before, f"cut before durable step {step}"
@@ -329,11 +329,11 @@ def test_what_another_process_did_to_a_tokens_file_is_taken_in(tmp_path: Path, m
     forget_vaults()
     uri, store = loaded(tmp_path, monkeypatch, ("pair",))["pair"], "77" * 16
     try:
-        one, _ = create_vault(tmp_path, store, uri, asking(PIN))
+        vault, _ = create_vault(tmp_path, store, uri, asking(PIN))
         other = Pkcs11Vault.open(tmp_path, store, uri, asking(PIN))
         other.add_master()
-        set_pin = one.new_passphrase(asking(PIN, "654321"))
-        assert one.drop_ca()
+        set_pin = vault.new_passphrase(asking(PIN, "654321"))
+        assert vault.drop_ca()
         assert Pkcs11Vault.open(tmp_path, store, uri, asking(PIN)).masters() == (1, 2)
         late = other.new_passphrase(asking(PIN, "111111"))
         set_pin()
@@ -345,8 +345,8 @@ def test_what_another_process_did_to_a_tokens_file_is_taken_in(tmp_path: Path, m
         assert other.masters() == (2,), "an open session outlasts the PIN that opened it"
         with pytest.raises(VaultChangedError):
             other.add_master()
-        assert one.refresh()
-        assert one.masters() == (2,)
+        assert vault.refresh()
+        assert vault.masters() == (2,)
     finally:
         forget_vaults()
         unload()

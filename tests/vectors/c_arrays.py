@@ -102,12 +102,12 @@ def _kind(value: Any) -> str:
             return "object"
 
 
-def _wider(one: str, other: str) -> str:
+def _wider(first: str, other: str) -> str:
     """The kind that holds both; numbers and objects in the place of one another are told as JSON text."""
-    if one == other:
-        return one
+    if first == other:
+        return first
     numbers = {frozenset(("int", "float")): "float", frozenset(("int", "big")): "big"}
-    return numbers.get(frozenset((one, other)), "text")
+    return numbers.get(frozenset((first, other)), "text")
 
 
 def c_name(text: str) -> str:
@@ -140,8 +140,8 @@ def _type(name: str, shape: Shape, *, pointer: bool = False) -> str:
         return f"const struct {name} *" if pointer else f"struct {name} "
     if shape.kind == "list":
         raise ValueError(f"{name}: a list of lists has no type here")
-    said = _SCALARS.get(shape.kind, "int64_t")
-    return said if said.endswith("*") else f"{said} "
+    c_type = _SCALARS.get(shape.kind, "int64_t")
+    return c_type if c_type.endswith("*") else f"{c_type} "
 
 
 class Constants:
@@ -166,22 +166,23 @@ class Constants:
         for member, inner in shape.members.items():
             if member not in value or value[member] is None:
                 continue
-            said, place = c_name(member), f"{name}_{c_name(member)}"
+            c_member, place = c_name(member), f"{name}_{c_name(member)}"
             if inner.kind == "list":
-                yield f".{said} = {self._list(place, inner, value[member])}, .{said}_count = {len(value[member])}"
+                items = self._list(place, inner, value[member])
+                yield f".{c_member} = {items}, .{c_member}_count = {len(value[member])}"
             elif inner.kind == "object":
-                yield f".{said} = &{self._constant(place, inner, value[member])}"
+                yield f".{c_member} = &{self._constant(place, inner, value[member])}"
             else:
-                yield f".{said} = {self.value(place, inner, value[member])}"
+                yield f".{c_member} = {self.value(place, inner, value[member])}"
 
     def _list(self, name: str, shape: Shape, values: list[Any]) -> str:
         if not values:
             return "NULL"
         item = shape.item or Shape("int")
-        told = ",\n    ".join(self.value(name, item, value) for value in values)
+        items = ",\n    ".join(self.value(name, item, value) for value in values)
         kind = _type(name, item)
         declared = f"{kind}const " if kind.endswith("*") else f"const {kind}"
-        return self._add(f"static {declared}{{name}}[] = {{{{\n    {{told}}\n}}}};", told)
+        return self._add(f"static {declared}{{name}}[] = {{{{\n    {{told}}\n}}}};", items)
 
     def _constant(self, name: str, shape: Shape, value: dict[str, Any]) -> str:
         return self._add(f"static const struct {name} {{name}} = {{told}};", self.value(name, shape, value))
@@ -193,10 +194,10 @@ class Constants:
             self._octets[text] = self._add("static const uint8_t {name}[] = {{\n    {told}\n}};", rows)
         return f"{{{self._octets[text]}, {len(text) // 2}}}"
 
-    def _add(self, form: str, told: str) -> str:
+    def _add(self, form: str, message: str) -> str:
         self._number += 1
         name = f"v{self._number}"
-        self.rows.append(form.format(name=name, told=told))
+        self.rows.append(form.format(name=name, told=message))
         return name
 
 

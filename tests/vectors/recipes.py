@@ -26,7 +26,7 @@ def rotation() -> Iterator[Scene]:
         "keyed",
     )
     agreed = scene.request("A Request needs no session where it is tapped.", one_time="one_time_2")
-    scene.say(agreed.confirm, "The Confirm replaces K in one transaction.")
+    scene.exchange(agreed.confirm, "The Confirm replaces K in one transaction.")
     scene.open("old", "The old key is unknown now: 16.", held=K)
     scene.open("new", "The new key opens.", held=agreed.key)
     scene.sealed("new", IDENTIFY, "Identify in the session says epoch 2.")
@@ -47,7 +47,7 @@ def rotation() -> Iterator[Scene]:
     scene.sealed(
         "old", agreed.confirm, "The inner Confirm; its reply still leaves sealed under the old session.", tapped=False
     )
-    scene.say(
+    scene.exchange(
         scene.sessions["old"][0].seal(IDENTIFY),
         "After that reply every session is over: the outer command gets 2.",
         **CAN,
@@ -66,7 +66,7 @@ def rotation() -> Iterator[Scene]:
         shown=credentials("second_station"),
         one_time="one_time_2",
     )
-    scene.say(agreed.confirm, "P(station) and K are replaced, P(CA) stays, the datasheet stays.")
+    scene.exchange(agreed.confirm, "P(station) and K are replaced, P(CA) stays, the datasheet stays.")
     scene.open("second", "The second station opens.", held=agreed.key)
     scene.sealed("second", IDENTIFY, "Still provisioned, epoch 2, sequence unchanged.")
     yield scene
@@ -80,38 +80,38 @@ def rotation() -> Iterator[Scene]:
     scene.sealed("bus", IDENTIFY, "It is in use.", tapped=False)
     agreed = scene.request("Request by tap.", one_time="one_time_2")
     scene.sealed("bus", IDENTIFY, "A Request alone ends nothing.", tapped=False)
-    scene.say(agreed.confirm, "Confirm by tap.")
-    scene.say(scene.sessions["bus"][0].seal(IDENTIFY), "The session on CAN is over: 2.", **CAN)
+    scene.exchange(agreed.confirm, "Confirm by tap.")
+    scene.exchange(scene.sessions["bus"][0].seal(IDENTIFY), "The session on CAN is over: 2.", **CAN)
     yield scene
 
     scene = Scene("a-new-request-replaces", "A good Request replaces what the one before it left in RAM.")
     first = scene.request("First Request.")
     second = scene.request("Second Request: another one-time key and nonce.", one_time="one_time_2")
-    scene.say(second.confirm, "The Confirm of the second is good.")
-    scene.say(first.confirm, "Nothing is pending any more: 2.")
+    scene.exchange(second.confirm, "The Confirm of the second is good.")
+    scene.exchange(first.confirm, "Nothing is pending any more: 2.")
     yield scene
 
     scene = Scene("a-bad-request-replaces-nothing", "A Request that is refused leaves what a good one before it left.")
     agreed = scene.request("A good Request.")
-    scene.say(changed_request(station_signature=bytes(64)), "A Request with a wrong field 104: 5.")
-    scene.say(agreed.confirm, "The Confirm of the good one still counts.")
+    scene.exchange(changed_request(station_signature=bytes(64)), "A Request with a wrong field 104: 5.")
+    scene.exchange(agreed.confirm, "The Confirm of the good one still counts.")
     yield scene
 
     scene = Scene("wrong-tag", "A Confirm with a wrong tag drops the pending agreement.")
     agreed = scene.request("A good Request.")
     wrong = bytes([agreed.confirm.payload[0] ^ 1]) + agreed.confirm.payload[1:]
-    scene.say(replace(agreed.confirm, payload=wrong), "One bit of tagS is wrong: 12.")
-    scene.say(agreed.confirm, "Too late, nothing is pending: 2.")
+    scene.exchange(replace(agreed.confirm, payload=wrong), "One bit of tagS is wrong: 12.")
+    scene.exchange(agreed.confirm, "Too late, nothing is pending: 2.")
     yield scene
 
     scene = Scene(
         "confirm-length",
         "State goes before length: with nothing pending a Confirm of any length gets 2, with one pending a wrong length gets 4 and leaves it.",
     )
-    scene.say(security_command(Function.CONFIRM, bytes(15)), "Nothing pending, wrong length: 2.")
+    scene.exchange(security_command(Function.CONFIRM, bytes(15)), "Nothing pending, wrong length: 2.")
     agreed = scene.request("A good Request.")
-    scene.say(security_command(Function.CONFIRM, agreed.confirm.payload[:15]), "Pending, wrong length: 4.")
-    scene.say(agreed.confirm, "It was left: good.")
+    scene.exchange(security_command(Function.CONFIRM, agreed.confirm.payload[:15]), "Pending, wrong length: 4.")
+    scene.exchange(agreed.confirm, "It was left: good.")
     yield scene
 
     scene = Scene(
@@ -119,27 +119,29 @@ def rotation() -> Iterator[Scene]:
         "A node without NFC, its bus counted as tapped in factory state: a Confirm comes by the line of its Request.",
     )
     agreed = scene.request("Request from station address F1.", link="can:f1", tapped=True)
-    scene.say(agreed.confirm, "The Confirm from F2: 2, and it is left.", link="can:f2", tapped=True)
-    scene.say(agreed.confirm, "From F1: good.", link="can:f1", tapped=True)
-    scene.say(changed_request(), "The node is keyed now, its bus counts as untapped: 3.", link="can:f1", tapped=False)
+    scene.exchange(agreed.confirm, "The Confirm from F2: 2, and it is left.", link="can:f2", tapped=True)
+    scene.exchange(agreed.confirm, "From F1: good.", link="can:f1", tapped=True)
+    scene.exchange(
+        changed_request(), "The node is keyed now, its bus counts as untapped: 3.", link="can:f1", tapped=False
+    )
     yield scene
 
     scene = Scene("confirm-outside-its-session", "The Request came in a session, so the Confirm must.", "keyed")
     scene.open("old", "Open by NFC.")
     agreed = scene.request("Inner Request.", one_time="one_time_2", session="old")
-    scene.say(agreed.confirm, "A plain Confirm: 2, and it is left.")
+    scene.exchange(agreed.confirm, "A plain Confirm: 2, and it is left.")
     scene.sealed("old", agreed.confirm, "The inner one is good.")
     yield scene
 
     scene = Scene("confirm-too-late", "What a Request left lives 60 s.")
     agreed = scene.request("A good Request.")
-    scene.later(60.0).say(agreed.confirm, "60 s later: 2.")
+    scene.later(60.0).exchange(agreed.confirm, "60 s later: 2.")
     yield scene
 
     scene = Scene("confirm-after-the-field-was-lost", "Loss of the link takes the pending agreement along.")
     agreed = scene.request("A good Request.")
     scene.event("link_lost", "The node leaves the field.", link="nfc")
-    scene.say(agreed.confirm, "Back in the field: 2.")
+    scene.exchange(agreed.confirm, "Back in the field: 2.")
     yield scene
 
     scene = Scene(
@@ -147,14 +149,14 @@ def rotation() -> Iterator[Scene]:
         "Reset ends a pending agreement, in factory state too, where it changes nothing stored.",
     )
     agreed = scene.request("A good Request.")
-    scene.say(security_command(Function.RESET, CHALLENGE), "Reset: the proof, for epoch 0.")
-    scene.say(agreed.confirm, "Nothing is pending: 2.")
+    scene.exchange(security_command(Function.RESET, CHALLENGE), "Reset: the proof, for epoch 0.")
+    scene.exchange(agreed.confirm, "Nothing is pending: 2.")
     yield scene
 
     scene = Scene("confirm-after-a-restart", "The pending agreement lies in RAM only.")
     agreed = scene.request("A good Request.")
     scene.event("restart", "Power off and on.")
-    scene.say(agreed.confirm, "2.")
+    scene.exchange(agreed.confirm, "2.")
     yield scene
 
     scene = Scene(
@@ -162,9 +164,9 @@ def rotation() -> Iterator[Scene]:
     )
     agreed = scene.request("A good Request.")
     scene.event("flash_fails", "The flash refuses to be written.")
-    scene.say(agreed.confirm, "11.")
+    scene.exchange(agreed.confirm, "11.")
     scene.event("flash_works", "It works again.")
-    scene.say(agreed.confirm, "Good. (Our node keeps the pending agreement here; the profile leaves that open.)")
+    scene.exchange(agreed.confirm, "Good. (Our node keeps the pending agreement here; the profile leaves that open.)")
     yield scene
 
 
@@ -181,7 +183,7 @@ def sessions() -> Iterator[Scene]:
     scene.open("a", "Open.")
     scene.sealed("a", IDENTIFY, "Counter 1.")
     scene.sealed("a", security_command(Function.CLOSE), "Close.")
-    scene.say(scene.sessions["a"][0].seal(IDENTIFY), "Counter 3, after the end: outer 2.")
+    scene.exchange(scene.sessions["a"][0].seal(IDENTIFY), "Counter 3, after the end: outer 2.")
     yield scene
 
     yield _open_checks()
@@ -190,7 +192,7 @@ def sessions() -> Iterator[Scene]:
     scene.open("a", "Open.")
     before = bytes.fromhex(scene.steps[-1]["command"])
     scene.event("restart", "Power off and on.")
-    scene.say(before, "The same Open: 12.", crafted=True)
+    scene.exchange(before, "The same Open: 12.", crafted=True)
     scene.open("b", "With the new c.")
     scene.sealed("b", IDENTIFY, "Good.")
     yield scene
@@ -198,7 +200,7 @@ def sessions() -> Iterator[Scene]:
     scene = Scene("half-open-is-replaced", "A new Open replaces the half-open one.", "keyed")
     scene.open("a", "First Open; nothing sealed under it yet.")
     scene.open("b", "Second Open.")
-    scene.say(scene.sessions["a"][0].seal(IDENTIFY), "Sealed under the first: 12.")
+    scene.exchange(scene.sessions["a"][0].seal(IDENTIFY), "Sealed under the first: 12.")
     scene.sealed("b", IDENTIFY, "Sealed under the second: good.")
     yield scene
 
@@ -212,7 +214,7 @@ def sessions() -> Iterator[Scene]:
     scene.open("b", "A second Open on the same link.")
     scene.sealed("a", IDENTIFY, "The first session still serves.")
     scene.sealed("b", IDENTIFY, "First good frame under the second: it takes over.")
-    scene.say(scene.sessions["a"][0].seal(IDENTIFY), "The first is gone: 12.")
+    scene.exchange(scene.sessions["a"][0].seal(IDENTIFY), "The first is gone: 12.")
     yield scene
 
     scene = Scene("half-open-dies-after-60-s", "A half-open Open lives 60 s.", "keyed")
@@ -220,7 +222,7 @@ def sessions() -> Iterator[Scene]:
     scene.later(59.0).open("b", "59 s later, another.")
     scene.later(59.0).sealed("b", IDENTIFY, "59 s after its Open: good.")
     scene.open("c", "A third Open beside the session.")
-    scene.later(60.0).say(
+    scene.later(60.0).exchange(
         scene.sessions["c"][0].seal(IDENTIFY), "60 s later it is gone; the session is not its own: 12."
     )
     yield scene
@@ -229,7 +231,7 @@ def sessions() -> Iterator[Scene]:
     scene.open("a", "Open.")
     scene.sealed("a", IDENTIFY, "Good.")
     scene.later(599.0).sealed("a", IDENTIFY, "599 s later: good.")
-    scene.later(600.0).say(scene.sessions["a"][0].seal(IDENTIFY), "600 s later: no session, outer 2.")
+    scene.later(600.0).exchange(scene.sessions["a"][0].seal(IDENTIFY), "600 s later: no session, outer 2.")
     yield scene
 
     scene = Scene(
@@ -258,7 +260,7 @@ def sessions() -> Iterator[Scene]:
     scene.sealed("nfc", IDENTIFY, "Good.")
     scene.sealed("bus", IDENTIFY, "Good.", tapped=False)
     scene.event("link_lost", "The field goes.", link="nfc")
-    scene.say(scene.sessions["nfc"][0].seal(IDENTIFY), "By NFC: outer 2.")
+    scene.exchange(scene.sessions["nfc"][0].seal(IDENTIFY), "By NFC: outer 2.")
     scene.sealed("bus", IDENTIFY, "By CAN: good.", tapped=False)
     yield scene
 
@@ -298,13 +300,13 @@ def _open_checks() -> Scene:
     )
     off_curve = bytes([4]) + bytes(31) + b"\x01" + bytes(31) + b"\x01"
     empty, good = security_command(Function.OPEN), key("one_time_2").point
-    scene.say(empty, "Without payload: c.")
-    scene.say(empty, "Asking changes nothing: the same c.")
+    scene.exchange(empty, "Without payload: c.")
+    scene.exchange(empty, "Asking changes nothing: the same c.")
     for size in (1, 8, 24, 88, 90):
-        scene.say(security_command(Function.OPEN, bytes(size)), f"{size} octets: 4.")
-    scene.say(security_command(Function.OPEN, bytes(89)), "A keyId that is not the key's: 16.")
-    scene.say(security_command(Function.OPEN, key_id(K) + good + bytes(16)), "A wrong mac: 12, and c stands.")
-    scene.say(
+        scene.exchange(security_command(Function.OPEN, bytes(size)), f"{size} octets: 4.")
+    scene.exchange(security_command(Function.OPEN, bytes(89)), "A keyId that is not the key's: 16.")
+    scene.exchange(security_command(Function.OPEN, key_id(K) + good + bytes(16)), "A wrong mac: 12, and c stands.")
+    scene.exchange(
         security_command(Function.OPEN, key_id(K) + off_curve + bytes(16)),
         "A wrong mac over no point: 12 goes before 15.",
     )
@@ -317,7 +319,7 @@ def _open_checks() -> Scene:
     scene.crafted_open("The mac of the c before: 12.", ahead=-1)
     scene.open("a", "A good Open.")
     again = bytes.fromhex(scene.steps[-1]["command"])
-    scene.say(again, "The same Open again: 12; the half-open one stands.", crafted=True)
+    scene.exchange(again, "The same Open again: 12; the half-open one stands.", crafted=True)
     scene.sealed("a", IDENTIFY, "Counter 1.")
     return scene
 
@@ -356,7 +358,7 @@ def _bad_frames() -> Scene:
             "A block of padding alone: well sealed, an inner frame of no octets: inner 4. It uses up counter 2.",
         ),
     ]:
-        scene.say(command, note, crafted=True)
+        scene.exchange(command, note, crafted=True)
     scene.crafted("a", 3, IDENTIFY, "Counter 3: the session was never harmed.")
     return scene
 

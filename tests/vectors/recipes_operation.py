@@ -62,7 +62,7 @@ class OperationScene:
         self.bench.tim._sessions._opens = int.from_bytes(octets(name, "c")[:8], "big")
         for link in links or (F1,):
             self.open(link)
-        self.told = len(self.bench.hardware.log)
+        self.logged = len(self.bench.hardware.log)
 
     def open(self, link: str) -> None:
         """Open a session on a link, with one-time keys that follow from the entry's name."""
@@ -73,10 +73,16 @@ class OperationScene:
         counter = self.bench.plain(session.request_counter(), link).payload
         session.accept(self.bench.plain(session.open(counter), link).payload)
         self.bench.sessions[link] = session
-        told = {"link": link, "K": K.hex(), "Es": station.secret().hex(), "En": node.secret().hex(), "c": counter.hex()}
-        self.sessions.append({**told, "k_m": session.message_key.hex()})
+        record = {
+            "link": link,
+            "K": K.hex(),
+            "Es": station.secret().hex(),
+            "En": node.secret().hex(),
+            "c": counter.hex(),
+        }
+        self.sessions.append({**record, "k_m": session.message_key.hex()})
 
-    def say(self, command: Command, note: str, link: str = F1, *, plain: bool = False) -> OperationScene:
+    def exchange(self, command: Command, note: str, link: str = F1, *, plain: bool = False) -> OperationScene:
         """A command and its reply: an inner one of this link's session, or a plain one."""
         reply = self.bench.plain(command, link) if plain else self.bench.send(command, link)
         step = {"at": self.bench.hardware.tick, "link": link, "note": note, "plain": plain}
@@ -89,7 +95,7 @@ class OperationScene:
     def rows(self, rows: list[tuple[Command, str]], link: str = F1) -> OperationScene:
         """Several."""
         for command, note in rows:
-            self.say(command, note, link)
+            self.exchange(command, note, link)
         return self
 
     def until(self, tick: int, note: str = "") -> OperationScene:
@@ -132,8 +138,8 @@ class OperationScene:
 
     def _add(self, step: dict[str, Any]) -> None:
         log = self.bench.hardware.log
-        done = [{"apply": value} if what == "apply" else {what: value} for what, value in log[self.told :]]
-        self.told = len(log)
+        done = [{"apply": value} if what == "apply" else {what: value} for what, value in log[self.logged :]]
+        self.logged = len(log)
         self.steps.append(step | ({"hardware": done} if done else {}))
 
     def entry(self) -> dict[str, Any]:
@@ -291,9 +297,9 @@ def _checks_of_streams() -> Iterator[OperationScene]:
 def _lives() -> Iterator[OperationScene]:
     scene = OperationScene("dead-man", "A dead-man lives by values for its channel alone.")
     scene.rows([(operate(4, dead_man=200), "Dead-man 200 ms."), (operate(6, dead_man=200), "The other one.")])
-    scene.say(write_data_set(4, VALUE), "A value for 4.")
-    scene.later(150 * MS).say(write_data_set(4, VALUE), "Another one; none for 6.").later(50 * MS, "6 goes safe.")
-    scene.say(OPERATION, "Bit 5 of 6.").later(140 * MS).say(CLOCK, "A keep-alive is no value.").later(
+    scene.exchange(write_data_set(4, VALUE), "A value for 4.")
+    scene.later(150 * MS).exchange(write_data_set(4, VALUE), "Another one; none for 6.").later(50 * MS, "6 goes safe.")
+    scene.exchange(OPERATION, "Bit 5 of 6.").later(140 * MS).exchange(CLOCK, "A keep-alive is no value.").later(
         10 * MS, "4 goes safe."
     )
     yield scene.rows(
@@ -308,8 +314,8 @@ def _lives() -> Iterator[OperationScene]:
         "lease", "A lease lives by any good Sealed frame; the claims end with it, the session does not."
     )
     scene.rows([(operate(1, lease=60), "60 s."), (operate(2, lease=1), "The last Operate's counts: 1 s for both.")])
-    scene.later(999 * MS).say(read_data_set(9), "Refused, and a sign of life all the same.")
-    scene.later(999 * MS).say(sample([1, 2]), "Still claimed.").later(1 * SECOND, "Silence for 1 s.")
+    scene.later(999 * MS).exchange(read_data_set(9), "Refused, and a sign of life all the same.")
+    scene.later(999 * MS).exchange(sample([1, 2]), "Still claimed.").later(1 * SECOND, "Silence for 1 s.")
     yield scene.rows([(sample([1]), "2."), (OPERATION, "Nothing is claimed.")])
 
 
@@ -318,36 +324,38 @@ def _several() -> Iterator[OperationScene]:
         "under-a-claim", "1.3, 1.4 and 128.10 while a session claims: 2 in one that claims, else 17.", F1, F2, NFC
     )
     write, address = write_teds(1, 12, 0, b"x"), security_command(Function.SET_CAN_ADDRESS, b"\x21")
-    scene.say(operate(1), "F1 claims a sensor.")
+    scene.exchange(operate(1), "F1 claims a sensor.")
     for command, words in ((write, "Write"), (update_teds(1, 12), "Update"), (address, "Set CAN address")):
-        scene.say(command, f"{words}, its own claim: 2.").say(command, f"{words}, another's: 17.", F2)
-    scene.say(address, "Plain and tapped: 17.", NFC, plain=True)
-    scene.say(write, "A Write over NFC ends the claims of others on sensors.", NFC).say(
+        scene.exchange(command, f"{words}, its own claim: 2.").exchange(command, f"{words}, another's: 17.", F2)
+    scene.exchange(address, "Plain and tapped: 17.", NFC, plain=True)
+    scene.exchange(write, "A Write over NFC ends the claims of others on sensors.", NFC).exchange(
         OPERATION, "Nothing is claimed."
     )
-    scene.say(operate(4, dead_man=10_000), "F1 claims an actuator.")
-    yield scene.say(write, "Now a Write over NFC gets 17 too.", NFC)
+    scene.exchange(operate(4, dead_man=10_000), "F1 claims an actuator.")
+    yield scene.exchange(write, "Now a Write over NFC gets 17 too.", NFC)
 
     scene = OperationScene(
         "strangers", "No stranger stops a motor: a node that takes long for a point operation.", quick_points=False
     )
     read = read_teds(0, 128, 0)
-    scene.say(PROVE, "Prove, nothing claimed: good.", plain=True).say(operate(4, dead_man=10_000), "An actuator.")
-    scene.say(PROVE, "Plain Prove: 17.", plain=True).say(PROVE, "In the session: good.")
-    scene.say(security_command(Function.OPEN, bytes(89)), "The long form of a plain Open: 17.", F2, plain=True)
-    scene.say(operate(1), "A sensor.").say(subscribe(), "A stream.")
-    scene.say(read, "Plain Read: good.", plain=True).say(
+    scene.exchange(PROVE, "Prove, nothing claimed: good.", plain=True).exchange(
+        operate(4, dead_man=10_000), "An actuator."
+    )
+    scene.exchange(PROVE, "Plain Prove: 17.", plain=True).exchange(PROVE, "In the session: good.")
+    scene.exchange(security_command(Function.OPEN, bytes(89)), "The long form of a plain Open: 17.", F2, plain=True)
+    scene.exchange(operate(1), "A sensor.").exchange(subscribe(), "A stream.")
+    scene.exchange(read, "Plain Read: good.", plain=True).exchange(
         security_command(Function.LIST), "List within a second: 17.", NFC, plain=True
     )
-    yield scene.later(1 * SECOND).say(read, "A second later: good.", F2, plain=True)
+    yield scene.later(1 * SECOND).exchange(read, "A second later: good.", F2, plain=True)
 
 
 def _streams() -> Iterator[OperationScene]:
     scene = OperationScene("two-streams", "Two streams on one bus: 700 µs apart, the shorter n · period first.")
     start = scene.bench.hardware.tick + 20 * MS
-    scene.say(operate(0), "All sensors.")
-    scene.say(subscribe(n=4, gap=300, start=start, channels=(1, 3)), "Stream 0: four samples of 1 and 3.")
-    scene.say(
+    scene.exchange(operate(0), "All sensors.")
+    scene.exchange(subscribe(n=4, gap=300, start=start, channels=(1, 3)), "Stream 0: four samples of 1 and 3.")
+    scene.exchange(
         subscribe(stream=1, n=1, period=30 * MS, gap=700, start=start, channels=(2,)), "Stream 1: one sample of 2."
     )
     scene.until(start + 65 * MS, "Frames; then message 2 of stream 1 is full.")
@@ -355,12 +363,12 @@ def _streams() -> Iterator[OperationScene]:
 
     scene = OperationScene("taken-back", "Frames not yet sent are taken back at every end.")
     start = scene.bench.hardware.tick + 20 * MS
-    scene.say(operate(1), "Sensor 1.").say(
+    scene.exchange(operate(1), "Sensor 1.").exchange(
         subscribe(n=25, period=1 * MS, gap=2000, start=start), "Eight frames, 2 ms apart."
     )
     yield (
         scene.until(start + 29 * MS, "Three frames.")
-        .say(stop(0), "The counter says that one was full.")
+        .exchange(stop(0), "The counter says that one was full.")
         .later(50 * MS, "Nothing more.")
     )
 
@@ -368,7 +376,7 @@ def _streams() -> Iterator[OperationScene]:
         "events", "Events before the start do not count; those sooner than the period count and are dropped."
     )
     start = scene.bench.hardware.tick + 20 * MS
-    scene.say(operate(5), "The event sensor.").say(
+    scene.exchange(operate(5), "The event sensor.").exchange(
         subscribe(kind=StreamKind.EVENT, n=1, period=20 * MS, start=start, channels=(5,)), "Subscribe."
     )
     for after, note in (
@@ -378,12 +386,12 @@ def _streams() -> Iterator[OperationScene]:
         (20, "Counter 2."),
     ):
         scene.until(start + after * MS).event(5, bytes([50 + after]), note)
-    yield scene.later(5 * MS).say(stop(0), "3.")
+    yield scene.later(5 * MS).exchange(stop(0), "3.")
 
     scene = OperationScene("replaced", "A half-open Open ends nothing; its first good frame ends claims and streams.")
-    scene.say(operate(1), "Sensor 1.").say(subscribe(n=1, period=20 * MS), "Subscribe.")
+    scene.exchange(operate(1), "Sensor 1.").exchange(subscribe(n=1, period=20 * MS), "Subscribe.")
     scene.later(45 * MS).open(F1)
-    scene.later(20 * MS, "The stream goes on.").say(OPERATION, "The first good frame of the new session.")
+    scene.later(20 * MS, "The stream goes on.").exchange(OPERATION, "The first good frame of the new session.")
     yield scene.later(50 * MS, "Nothing more.")
 
 
@@ -392,30 +400,32 @@ def _triggers() -> Iterator[OperationScene]:
     scene = OperationScene(
         "trigger", "A trigger: the mark, the start of streams that wait, once, for its life.", F1, F2
     )
-    scene.say(operate(1), "Sensor 1.").say(subscribe(start=WAITS), "A stream that waits.")
-    scene.say(token.arm(Action.START, 10).command(), "Arm, start.").say(CLOCK, "No mark.").later(5 * MS)
+    scene.exchange(operate(1), "Sensor 1.").exchange(subscribe(start=WAITS), "A stream that waits.")
+    scene.exchange(token.arm(Action.START, 10).command(), "Arm, start.").exchange(CLOCK, "No mark.").later(5 * MS)
     scene.trigger(other.octets, "A wrong T changes nothing.").trigger(token.octets, "Another station's frame.", F2)
-    scene.say(CLOCK, "No mark.").trigger(token.octets, "The right one.").say(CLOCK, "The mark.")
-    scene.later(45 * MS, "The stream began 10 ms after the mark.").trigger(token.octets, "Used up.").say(
+    scene.exchange(CLOCK, "No mark.").trigger(token.octets, "The right one.").exchange(CLOCK, "The mark.")
+    scene.later(45 * MS, "The stream began 10 ms after the mark.").trigger(token.octets, "Used up.").exchange(
         CLOCK, "The mark stands."
     )
-    scene.say(other.arm(Action.MARK, 1).command(), "Arm, mark, for 1 s.").later(1 * SECOND)
-    scene.trigger(other.octets, "Too late.").say(CLOCK, "The mark stands.")
-    scene.say(last.arm(Action.MARK, 10).command(), "Arm once more.").say(
+    scene.exchange(other.arm(Action.MARK, 1).command(), "Arm, mark, for 1 s.").later(1 * SECOND)
+    scene.trigger(other.octets, "Too late.").exchange(CLOCK, "The mark stands.")
+    scene.exchange(last.arm(Action.MARK, 10).command(), "Arm once more.").exchange(
         idle(), "The last claim goes, and what is armed."
     )
-    yield scene.trigger(last.octets, "Nothing.").say(CLOCK, "The mark stands.")
+    yield scene.trigger(last.octets, "Nothing.").exchange(CLOCK, "The mark stands.")
 
     scene = OperationScene("trigger-stop", "A trigger that stops: every actuator of its session goes safe.", F1, F2)
-    scene.say(operate(4, dead_man=10_000), "F1 claims 4.").say(operate(6, dead_man=10_000), "F2 claims 6.", F2)
-    scene.say(write_data_set(4, VALUE), "A value.").say(write_data_set(6, VALUE), "A value.", F2)
-    scene.say(token.arm(Action.STOP, 10).command(), "Arm, stop.").trigger(token.octets, "4 goes safe.")
-    yield scene.say(OPERATION, "Bit 5 of 4; 6 goes on.")
+    scene.exchange(operate(4, dead_man=10_000), "F1 claims 4.").exchange(
+        operate(6, dead_man=10_000), "F2 claims 6.", F2
+    )
+    scene.exchange(write_data_set(4, VALUE), "A value.").exchange(write_data_set(6, VALUE), "A value.", F2)
+    scene.exchange(token.arm(Action.STOP, 10).command(), "Arm, stop.").trigger(token.octets, "4 goes safe.")
+    yield scene.exchange(OPERATION, "Bit 5 of 4; 6 goes on.")
 
 
 def _drives() -> Iterator[OperationScene]:
     scene = OperationScene("drive", "Drive messages: which move and which do not.")
-    scene.say(operate(4, dead_man=500), "Actuator 4.").say(operate(6, dead_man=800), "Actuator 6.").say(
+    scene.exchange(operate(4, dead_man=500), "Actuator 4.").exchange(operate(6, dead_man=800), "Actuator 6.").exchange(
         drive([4, 6]), "Drive."
     )
     reply = DriveReply.decode(bytes.fromhex(scene.steps[-1]["reply"])[3:])
@@ -428,13 +438,13 @@ def _drives() -> Iterator[OperationScene]:
 
     first, held = message(1000, 1001), message(2000, 2001, hold=20)
     scene.message(first, "Counter 0: good.").message(first, "Again: nothing.")
-    scene.message(first[:-1] + bytes([first[-1] ^ 1]), "A bad tag: nothing.").say(CLOCK, "last 0.")
-    scene.later(21 * MS).message(held, "Counter 1, its until is past: nothing.").say(CLOCK, "last 1 all the same.")
+    scene.message(first[:-1] + bytes([first[-1] ^ 1]), "A bad tag: nothing.").exchange(CLOCK, "last 0.")
+    scene.later(21 * MS).message(held, "Counter 1, its until is past: nothing.").exchange(CLOCK, "last 1 all the same.")
     scene.message(message(3000, 3001, ahead=2), "until 502 ms ahead, the smallest dead-man is 500: nothing.")
     scene.message(message(3000, HIGH + 1), "One value that the hardware does not bear: nothing.")
-    scene.message(message(1500, 1501), "Good.").say(read_data_set(6), "1501.")
+    scene.message(message(1500, 1501), "Good.").exchange(read_data_set(6), "1501.")
     scene.later(499 * MS, "Nothing yet.").later(1 * MS, "4 goes safe, Drive ends; 6 goes on.")
-    scene.message(message(1600, 1601), "Nothing.").say(OPERATION, "Operation.")
+    scene.message(message(1600, 1601), "Nothing.").exchange(OPERATION, "Operation.")
     yield scene.later(300 * MS, "6 goes safe.")
 
 

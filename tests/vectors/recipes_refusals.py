@@ -40,7 +40,7 @@ def refusals() -> Iterator[Scene]:
         (bytes.fromhex("00000102000180"), "Read without an offset."),
         (bytes.fromhex("000080050001"), "A plain Close is not permitted: 3 goes before 4."),
     ]:
-        scene.say(octets, note)
+        scene.exchange(octets, note)
     yield scene
 
     scene = Scene(
@@ -72,13 +72,13 @@ def refusals() -> Iterator[Scene]:
         (query_teds(256, 3), "Channel 256: 18."),
         (query_teds(0xFFFF, 1), "Every channel at once: 18."),
     ]:
-        scene.say(command, note)
+        scene.exchange(command, note)
     yield scene
 
     scene = Scene("flash-fails", "A command whose transaction fails gets 11 and changes nothing.")
     scene.event("flash_fails", "The flash refuses to be written.")
-    scene.say(security_command(Function.SET_CAN_ADDRESS, b"\x21"), "11.")
-    scene.say(IDENTIFY, "The old address stands.")
+    scene.exchange(security_command(Function.SET_CAN_ADDRESS, b"\x21"), "11.")
+    scene.exchange(IDENTIFY, "The old address stands.")
     yield scene
 
 
@@ -111,7 +111,7 @@ def _state_table(state: str, tapped: bool) -> Scene:
         (security_command(Function.RESET, CHALLENGE), "Reset"),
     ]
     for command, note in commands:
-        reply = scene.say(command, note, link="nfc" if tapped else "can:f1")
+        reply = scene.exchange(command, note, link="nfc" if tapped else "can:f1")
         scene.steps[-1]["note"] += ": refused." if not reply.ok else ": yes."
     return scene
 
@@ -144,10 +144,10 @@ def _requests() -> Iterator[Scene]:
         (changed_request(station=key("second_station").point), "Field 104 over another station's key: 5.", {}),
     ]  # fmt: skip
     for command, note, more in cases:
-        scene.say(command, note, **more)
+        scene.exchange(command, note, **more)
     yield scene
     scene = Scene("last-epoch", "A node at epoch 2^32 - 1 cannot go on: our node refuses with 8.", epoch=0xFFFFFFFF)
-    scene.say(good, "8.")
+    scene.exchange(good, "8.")
     yield scene
 
 

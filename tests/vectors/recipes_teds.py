@@ -280,7 +280,7 @@ def _staging() -> Iterator[Scene]:
     scene.sealed("a", write_teds(*SECURITY, 0, bytes(459)), "459 octets: taken; the sealed frame has 506.")
     scene.sealed("a", write_teds(*SECURITY, 459, bytes(441)), "900 octets in all: taken.")
     scene.sealed("a", write_teds(*SECURITY, 900, b"x"), "One more: 10, and the staged ones stay.")
-    scene.say(write_teds(*SECURITY, 0, bytes(502)).encode(), "A frame of 513 octets, plain: 10 goes before 3.")
+    scene.exchange(write_teds(*SECURITY, 0, bytes(502)).encode(), "A frame of 513 octets, plain: 10 goes before 3.")
     yield scene
 
     scene = Scene(
@@ -401,16 +401,16 @@ def reset() -> Iterator[Scene]:
         security_command(Function.RESET, CHALLENGE),
         "The proof; K, CA, station and staging are erased before it leaves.",
     )
-    scene.say(scene.sessions["a"][0].seal(IDENTIFY), "Every session is over: outer 2.")
-    scene.say(IDENTIFY, "Factory; epoch and sequence stay.")
-    scene.say(
+    scene.exchange(scene.sessions["a"][0].seal(IDENTIFY), "Every session is over: outer 2.")
+    scene.exchange(IDENTIFY, "Factory; epoch and sequence stay.")
+    scene.exchange(
         security_command(Function.RESET, CHALLENGE),
         "The lost receipt, fetched again: a proof of the same statement (the same octets where the node signs deterministically).",
         link="can:f1",
     )
-    scene.say(security_command(Function.RESET, fresh), "Another challenge, another proof; nothing changes.")
-    scene.say(security_command(Function.LIST), "The other TEDS stay, unsigned.")
-    scene.say(read_teds(*SECURITY, 0), "The initial Security TEDS again, with sequence 1 and epoch 1.")
+    scene.exchange(security_command(Function.RESET, fresh), "Another challenge, another proof; nothing changes.")
+    scene.exchange(security_command(Function.LIST), "The other TEDS stay, unsigned.")
+    scene.exchange(read_teds(*SECURITY, 0), "The initial Security TEDS again, with sequence 1 and epoch 1.")
     yield scene
 
     scene = Scene(
@@ -419,11 +419,11 @@ def reset() -> Iterator[Scene]:
         "provisioned",
     )
     scene.event("reset_by_hand", "Button held 5 s.")
-    scene.say(IDENTIFY, "Factory.")
+    scene.exchange(IDENTIFY, "Factory.")
     agreed = scene.request(
         "A station of another CA.", shown=credentials("foreign_station", "foreign_ca"), one_time="one_time_3"
     )
-    scene.say(agreed.confirm, "Epoch 2; the node keeps the other CA now.")
+    scene.exchange(agreed.confirm, "Epoch 2; the node keeps the other CA now.")
     scene.open("a", "Open under the new key.", held=agreed.key)
     scene.sealed("a", read_teds(*SECURITY, 0), "Still the initial Security TEDS, now with epoch 2.")
     teds = signed(station="foreign_station", ca="foreign_ca", sequence=2, key_epoch=2)
@@ -432,7 +432,7 @@ def reset() -> Iterator[Scene]:
     yield scene
 
     scene = Scene("plain-on-a-keyed-node", "Outside a session only a node in factory state gives a proof.", "keyed")
-    scene.say(security_command(Function.RESET, CHALLENGE), "3, tapped or not.")
+    scene.exchange(security_command(Function.RESET, CHALLENGE), "3, tapped or not.")
     yield scene
 
     scene = Scene("flash-fails", "A reset whose transaction fails gives no proof.", "keyed")

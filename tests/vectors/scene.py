@@ -176,7 +176,7 @@ class Scene:
             case _:
                 self.memory.fail = event == "flash_fails"
 
-    def say(
+    def exchange(
         self, frame: Command | bytes, note: str, *, link: str = "nfc", tapped: bool | None = None, **more: Any
     ) -> Reply:
         """Run one command frame and write it down."""
@@ -207,7 +207,7 @@ class Scene:
         agreement = StationAgreement(shown or credentials(), UUID, one_time=key(one_time))
         station = {"agreement": {"one_time": one_time, "epoch_held": self.memory.state.epoch}}
         if session is None:
-            reply = self.say(agreement.request(), note, **station, **more)
+            reply = self.exchange(agreement.request(), note, **station, **more)
         else:
             reply = self.sealed(session, agreement.request(), note, **station, **more)
         held, pinned = self.memory.state, fingerprint(key("node").point)
@@ -224,9 +224,9 @@ class Scene:
         """Open under a link key; ``label`` names the session for later steps."""
         one_time = named_key(self.name, len(self.steps), "Es")
         session = StationSession(held, UUID, one_time=one_time)
-        counter = self.say(session.request_counter(), "Open without payload asks for c.", **more).payload
-        told = {"session": label, "K": held.hex(), "Es": one_time.secret().hex(), "c": counter.hex()}
-        reply = self.say(session.open(counter), note, open=told, **more)
+        counter = self.exchange(session.request_counter(), "Open without payload asks for c.", **more).payload
+        record = {"session": label, "K": held.hex(), "Es": one_time.secret().hex(), "c": counter.hex()}
+        reply = self.exchange(session.open(counter), note, open=record, **more)
         if reply.ok:
             session.accept(reply.payload)
             node = reply.payload[:65]
@@ -241,16 +241,18 @@ class Scene:
 
     def crafted_open(self, note: str, *, ahead: int = 0, point: bytes | None = None, held: bytes = K) -> Reply:
         """An Open whose mac is right for the node's c plus ``ahead``, with any point as Es."""
-        counter = self.say(StationSession(held, UUID).request_counter(), "Open without payload asks for c.").payload
+        counter = self.exchange(
+            StationSession(held, UUID).request_counter(), "Open without payload asks for c."
+        ).payload
         used = ((int.from_bytes(counter, "big") + ahead) % (1 << 64)).to_bytes(8, "big")
         station = named_key(self.name, len(self.steps), "Es").point if point is None else point
         payload = key_id(held) + station + open_mac(held, UUID, used, station)
-        return self.say(security_command(Function.OPEN, payload), note, crafted=True)
+        return self.exchange(security_command(Function.OPEN, payload), note, crafted=True)
 
     def sealed(self, label: str, command: Command, note: str, **more: Any) -> Reply:
         """One inner command under the session's next counter."""
         session, _, link = self.sessions[label]
-        outer = self.say(session.seal(command), note, **{"link": link} | more)
+        outer = self.exchange(session.seal(command), note, **{"link": link} | more)
         self.steps[-1]["inner"] = {"session": label, "command": command.encode().hex()}
         if not outer.ok:
             return outer
@@ -264,7 +266,7 @@ class Scene:
         """A sealed frame under any counter, which no good station would send."""
         _, derived, link = self.sessions[label]
         payload = _seal(derived.to_node, counter, command.encode())
-        return self.say(security_command(Function.SEALED, payload), note, link=link, crafted=True)
+        return self.exchange(security_command(Function.SEALED, payload), note, link=link, crafted=True)
 
     # -- the entry -------------------------------------------------------------------------------------------------
 

@@ -58,7 +58,7 @@ def octets(value: str | None) -> str:
     return "-" if value is None else f"h{value}"
 
 
-def told(step: dict[str, Any]) -> str:
+def description(step: dict[str, Any]) -> str:
     inner = step.get("inner") or {}
     parts = [str(step.get("event") or "-"), *(octets(step.get(name)) for name in ("command", "reply", "nonceN"))]
     return " ".join([*parts, str(step.get("reason") or 0), octets(inner.get("command"))])
@@ -77,7 +77,7 @@ def test_the_vectors_say_the_same_in_c(tmp_path: Path) -> None:
     due = []
     for stem in TRANSCRIPTS:
         for entry in json.loads((PROFILE / f"{stem}.json").read_text())["entries"]:
-            due += [entry["name"], *map(told, entry["steps"])]
+            due += [entry["name"], *map(description, entry["steps"])]
     assert shown == [*due, octets(json.loads((PROFILE / "kat.json").read_text())["uuid"])]
 
 

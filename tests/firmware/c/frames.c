@@ -963,7 +963,7 @@ static void a_board_that_cannot_be_is_told_at_the_start(void)
         uint32_t slot, identity;
         bool antenna;
         uint16_t ndef;
-        int said;
+        int result;
     } rows[] = {
         {8, good.slot_octets, 192, true, 0, 0},         {0, good.slot_octets, 256, false, 0, TEDS_E_USAGE},
         {33, good.slot_octets, 256, false, 0, TEDS_E_USAGE}, {12, good.slot_octets, 256, false, 0, TEDS_E_USAGE},
@@ -977,7 +977,7 @@ static void a_board_that_cannot_be_is_told_at_the_start(void)
         board->port.identity_octets = rows[i].identity;
         board->config.nfc.present = rows[i].antenna;
         board->config.nfc.max_ndef = rows[i].ndef;
-        CHECK(memory_start(board) == rows[i].said, "row %u", (unsigned)i);
+        CHECK(memory_start(board) == rows[i].result, "row %u", (unsigned)i);
     }
     memory_free(board);
 }

@@ -282,13 +282,13 @@ static bool ask_fault(void *user, uint8_t channel)
 
 static void ask_power(void *user, teds_power *out)
 {
-    uint8_t said[7] = {0};
-    (void)ask(user, 'p', 0, 0, said, sizeof said);
-    out->flags = said[0];
-    out->level = said[1];
-    out->voltage = teds_get16(said + 2);
-    out->current = (int16_t)teds_get16(said + 4);
-    out->temperature = (int8_t)said[6];
+    uint8_t power[7] = {0};
+    (void)ask(user, 'p', 0, 0, power, sizeof power);
+    out->flags = power[0];
+    out->level = power[1];
+    out->voltage = teds_get16(power + 2);
+    out->current = (int16_t)teds_get16(power + 4);
+    out->temperature = (int8_t)power[6];
 }
 
 void memory_hook_up(memory_board *board, memory_hook hook)

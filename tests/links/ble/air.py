@@ -51,7 +51,7 @@ class Air(LocalLink):
         super().send_acl_data(sender, destination, transport, data)
 
 
-class Cut(Peripheral):
+class CutPeripheral(Peripheral):
     """Loses its connection after so many pieces that were written, and may be mute."""
 
     cut_after: int | None = None
@@ -71,7 +71,7 @@ class Cut(Peripheral):
             asyncio.get_running_loop().create_task(self._drop(line))
 
 
-class Stranger:
+class OtherConnection:
     """A connection that is none of the station's."""
 
     def __init__(self, connection: Any) -> None:
@@ -79,7 +79,7 @@ class Stranger:
         connection.on("disconnection", lambda _reason: setattr(self, "is_gone", True))
 
 
-class Everything:
+class BleScene:
     """Nodes, radio and Bluetooth of one test."""
 
     def __init__(self) -> None:
@@ -89,7 +89,7 @@ class Everything:
         self.pulse = RealtimeLoop()
         self.bluez: Any = None
         self.keep: list[Any] = []
-        self.strangers: list[Stranger] = []
+        self.strangers: list[OtherConnection] = []
         self.stranger_seconds = 10.0
 
     async def open(self, config: dict[str, Any]) -> None:
@@ -123,7 +123,7 @@ class Everything:
 
         node = VirtualNode(folder, exclusive=True, board=board, pulse=self.pulse)
         address = StaticAddress(folder, factory=node.in_factory_state())
-        peripheral = Cut(node, address, stranger_seconds=self.stranger_seconds)
+        peripheral = CutPeripheral(node, address, stranger_seconds=self.stranger_seconds)
         await peripheral.power_on(self.host(f"N{number}", f"00:D8:57:00:{number >> 8:02X}:{number & 255:02X}"))
         loop = asyncio.get_running_loop()
 
@@ -178,7 +178,7 @@ class Everything:
         device = Device(name="stranger", host=self.host(f"S{len(self.strangers)}"))
         await device.power_on()
         address = Address(self.nodes[number]._address.address.text, Address.RANDOM_DEVICE_ADDRESS)
-        self.strangers.append(Stranger(await device.connect(address, timeout=10)))
+        self.strangers.append(OtherConnection(await device.connect(address, timeout=10)))
 
     async def access(self, number: int, kind: str, uuid: str) -> int | None:
         """Somebody reads or writes a characteristic of a node: the error that comes back, None for none in 5 s."""
@@ -219,7 +219,7 @@ async def main() -> None:
     lines = asyncio.StreamReader()
     source = open(int(sys.argv[1])) if sys.argv[1:] else sys.stdin  # noqa: SIM115  until the process ends
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), source)
-    everything = Everything()
+    everything = BleScene()
     await everything.open(json.loads(await lines.readline()))
     print(json.dumps({"nodes": [node._address.address.text for node in everything.nodes]}), flush=True)
     while line := await lines.readline():

@@ -17,7 +17,7 @@ from typing import Any, TextIO
 
 import pytest
 
-from tests.zygote import FIRST_FD, Forked, Zygote
+from tests.zygote import FIRST_FD, ForkedProcess, Zygote
 
 ROOT = Path(__file__).resolve().parents[3]
 CONFIG = """<!DOCTYPE busconfig PUBLIC "-//freedesktop//DTD D-Bus Bus Configuration 1.0//EN"
@@ -33,7 +33,7 @@ AIR = "tests.links.ble.air"
 
 
 @dataclass
-class AirProcess(Forked):
+class AirProcess(ForkedProcess):
     """The air as a fork of one that has imported bumble: its two ends."""
 
     stdin: TextIO
@@ -86,7 +86,7 @@ class Radio:
         return f"unix:path={self.path}"
 
     def do(self, *words: Any) -> Any:
-        """Have the air do something; see air.Everything.do."""
+        """Have the air do something; see air.BleScene.do."""
         answer = self._say(list(words))
         assert "error" not in answer, answer
         return answer["result"]

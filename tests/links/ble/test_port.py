@@ -262,12 +262,12 @@ def test_without_a_system_bus(port: Ports, monkeypatch: pytest.MonkeyPatch, tmp_
 
 
 @pytest.mark.parametrize(
-    ("manners", "said"),
+    ("manners", "message"),
     [({"powered": False}, "switched off"), ({"central": False}, "LE central role is not supported")],
 )
-def test_an_adapter_that_cannot_be_used(air: Air, port: Ports, manners: dict[str, bool], said: str) -> None:
+def test_an_adapter_that_cannot_be_used(air: Air, port: Ports, manners: dict[str, bool], message: str) -> None:
     air(manners=manners)
-    with pytest.raises(NoReaderError, match=said):
+    with pytest.raises(NoReaderError, match=message):
         find(port(), seconds=2)
 
 

@@ -228,8 +228,8 @@ def test_what_a_board_announced_while_it_was_served_is_no_news(other: bool) -> N
         bus, stop = StillBus(), threading.Event()
         arrivals = Arrivals(bus, quiet)  # type: ignore[arg-type]
         [(address, identity)] = arrivals.round(stop)
-        said = Announce(address + other, identity.state, uuid_crc(b"another 10" if other else identity.uuid))
-        bus.announced = [Frame(said.identifier, said.encode(), False)]
+        announce = Announce(address + other, identity.state, uuid_crc(b"another 10" if other else identity.uuid))
+        bus.announced = [Frame(announce.identifier, announce.encode(), False)]
         arrivals.pause(stop)
         return bus.waited == 0
 
@@ -246,12 +246,12 @@ def test_watch_survives_a_bus_that_goes_away() -> None:
     stop = threading.Event()
     then = {"waiting": threading.Timer(0.3, hub.close), "reader-lost": threading.Timer(2.2, stop.set)}
 
-    def told(notice: Notice) -> None:
+    def on_notice(notice: Notice) -> None:
         notices.append(notice.kind)
         if (next_one := then.pop(notice.kind, None)) is not None:
             next_one.start()
 
-    assert list(port.watch(stop=stop, notice=told)) == []
+    assert list(port.watch(stop=stop, notice=on_notice)) == []
     assert notices == ["waiting", "reader-lost"]
     port.close()
 
@@ -307,12 +307,12 @@ def test_two_nodes_under_one_address_are_a_conflict(hub: Hub) -> None:
         latest = threading.Timer(PATIENCE, stop.set)
         latest.start()
 
-        def told(notice: Notice) -> None:
+        def on_notice(notice: Notice) -> None:
             kinds.append(notice.kind)
             if notice.kind == "conflict":
                 threading.Timer(0.5, stop.set).start()
 
-        for contact in port.watch(stop=stop, notice=told):  # the first that answers
+        for contact in port.watch(stop=stop, notice=on_notice):  # the first that answers
             time.sleep(0.1)
             until(lambda contact=contact: refused(lambda: contact.link.exchange(COUNT)))
         latest.cancel()
@@ -372,9 +372,9 @@ def test_nobody_is_there(hub: Hub) -> None:
             began = time.monotonic()
             with pytest.raises(NoNodeError, match=r"within 1\.2 s"):
                 find(port, seconds=1.2)
-            took = time.monotonic() - began
-            assert took > 1.0
-            return took
+            seconds = time.monotonic() - began
+            assert seconds > 1.0
+            return seconds
 
         best_of(5, 3.0, looked, because="a try is 1.2 s of waiting and two of patience")
 
@@ -385,10 +385,10 @@ def test_another_node_than_the_wanted_is_told_and_waited_past(hub: Hub) -> None:
 
         def others() -> list[str]:
             """What was told instead: a node that had no processor in time is told as none."""
-            told: list[Notice] = []
+            notices: list[Notice] = []
             with pytest.raises(NoNodeError) as error:
-                port.find(lambda _: False, seconds=1.2, notice=told.append)
-            kinds = [notice.kind for notice in told]
+                port.find(lambda _: False, seconds=1.2, notice=notices.append)
+            kinds = [notice.kind for notice in notices]
             return [] if "2121" in str(error.value) and kinds == ["waiting", "foreign-tag"] else [str(error.value)]
 
         succeeds(5, others, because="the node has 50 ms to answer")

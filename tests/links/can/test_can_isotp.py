@@ -416,7 +416,7 @@ def test_two_senders_on_one_paced_bus_take_turns(group: str) -> None:
     assert not wire._path.exists()
 
 
-class ByTheLibrary(Pair):
+class LibraryPair(Pair):
     """A pair that never takes the short way for single frames."""
 
     @property
@@ -432,7 +432,7 @@ class ByTheLibrary(Pair):
 def test_a_single_frame_is_read_as_the_library_reads_it(data: bytes, fd: bool) -> None:
     frame = Frame(physical_id(NODE, STATION), bytes([data[0] & 0xF]) + data[1:] if data else b"", fd)
     bodies = []
-    for made in (Pair, ByTheLibrary):
+    for made in (Pair, LibraryPair):
         pair = made(NODE, STATION, lambda _: None, fd=fd)
         assert pair.handle_frame(frame)
         bodies.append(pair.received())
@@ -443,7 +443,7 @@ def test_a_single_frame_is_read_as_the_library_reads_it(data: bytes, fd: bool) -
 @given(st.binary(min_size=1, max_size=63), st.booleans())
 def test_a_single_frame_is_written_as_the_library_writes_it(body: bytes, fd: bool) -> None:
     sent: list[list[Frame]] = []
-    for made in (Pair, ByTheLibrary):
+    for made in (Pair, LibraryPair):
         frames: list[Frame] = []
         made(NODE, STATION, frames.append, fd=fd).send(body)
         sent.append(frames)

@@ -75,14 +75,14 @@ def test_a_lost_flow_control_ends_the_wait_at_once(hub: Hub, nodes: Start) -> No
     hub.lose = lose_flow
     port = CanPort(hub.spec)
 
-    def took() -> float:
+    def elapsed() -> float:
         lost.clear()
         began = time.monotonic()
         assert port.link(0x21).exchange(write(bytes(300))) == bytes(300)
         assert lost
         return time.monotonic() - began
 
-    best_of(5, 4.0, took, because="the exchange itself may take seconds, a reply that is waited for five")
+    best_of(5, 4.0, elapsed, because="the exchange itself may take seconds, a reply that is waited for five")
     port.close()
 
 
@@ -134,9 +134,9 @@ def test_an_order_is_sent_again_after_a_quarter_and_a_half_and_given_up_at_the_e
         hub.lose = lose
         began = time.monotonic()
         assert link.exchange_within(write(bytes(range(20))), 2.0) == bytes(range(20))[::-1]
-        took = time.monotonic() - began
-        assert took >= 0.5
-        return took
+        seconds = time.monotonic() - began
+        assert seconds >= 0.5
+        return seconds
 
     best_of(5, 1.0, with_first_reply_lost, because="half of the second is the wait itself")
     hub.lose = lambda identifier, _data: identifier == 0x18DAF121
@@ -146,10 +146,10 @@ def test_an_order_is_sent_again_after_a_quarter_and_a_half_and_given_up_at_the_e
         began = time.monotonic()
         with pytest.raises(LinkError):
             link.exchange_within(write(b""), 0.8)  # one frame
-        took = time.monotonic() - began
-        assert took >= 0.8
+        seconds = time.monotonic() - began
+        assert seconds >= 0.8
         requests = [data for identifier, data in hub.frames if identifier == 0x18DA21F1]
-        return took if len(requests) == 3 else float("inf")
+        return seconds if len(requests) == 3 else float("inf")
 
     best_of(5, 1.2, with_every_reply_lost, because="0.8 s are the wait itself")
     hub.frames.clear()
@@ -234,9 +234,9 @@ def test_what_began_and_did_not_end_is_named(hub: Hub, nodes: Start) -> None:
     nodes(hub.spec, 0x21, 0x22)
     hub.lose = lambda identifier, data: identifier == 0x18DAF122 and data[0] == 0x23  # its last frame, always
     port = CanPort(hub.spec)
-    told: list[Notice] = []
-    assert_all_found(port, [0x21], begin=told.clear, notice=told.append)
-    assert [(notice.kind, "0x22" in notice.text) for notice in told[1:]] == [("unfinished", True)]
+    notices: list[Notice] = []
+    assert_all_found(port, [0x21], begin=notices.clear, notice=notices.append)
+    assert [(notice.kind, "0x22" in notice.text) for notice in notices[1:]] == [("unfinished", True)]
     port.close()
 
 
@@ -248,10 +248,10 @@ def test_one_uuid_at_two_addresses_is_named(hub: Hub) -> None:
     for server in servers:
         server.start()
     port = CanPort(hub.spec)
-    told: list[Notice] = []
+    notices: list[Notice] = []
     try:
-        assert_all_found(port, [0x21, 0x22], begin=told.clear, notice=told.append)
-        assert any(notice.kind == "conflict" and "0x21 and 0x22" in notice.text for notice in told)
+        assert_all_found(port, [0x21, 0x22], begin=notices.clear, notice=notices.append)
+        assert any(notice.kind == "conflict" and "0x21 and 0x22" in notice.text for notice in notices)
     finally:
         for server in servers:
             server.stop()

@@ -59,13 +59,13 @@ def test_eight_nodes_are_talked_to_at_once_and_none_waits_for_a_slow_one(hub: Hu
     port = CanPort(hub.spec)
     bodies = [os.urandom(300 + 10 * number) for number in range(8)]
 
-    def took() -> float:
+    def elapsed() -> float:
         began = time.monotonic()
         replies = in_threads(lambda number: port.link(addresses[number]).exchange(write(bodies[number])), 8)
         assert replies == [body[::-1] for body in bodies]
         return time.monotonic() - began
 
-    best_of(5, 8, took, because="eight nodes and eight threads that each wait a second")
+    best_of(5, 8, elapsed, because="eight nodes and eight threads that each wait a second")
     port.close()
 
 
@@ -177,9 +177,11 @@ def test_two_stations_of_one_address_are_noticed_and_named(hub: Hub, nodes: Star
     ours.link(0x21).exchange(write(b"abc"))
     assert not ours.bus().conflicts.seen_within()  # a station of another address is nobody's rival
     theirs.link(0x22).exchange(write(b"abcdefgh"))
-    told: list[Notice] = []
-    ours.find_all(seconds=2, notice=told.append)
-    assert any(notice.kind == "conflict" and "0xF1" in notice.text and "source=0xF2" in notice.text for notice in told)
+    notices: list[Notice] = []
+    ours.find_all(seconds=2, notice=notices.append)
+    assert any(
+        notice.kind == "conflict" and "0xF1" in notice.text and "source=0xF2" in notice.text for notice in notices
+    )
     with pytest.raises(LinkError, match="Another base station") as failure:
         ours.link(0x55).exchange_limited(write(b"nobody"), tries=1, seconds=0.2)
     assert "source=0xF2" in failure.value.hint

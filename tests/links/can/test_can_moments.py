@@ -18,7 +18,7 @@ from tests.links.can.test_can_exchange import COUNT, opened, serving
 pytestmark = pytest.mark.link
 
 
-class Telling(EchoNode):
+class TimedEchoNode(EchoNode):
     """Notes when it ran a request, and at which of its ticks (the host's ns) the request is said to have come."""
 
     def __init__(self, address: int) -> None:
@@ -46,7 +46,7 @@ class Telling(EchoNode):
 
 
 def test_a_link_says_when_the_first_request_left_and_when_the_last_reply_was_whole(group: str) -> None:
-    node = Telling(0x21)
+    node = TimedEchoNode(0x21)
     with serving(group, node), opened(group) as port:
         link = port.link(0x21)
         before = time.monotonic()
@@ -71,7 +71,7 @@ def test_a_node_dates_requests_and_triggers_by_their_arrival_not_by_when_its_thr
         return frame and replace(frame, at=frame.at - 0.25)
 
     monkeypatch.setattr(Bus, "receive", late)
-    node, server = Telling(0x21), CanServer(group)
+    node, server = TimedEchoNode(0x21), CanServer(group)
     server.add(node, measuring=node)  # type: ignore[arg-type]  # what a request asks of a measuring node
     server.start()
     try:

@@ -112,7 +112,7 @@ def test_our_own_frames_do_not_come_back(monkeypatch: pytest.MonkeyPatch, group:
     other.close()
 
 
-class Hurdled:
+class DelayedClock:
     """The module ``time`` for a thread that is put aside for 10 ms before each reading of a clock."""
 
     def __init__(self) -> None:
@@ -137,7 +137,7 @@ def test_a_frame_never_comes_before_it_was_sent(monkeypatch: pytest.MonkeyPatch,
     bus, other = Bus(parse_spec(group)), Bus(parse_spec(group))
     sent = time.monotonic()
     other.send(Frame(0x18DA21F1, b"when"))
-    monkeypatch.setattr(multicast, "time", Hurdled())
+    monkeypatch.setattr(multicast, "time", DelayedClock())
     heard = bus.receive(PATIENCE)
     assert heard is not None
     assert heard.at >= sent
@@ -167,8 +167,8 @@ def test_an_error_frame_that_says_bus_off_is_a_link_failure(group: str) -> None:
     spec = parse_spec(group)
     bus = Bus(spec)
     port = int(group.rpartition("=")[2])
-    with can.Bus(interface="udp_multicast", channel=spec.channel, port=port, hop_limit=0) as one:
-        one.send(can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8)))
+    with can.Bus(interface="udp_multicast", channel=spec.channel, port=port, hop_limit=0) as injector:
+        injector.send(can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8)))
         with pytest.raises(LinkError, match="bus-off"):
             bus.receive(PATIENCE)
     bus.close()

@@ -17,12 +17,12 @@ def hold(path: str) -> None:
 
 
 def wait(path: str) -> None:
-    def tell(notice: Notice) -> None:
+    def report(notice: Notice) -> None:
         print(notice.kind, flush=True)
 
     port = open_port(LinkSettings(nfc=path))
     try:
-        port.find(lambda identity: True, seconds=60, notice=tell)
+        port.find(lambda identity: True, seconds=60, notice=report)
     except KeyboardInterrupt:
         port.close()
         sys.exit(130)

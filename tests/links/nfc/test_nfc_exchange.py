@@ -47,9 +47,9 @@ def waited_past(port: Port, notices: list[Notice], uuid: str = UUID, kind: str =
         notices.clear()
         with pytest.raises(NoNodeError):
             find(port, notices, uuid, seconds=seconds)
-        if told := [notice for notice in notices if notice.kind == kind]:
+        if reported := [notice for notice in notices if notice.kind == kind]:
             break
-    return told
+    return reported
 
 
 def echo(contact: Contact, size: int) -> None:
@@ -152,10 +152,10 @@ def test_a_foreign_tag_is_named_once_and_waited_past(
     start_node: StartNode, port: Port, notices: list, tag: str
 ) -> None:
     start_node(tag=tag, uid="02112233445566", initial=foreign_message())
-    told = waited_past(port, notices)
-    assert len(told) == 1
+    reported = waited_past(port, notices)
+    assert len(reported) == 1
     for part in ("02112233445566", f"Type {tag}", "urn:nfc:wkt:U", "urn:nfc:wkt:Tp"):
-        assert part in told[0].text
+        assert part in reported[0].text
 
 
 def test_a_node_put_down_after_a_foreign_tag_is_found(start_node: StartNode, port: Port, notices: list) -> None:
@@ -207,8 +207,8 @@ def test_other_records_and_services_beside_ours_do_not_matter(start_node: StartN
 
 def test_another_node_is_waited_past_and_named(start_node: StartNode, port: Port, notices: list) -> None:
     start_node()
-    (told,) = waited_past(port, notices, OTHER, "waiting")
-    assert UUID.lower() in told.text
+    (reported,) = waited_past(port, notices, OTHER, "waiting")
+    assert UUID.lower() in reported.text
     assert {notice.kind for notice in notices} <= {"waiting", "retry"}  # a busy machine tries again
 
 

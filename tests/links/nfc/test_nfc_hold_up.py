@@ -15,7 +15,7 @@ from teds_provision.links.nfc.poller import LONGEST, Poller
 SERVICE = tnep.ServiceParameters(tnep.SERVICE, 20, 15, 499)
 
 
-class Dripping:
+class EndlessReply:
     """Gives ``step`` octets of an endless reply at a time, just within the station's patience."""
 
     def __init__(self, step: int, seconds: float) -> None:
@@ -44,14 +44,14 @@ class Dripping:
 
 
 def test_a_reply_in_drops_ends_after_two_minutes() -> None:
-    node = Dripping(8, 4.0)
+    node = EndlessReply(8, 4.0)
     with pytest.raises(NodeSilentError, match="120 s"):
         Poller(node, SERVICE, clock=lambda: node.now, sleep=node.sleep).transact(1, bytes(10))
     assert node.now < LONGEST + 15
 
 
 def test_a_slow_node_has_the_time_that_it_needs() -> None:
-    node = Dripping(100, 2.0)
+    node = EndlessReply(100, 2.0)
     reply = Poller(node, SERVICE, clock=lambda: node.now, sleep=node.sleep).transact(1, bytes(10))
     assert len(reply) == LONGEST_FRAME
 
@@ -63,7 +63,7 @@ def test_no_reply_is_longer_than_the_longest_frame() -> None:
     assert requester.handle_piece(Piece(1, LONGEST_FRAME, 0, bytes(8), answer=True))
 
 
-class Stubborn:
+class StuckFrontEnd:
     """A front end whose tag says the same block to whatever it is asked."""
 
     def __init__(self, block: bytes) -> None:
@@ -82,7 +82,7 @@ class Stubborn:
 def test_a_tag_that_puts_off_its_answer_for_ever_is_given_up(block: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     """nfcpy goes on for as long as the tag does: `identify --timeout 6` never ended, at full speed."""
     monkeypatch.setattr(tag, "_APDU_SECONDS", 0.2)
-    air = Stubborn(block)
+    air = StuckFrontEnd(block)
     began = time.monotonic()
     dep = tag.IsoDep(air, 64, 0.1)
     if block == b"\xa2":

@@ -148,7 +148,7 @@ def put_in(monkeypatch: pytest.MonkeyPatch, readers: list[str] | None) -> None:
 
 
 @pytest.mark.parametrize(
-    ("readers", "path", "error", "says"),
+    ("readers", "path", "error", "message"),
     [
         (None, "pcsc", NoReaderError, "does not answer: Service not available"),
         ([], "pcsc", NoReaderError, "No PC/SC reader is plugged in"),
@@ -157,10 +157,10 @@ def put_in(monkeypatch: pytest.MonkeyPatch, readers: list[str] | None) -> None:
     ],
 )
 def test_what_is_wrong_with_pc_sc_is_named(
-    monkeypatch: pytest.MonkeyPatch, readers: list[str] | None, path: str, error: type[Exception], says: str
+    monkeypatch: pytest.MonkeyPatch, readers: list[str] | None, path: str, error: type[Exception], message: str
 ) -> None:
     put_in(monkeypatch, readers)
-    with pytest.raises(error, match=says):
+    with pytest.raises(error, match=message):
         open_reader(path)
 
 

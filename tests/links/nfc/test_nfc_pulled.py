@@ -30,10 +30,10 @@ FRAME = bytes(range(10)) + bytes(600)
 
 
 class Watch:
-    """A watch that exchanges two frames with whoever comes; ``told`` is a UUID, or "pulled"."""
+    """A watch that exchanges two frames with each node that comes; ``results`` are UUIDs, or "pulled"."""
 
     def __init__(self, path: str) -> None:
-        self.told: list[str] = []
+        self.results: list[str] = []
         self.notices: list[Notice] = []
         self._using = False
         self._stop = threading.Event()
@@ -43,7 +43,7 @@ class Watch:
 
     def _run(self) -> None:
         for contact in self._port.watch(stop=self._stop, notice=self.notices.append):
-            self.told.append(self._use(contact))
+            self.results.append(self._use(contact))
 
     def _use(self, contact: Contact) -> str:
         self._using = True
@@ -58,7 +58,7 @@ class Watch:
         return contact.identity.uuid.hex().upper()
 
     def until(self, condition: Callable[[], bool], what: object = None) -> None:
-        until(condition, lambda: (what, self.told, self.notices[-3:]))
+        until(condition, lambda: (what, self.results, self.notices[-3:]))
 
     def left(self) -> int:
         return [notice.kind for notice in self.notices].count("node-left")
@@ -68,12 +68,12 @@ class Watch:
         before = self.left()
         lift()
         self.until(lambda: self.left() > before, what)
-        self.told.clear()
+        self.results.clear()
 
     def notices_it(self) -> None:
         """Give it time to find the board gone for good; one that was lifted while it was first read is not told of."""
         end = time.monotonic() + (8.0 if self._using else 0.3)
-        while not self.told and time.monotonic() < end:
+        while not self.results and time.monotonic() < end:
             time.sleep(0.005)
 
     def end(self) -> None:
@@ -112,7 +112,7 @@ def test_pulled_at_frames_all_over_an_exchange_between_two_processes(
         start_node(path=path, uuid=uuid, tag=tag, wt_int=4)
     watch = Watch(field.path)
     field.put(paths[UUID])
-    watch.until(lambda: watch.told == [UUID])
+    watch.until(lambda: watch.results == [UUID])
     frames = field.frames
     try:
         for number in range(8):
@@ -122,9 +122,9 @@ def test_pulled_at_frames_all_over_an_exchange_between_two_processes(
             if number % 2:
                 watch.notices_it()  # else it is back at once
             field.put(paths[UUID])
-            watch.until(lambda: UUID in watch.told, number)
+            watch.until(lambda: UUID in watch.results, number)
             field.put(paths[OTHER])
-            watch.until(lambda: OTHER in watch.told, number)
+            watch.until(lambda: OTHER in watch.results, number)
     finally:
         watch.end()
 
@@ -146,7 +146,7 @@ def test_pulled_at_every_frame_below_a_usb_reader(chip: Chip, make_node: Callabl
 
     chip.answer = answer
     watch = Watch("usb")
-    watch.until(lambda: watch.told == [UUID])
+    watch.until(lambda: watch.results == [UUID])
     whole = frames[0]
     try:
         for number in range(2, whole, max(1, whole // 17)):
@@ -159,6 +159,6 @@ def test_pulled_at_every_frame_below_a_usb_reader(chip: Chip, make_node: Callabl
                 watch.notices_it()
             left[0] = 10**6
             node.put_down()
-            watch.until(lambda: UUID in watch.told, number)
+            watch.until(lambda: UUID in watch.results, number)
     finally:
         watch.end()

@@ -198,10 +198,10 @@ def test_without_libusb_its_package_is_named(chip: Chip, monkeypatch: pytest.Mon
 def test_auto_takes_the_only_reader_and_names_it(make_node: Callable[[str], Node], chip: Chip) -> None:
     make_node("4")
     port = open_port(LinkSettings())
-    told: list[Notice] = []
+    notices: list[Notice] = []
     with pytest.raises(NoNodeError):
-        port.find(lambda identity: True, seconds=0.3, notice=told.append)
-    assert "usb:04e6:5591" in told[0].text
+        port.find(lambda identity: True, seconds=0.3, notice=notices.append)
+    assert "usb:04e6:5591" in notices[0].text
     assert port.place == "nfc:usb:04e6:5591"
     port.close()
 

@@ -67,7 +67,7 @@ def convert_to(folder: Path, suffix: str, target: Path) -> None:
         convert(recorded(folder / "origin.mcap"), target)
 
 
-def told(path: Path) -> dict[str, Any]:
+def content(path: Path) -> dict[str, Any]:
     recording, summary = open_recording(path), RecordingSummary()
     for entry in recording.entries():
         summary.add_entry(entry)
@@ -104,11 +104,11 @@ def test_a_recording_in_another_format_says_the_same(tmp_path: Path, begin: str,
                 "times and raw values are exact"
             )
             np.testing.assert_allclose([pair[2] for pair in after[key]], [pair[2] for pair in expected], rtol=1e-11)
-        facts, said, origin = open_recording(path), told(path), told(first)
+        facts, contents, origin = open_recording(path), content(path), content(first)
         assert facts.facts[ARM, 1] == FACTS[0], "every fact of the datasheet, its calibration too"
         assert (facts.station.name, facts.station.group) == ("bench", "crane")
         names = ("from", "until", "messages", "samples", "invalid", "lost", "missing", "complete")
-        assert {name: said[name] for name in names} == {name: origin[name] for name in names}
+        assert {name: contents[name] for name in names} == {name: origin[name] for name in names}
     assert (origin["invalid"], origin["lost"], origin["missing"]) == (1, 1, 3)
 
 
@@ -169,7 +169,7 @@ def test_a_grid_is_recorded_as_it_is_converted(tmp_path: Path) -> None:
     assert list(table.columns) == ["time", "arm/angle [rad]", "hand/force [N]"]
     assert table.iloc[0].isna().tolist() == [False, False, True]
     assert table.iloc[1].tolist() == [1.01, 2.5, -3.0]
-    assert told(tmp_path / "run.csv")["messages"] == 2
+    assert content(tmp_path / "run.csv")["messages"] == 2
 
 
 def test_another_datasheet_midway_begins_another_file_of_columns(tmp_path: Path) -> None:
@@ -189,14 +189,14 @@ def test_notes_of_the_recorder_go_along(tmp_path: Path) -> None:
     path = tmp_path / "noted.mcap"
     for end in (".jsonl", ".csv", ".parquet", ".mcap"):
         [path] = convert(path, tmp_path / f"next{end}").files
-        assert [note["why"] for note in told(path)["notes"]] == ["The disk was full."]
+        assert [note["why"] for note in content(path)["notes"]] == ["The disk was full."]
 
 
 def test_entries_come_in_the_order_in_which_they_were_measured(tmp_path: Path) -> None:
     """A report and a note stand behind the samples that came before them, whatever was gathered meanwhile."""
-    told = NodeReport(ARM, "lost", why="The link ended.", time=1_795_000_010.0)
+    report = NodeReport(ARM, "lost", why="The link ended.", time=1_795_000_010.0)
     noted = Note(1_795_000_020.0, "The disk was full.")
-    items = [block(index=0), told, block(index=3), noted, block(index=6)]
+    items = [block(index=0), report, block(index=3), noted, block(index=6)]
     sink = open_sink(str(tmp_path / "run.mcap"))
     sink.copy(items, FACTS, STATION)  # type: ignore[attr-defined]
     entries = open_recording(tmp_path / "run.mcap").entries()

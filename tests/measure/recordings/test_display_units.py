@@ -55,16 +55,16 @@ def test_a_file_holds_what_people_read_and_its_readers_have_si_again(tmp_path: P
     path = tmp_path / f"run{suffix}"
     if suffix == ".parquet":
         convert(recorded(tmp_path / "run.mcap"), path, units="shown")
-        told = pd.read_parquet(path)
+        frame = pd.read_parquet(path)
     else:
         recorded(path)
         separator = "," if suffix == ".csv" else "\t"
-        told = None if suffix == ".jsonl" else pd.read_csv(path, comment="#", sep=separator)
-    if told is not None:
-        (angle,) = [name for name in told.columns if "[°]" in name]
-        (warm,) = [name for name in told.columns if "[°C]" in name]
-        assert told[angle].dropna().tolist() == pytest.approx([math.degrees(value) for value in RADIANS])
-        assert told[warm].dropna().tolist() == pytest.approx([value - 273.15 for value in KELVINS])
+        frame = None if suffix == ".jsonl" else pd.read_csv(path, comment="#", sep=separator)
+    if frame is not None:
+        (angle,) = [name for name in frame.columns if "[°]" in name]
+        (warm,) = [name for name in frame.columns if "[°C]" in name]
+        assert frame[angle].dropna().tolist() == pytest.approx([math.degrees(value) for value in RADIANS])
+        assert frame[warm].dropna().tolist() == pytest.approx([value - 273.15 for value in KELVINS])
     else:
         lines = [json.loads(line) for line in path.read_text().splitlines()]
         assert lines[0]["units"] == "shown"
@@ -126,6 +126,6 @@ def test_facts_come_back_as_they_were_and_channels_in_si_stay() -> None:
     assert in_display_units(replace(force, units=None)) == replace(force, units=None)
     conversion = UnitConversion()
     conversion.facts([force])
-    one = items()[0]
-    assert conversion.convert(one) is one
-    assert conversion.convert(replace(one, uuid=HAND)) is not None, "a channel that nothing describes stays as it is"
+    first = items()[0]
+    assert conversion.convert(first) is first
+    assert conversion.convert(replace(first, uuid=HAND)) is not None, "a channel that nothing describes stays as it is"

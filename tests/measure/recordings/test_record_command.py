@@ -19,7 +19,7 @@ from teds_provision.measure.recordings.opening import open_recording
 from teds_provision.measure.sinks import Sink, open_sink
 from teds_provision.teds.units import parse_units
 from tests.cli.shell import call, unmeasured_environment
-from tests.measure.recordings.test_converting import recorded, told
+from tests.measure.recordings.test_converting import content, recorded
 from tests.measure.sinks.parts import ANGLE, ARM, STATION, block
 from tests.pace import until
 
@@ -67,7 +67,7 @@ def test_a_recorder_that_is_killed_in_the_middle_leaves_what_info_and_convert_re
         <= told_of["messages"]
         == rows_in(tmp_path / "whole.mcap")
     )
-    assert told(tmp_path / "whole.mcap")["missing"] == 0, "all of it, from the first sample on"
+    assert content(tmp_path / "whole.mcap")["missing"] == 0, "all of it, from the first sample on"
     if suffix == ".mcap":
         assert told_of["complete"] is False
         assert "was cut off" in done.err
@@ -88,10 +88,10 @@ def test_two_conversions_to_one_name_leave_one_whole_file(tmp_path: Path) -> Non
 def test_what_a_killed_conversion_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", [block(index=k) for k in range(0, 90_000, 3)])
     words = [sys.executable, "-m", "teds_provision", "record", "convert", str(source), str(tmp_path / "to.csv")]
-    one = subprocess.Popen(words, env=unmeasured_environment())
+    killed = subprocess.Popen(words, env=unmeasured_environment())
     until(lambda: any(found.name.endswith(".teds-part") for found in tmp_path.iterdir()))
-    os.kill(one.pid, signal.SIGKILL)
-    one.wait()
+    os.kill(killed.pid, signal.SIGKILL)
+    killed.wait()
     if not (tmp_path / "to.csv").exists():
         assert call(tmp_path / "home", "record", "convert", str(source), str(tmp_path / "to.csv")).code == 0
     assert {path.name for path in tmp_path.iterdir()} == {"run.mcap", "to.csv"}

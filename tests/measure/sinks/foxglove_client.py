@@ -39,25 +39,29 @@ def main(port: int, wanted: int, expected: int) -> None:
         while count < wanted or not {"parameters", "set"} <= parameters.keys() or "/bench/arm/teds" not in found:
             message = line.recv(timeout=20)
             if isinstance(message, str):
-                told = json.loads(message)
-                if told["op"] == "advertise":
-                    new = [channel for channel in told["channels"] if channel["id"] not in channels]
+                record = json.loads(message)
+                if record["op"] == "advertise":
+                    new = [channel for channel in record["channels"] if channel["id"] not in channels]
                     channels |= {channel["id"]: channel for channel in new}
                     line.send(
                         json.dumps(
                             {
                                 "op": "subscribe",
-                                "subscriptions": [{"id": one["id"], "channelId": one["id"]} for one in new],
+                                "subscriptions": [
+                                    {"id": advertised["id"], "channelId": advertised["id"]} for advertised in new
+                                ],
                             }
                         )
                     )
                     # Its answer comes after the subscription was taken: requests of a connection are served in order.
                     line.send(json.dumps({"op": "getParameters", "parameterNames": [], "id": f"ready {len(channels)}"}))
-                elif told["op"] == "parameterValues":
-                    if told.get("id") == f"ready {expected}":
+                elif record["op"] == "parameterValues":
+                    if record.get("id") == f"ready {expected}":
                         print(json.dumps({"subscribed": True}), flush=True)
                         continue
-                    parameters[told.get("id", "")] = {one["name"]: one["value"] for one in told["parameters"]}
+                    parameters[record.get("id", "")] = {
+                        parameter["name"]: parameter["value"] for parameter in record["parameters"]
+                    }
                 continue
             if message[0] != 1:
                 continue

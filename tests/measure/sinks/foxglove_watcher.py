@@ -45,25 +45,27 @@ def main(url: str, authority: str = "") -> None:
                     for key, value in vars(decoded).items()
                     if key not in ("stamp", "__msgtype__")
                 }
-                tell(topic=channel["topic"], time=at, fields=fields)
+                show(topic=channel["topic"], time=at, fields=fields)
                 continue
-            told = json.loads(message)
-            if told["op"] == "advertise":
-                channels |= {channel["id"]: channel for channel in told["channels"]}
-                wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in told["channels"]]
+            record = json.loads(message)
+            if record["op"] == "advertise":
+                channels |= {channel["id"]: channel for channel in record["channels"]}
+                wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in record["channels"]]
                 line.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
                 line.send(json.dumps({"op": "getParameters", "parameterNames": [], "id": "all"}))
-                tell(opened=[channel["topic"] for channel in told["channels"]])
-            elif told["op"] == "unadvertise":
-                tell(closed=[channels.pop(number)["topic"] for number in told["channelIds"]])
+                show(opened=[channel["topic"] for channel in record["channels"]])
+            elif record["op"] == "unadvertise":
+                show(closed=[channels.pop(number)["topic"] for number in record["channelIds"]])
                 line.send(json.dumps({"op": "getParameters", "parameterNames": [], "id": "all"}))
-            elif told["op"] == "parameterValues":
-                tell(parameters={one["name"]: json.loads(one["value"]) for one in told["parameters"]})
-            elif told["op"] == "serverInfo":
-                tell(server=told["name"])
+            elif record["op"] == "parameterValues":
+                show(
+                    parameters={parameter["name"]: json.loads(parameter["value"]) for parameter in record["parameters"]}
+                )
+            elif record["op"] == "serverInfo":
+                show(server=record["name"])
 
 
-def tell(**facts: Any) -> None:
+def show(**facts: Any) -> None:
     """Print a line."""
     print(json.dumps(facts), flush=True)
 

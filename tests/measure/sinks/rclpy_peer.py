@@ -1,6 +1,6 @@
-"""Runs under a Python with the real rclpy: another node, told what to do by lines of JSON, telling what it hears.
+"""Runs under a Python with the real rclpy: another node, controlled by lines of JSON, printing what it hears.
 
-``{"op": "hear", "topic", "type", "latched"}``, ``{"op": "say", "topic", "type", "fields"}``, ``{"op": "graph"}``,
+``{"op": "hear", "topic", "type", "latched"}``, ``{"op": "publish", "topic", "type", "fields"}``, ``{"op": "graph"}``,
 ``{"op": "parameters", "node", "names"}``, ``{"op": "set", "node", "name", "value"}``. It ends when stdin closes.
 """
 
@@ -20,7 +20,7 @@ from rclpy.executors import SingleThreadedExecutor
 _OUT = threading.Lock()
 
 
-def tell(**words: Any) -> None:
+def show(**words: Any) -> None:
     with _OUT:
         print(json.dumps(words), flush=True)
 
@@ -64,11 +64,11 @@ class Peer:
         self.node.create_subscription(
             kind_of(line["type"]),
             topic,
-            lambda message: tell(event="message", topic=topic, message=plain(message)),
+            lambda message: show(event="message", topic=topic, message=plain(message)),
             profile(latched=line.get("latched", False), reliable=line.get("reliable", True)),
         )
 
-    def say(self, line: dict[str, Any]) -> None:
+    def publish(self, line: dict[str, Any]) -> None:
         kind = kind_of(line["type"])
         if line["topic"] not in self.publishers:
             self.publishers[line["topic"]] = self.node.create_publisher(kind, line["topic"], profile(latched=False))
@@ -90,14 +90,14 @@ class Peer:
             for topic, types in self.node.get_topic_names_and_types()
         }
         nodes = [f"{space}{name}" for name, space in self.node.get_node_names_and_namespaces()]
-        tell(event="graph", nodes=nodes, topics=topics)
+        show(event="graph", nodes=nodes, topics=topics)
 
     def parameters(self, line: dict[str, Any]) -> None:
         service = importlib.import_module("rcl_interfaces.srv").GetParameters
         client = self.node.create_client(service, f"{line['node']}/get_parameters")
         client.wait_for_service(30.0)
         answer = client.call_async(service.Request(names=line["names"]))
-        answer.add_done_callback(lambda done: tell(event="parameters", values=plain(done.result().values)))
+        answer.add_done_callback(lambda done: show(event="parameters", values=plain(done.result().values)))
 
     def set(self, line: dict[str, Any]) -> None:
         service = importlib.import_module("rcl_interfaces.srv").SetParameters
@@ -107,7 +107,7 @@ class Peer:
         client.wait_for_service(30.0)
         asked = service.Request(parameters=[messages.Parameter(name=line["name"], value=value)])
         answer = client.call_async(asked)
-        answer.add_done_callback(lambda done: tell(event="set", results=plain(done.result().results)))
+        answer.add_done_callback(lambda done: show(event="set", results=plain(done.result().results)))
 
 
 def main() -> None:
@@ -117,7 +117,7 @@ def main() -> None:
     executor.add_node(node)
     threading.Thread(target=executor.spin, daemon=True).start()
     peer = Peer(node)
-    tell(event="ready")
+    show(event="ready")
     for line in sys.stdin:
         words = json.loads(line)
         getattr(peer, words["op"])(words)

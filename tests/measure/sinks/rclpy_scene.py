@@ -46,7 +46,7 @@ class Peer:
         for line in self.process.stdout:
             self.lines.append(json.loads(line))
 
-    def tell(self, **words: Any) -> None:
+    def send(self, **words: Any) -> None:
         assert self.process.stdin is not None
         self.process.stdin.write(json.dumps(words) + "\n")
         self.process.stdin.flush()
@@ -55,7 +55,7 @@ class Peer:
         return [line for line in list(self.lines) if line["event"] == event]
 
     def hear(self, topic: str, kind: str, *, latched: bool = False, reliable: bool = True) -> None:
-        self.tell(op="hear", topic=topic, type=kind, latched=latched, reliable=reliable)
+        self.send(op="hear", topic=topic, type=kind, latched=latched, reliable=reliable)
 
     def heard(self, topic: str) -> list[Any]:
         return [entry["message"] for entry in self.of("message") if entry["topic"] == topic]
@@ -66,7 +66,7 @@ class Peer:
 
         def look() -> bool:
             before = len(self.of("graph"))
-            self.tell(op="graph")
+            self.send(op="graph")
             until(lambda: len(self.of("graph")) > before)
             found.update(self.of("graph")[-1])
             return ready(found)

@@ -276,8 +276,8 @@ def test_a_node_that_is_tried_again_gets_one_line_until_something_changes(tmp_pa
     tries = [refused(f"the station is not trusted; again in {pause} s") for pause in (1, 2, 4, 8)]
     back = NodeReport(ARM, "running", time=1_795_000_050.0)
     record(path, [block(), *tries, other, back, tries[0], tries[1]])
-    said = [line for line in path.read_text().splitlines() if line.startswith("# ") and " refused: " in line]
-    assert [line.partition("; ")[2] for line in said] == [
+    lines = [line for line in path.read_text().splitlines() if line.startswith("# ") and " refused: " in line]
+    assert [line.partition("; ")[2] for line in lines] == [
         "the station is not trusted; again in 1 s",
         "TEDS 3 of channel 1 has another digest; again in 8 s",
         "the station is not trusted; again in 1 s",
@@ -586,13 +586,13 @@ def test_writing_never_waits_for_the_disk(tmp_path: Path) -> None:
         began = time.perf_counter()
         for k in range(200):
             sink.write(block(index=3 * k))
-        took = time.perf_counter() - began
+        seconds = time.perf_counter() - began
         sink.close()
         sink.close()
         sink.write(block())
         assert sink.stats.written == 600
         assert len(rows(path.read_text())) == 600
-        return took
+        return seconds
 
     best_of(5, 2.0, waited, because="the disk may be another process's for a second")
 
@@ -602,12 +602,12 @@ def test_the_command_names_what_is_damaged_and_exits_with_8(long: Finished, tmp_
     hurt, path = bytearray(octets), tmp_path / "run.mcap"
     hurt[chunks[5][1] - 20] ^= 1
     path.write_bytes(bytes(hurt))
-    told = call(tmp_path / "home", "--json", "measure", "recover", str(path))
-    assert told.code == 8
-    assert told.json["output"] == f"{path}.recovered"
-    [damage] = told.json["damaged"]
+    outcome = call(tmp_path / "home", "--json", "measure", "recover", str(path))
+    assert outcome.code == 8
+    assert outcome.json["output"] == f"{path}.recovered"
+    [damage] = outcome.json["damaged"]
     assert (damage["what"], damage["offset"]) == ("chunk", chunks[5][0])
-    assert f"chunk at octet {chunks[5][0]}" in told.json["error"]["message"]
+    assert f"chunk at octet {chunks[5][0]}" in outcome.json["error"]["message"]
     assert call(tmp_path / "home", "measure", "recover", str(path)).code == 2
     again = call(tmp_path / "home", "--json", "measure", "recover", str(path), "--output", str(tmp_path / "b.mcap"))
     assert (again.code, again.json["output"]) == (8, str(tmp_path / "b.mcap"))

@@ -365,12 +365,17 @@ def test_the_datasheet_is_on_a_topic_whole() -> None:
     )
     facts = replace(ANGLE, units=parse_units("rad"), own_period=1e-4, deviation=0.002, calibration=curve)
     sheet = json.loads(carried([], facts=[facts]).words["/bench/arm/teds"])
-    [told] = sheet["channels"]
-    assert (told["low"], told["high"], told["unit"], told["uncertainty"]) == (0.0, 6.283185, "rad", 0.0087)
-    assert (told["deviation"], told["own_period"], told["due"]) == (0.002, 1e-4, "2027-03-01")
-    assert told["calibration"]["method"] == "linear"
-    assert told["calibration"]["coefficients"] == [0.5, 0.25]
-    again = calibration_from_json(told["calibration"], 1, parse_units("rad"))
+    [channels] = sheet["channels"]
+    assert (channels["low"], channels["high"], channels["unit"], channels["uncertainty"]) == (
+        0.0,
+        6.283185,
+        "rad",
+        0.0087,
+    )
+    assert (channels["deviation"], channels["own_period"], channels["due"]) == (0.002, 1e-4, "2027-03-01")
+    assert channels["calibration"]["method"] == "linear"
+    assert channels["calibration"]["coefficients"] == [0.5, 0.25]
+    again = calibration_from_json(channels["calibration"], 1, parse_units("rad"))
     assert evaluate(again, 100.0).value == evaluate(curve, 100.0).value
 
 
@@ -386,8 +391,8 @@ def test_an_unsigned_datasheet_is_told_in_diagnostics_and_metadata() -> None:
     assert sink.scalars == []
     assert json.loads(sink.words["/bench/arm/teds"])["channels"][0]["unsigned"] is True
     assert "unsigned" not in json.loads(sink.words["/bench/hand/teds"])["channels"][0]
-    [told] = [diagnostic for diagnostic in sink.statuses if diagnostic.message.startswith("unsigned:")]
-    assert (told.level, told.hardware) == (1, ARM)
+    [diagnostic] = [diagnostic for diagnostic in sink.statuses if diagnostic.message.startswith("unsigned:")]
+    assert (diagnostic.level, diagnostic.hardware) == (1, ARM)
 
 
 def test_rows_faster_than_a_thousand_a_second_are_thinned_out() -> None:
@@ -452,11 +457,11 @@ def test_diagnostics_tell_what_is_wrong(report: NodeReport, level: int) -> None:
 
 
 def test_a_slow_carrier_loses_the_oldest_and_says_how_much() -> None:
-    class Slow(Carrier):
+    class SlowCarrier(Carrier):
         def _scalar(self, *_: object) -> None:
             time.sleep(0.3)
 
-    sink = Slow()
+    sink = SlowCarrier()
     sink.open([ANGLE], replace(STATION, scalar_rate=1e6))
     for k in range(600):
         sink.write(block([[k]], index=k))

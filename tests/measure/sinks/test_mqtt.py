@@ -106,9 +106,9 @@ class Cable:
             for sock, other in ((near, far), (far, near)):
                 threading.Thread(target=self._carry, args=(sock, other), daemon=True).start()
 
-    def _carry(self, one: socket.socket, other: socket.socket) -> None:
+    def _carry(self, source: socket.socket, other: socket.socket) -> None:
         try:
-            while octets := one.recv(1 << 16):
+            while octets := source.recv(1 << 16):
                 other.sendall(octets)
         except OSError:
             pass
@@ -125,9 +125,9 @@ class Cable:
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:
-    one = Broker(tmp_path)
-    yield one
-    one.stop()
+    running = Broker(tmp_path)
+    yield running
+    running.stop()
 
 
 @pytest.mark.system
@@ -175,10 +175,10 @@ class TestWithMosquitto:
         try:
             for sink, group in zip(sinks, ("left arm", "right arm"), strict=True):
                 sink.open([ANGLE], replace(STATION, group=group, instance=group))
-            one, other = "bench/left_arm/status", "bench/right_arm/status"
-            until(lambda: heard.get(one) == heard.get(other) == "online")
+            first, other = "bench/left_arm/status", "bench/right_arm/status"
+            until(lambda: heard.get(first) == heard.get(other) == "online")
             sinks[0].close()
-            until(lambda: heard[one] == "offline")
+            until(lambda: heard[first] == "offline")
             assert heard[other] == "online"
         finally:
             client.disconnect()

@@ -50,8 +50,8 @@ def test_a_python_that_was_named_and_has_no_rclpy_is_refused(monkeypatch: pytest
 
 def ports_of(process: int) -> list[str]:
     """Local addresses of the UDP sockets of a process, as ``ss`` tells them: ``0.0.0.0%lo:7410``."""
-    told = subprocess.run(["ss", "-Hulpn"], capture_output=True, text=True, check=True).stdout
-    return [line.split()[3] for line in told.splitlines() if f"pid={process}," in line]
+    output = subprocess.run(["ss", "-Hulpn"], capture_output=True, text=True, check=True).stdout
+    return [line.split()[3] for line in output.splitlines() if f"pid={process}," in line]
 
 
 @pytest.fixture(params=["rclpy", "Cyclone DDS"])
@@ -109,7 +109,7 @@ class TestSeenByRclpy:
         peer.graph(lambda entry: bool(entry["topics"].get("/bench/hand/force/cmd", {}).get("subscribers")))
         until(
             lambda: (
-                peer.tell(op="say", topic="/bench/hand/force/cmd", type="std_msgs/Float64", fields={"data": 1.25}),
+                peer.send(op="publish", topic="/bench/hand/force/cmd", type="std_msgs/Float64", fields={"data": 1.25}),
                 time.sleep(0.2),
                 not sink.came.empty(),
             )[2]
@@ -166,7 +166,7 @@ class TestSeenByRclpy:
         names = ["bench.arm.angle.uuid", "bench.arm.angle.calibrated", "bench.arm.axis_4.vector"]
         until(
             lambda: (
-                peer.tell(op="parameters", node=node, names=names),
+                peer.send(op="parameters", node=node, names=names),
                 time.sleep(0.3),
                 [entry for entry in peer.of("parameters") if len(entry["values"]) == 3 and entry["values"][2]["type"]],
             )[2]
@@ -174,7 +174,7 @@ class TestSeenByRclpy:
         uuid, calibrated, vector = peer.of("parameters")[-1]["values"]
         assert (uuid["string_value"], calibrated["string_value"]) == (ARM, "2026-03-01")
         assert vector["double_array_value"] == [4.0, 5.0, 6.0]
-        peer.tell(op="set", node=node, name="bench.arm.angle.uuid", value="mine")
+        peer.send(op="set", node=node, name="bench.arm.angle.uuid", value="mine")
         until(lambda: peer.of("set"))
         assert peer.of("set")[0]["results"][0]["successful"] is False
         sink.close()

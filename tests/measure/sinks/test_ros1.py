@@ -95,18 +95,18 @@ class Master:
 @pytest.fixture
 def master(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Master]:
     """A master of this test alone, not started yet."""
-    one = Master(tmp_path)
-    with _visited(one, monkeypatch):
-        yield one
-    one.stop()
+    running = Master(tmp_path)
+    with _visited(running, monkeypatch):
+        yield running
+    running.stop()
 
 
 @pytest.fixture(scope="module")
 def _standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Master]:
-    one = Master(tmp_path_factory.mktemp("master"))
-    one.start()
-    yield one
-    one.stop()
+    running = Master(tmp_path_factory.mktemp("master"))
+    running.start()
+    yield running
+    running.stop()
 
 
 @pytest.fixture
@@ -206,12 +206,12 @@ def test_a_vector_and_a_wrench_are_messages_of_their_own(shared: Master) -> None
         sink.write(block([[10, 20, 30, 40, 50, 60]], channels=(1, 2, 3, 4, 5, 6), index=k, start=time.time()))
         time.sleep(0.05)
     assert echo.stdout is not None
-    told = echo.stdout.read()
+    output = echo.stdout.read()
     echo.stdout.close()
     sink.close()
-    assert "force:" in told
-    assert "torque:" in told
-    assert "x: 4.0" in told
+    assert "force:" in output
+    assert "torque:" in output
+    assert "x: 4.0" in output
     assert sink.stats.error == ""
 
 
@@ -225,12 +225,12 @@ def test_a_command_topic_moves_an_actuator(shared: Master) -> None:
     command = ["/usr/bin/python3", *words]
     publisher = subprocess.Popen(command, env=shared.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        one = came.get(timeout=60)
+        message = came.get(timeout=60)
     finally:
         publisher.kill()
         publisher.wait()
         sink.close()
-    assert (one.uuid, one.channel, one.value) == (HAND, 2, 1.25)
+    assert (message.uuid, message.channel, message.value) == (HAND, 2, 1.25)
 
 
 def test_without_a_master_it_waits_and_says_for_what_then_carries_on(master: Master) -> None:

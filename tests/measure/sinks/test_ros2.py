@@ -68,7 +68,7 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
         yield number
 
 
-class Seen:
+class ReaderOutput:
     """What the reader prints, as it comes."""
 
     def __init__(self, program: Path, domain: int, publish: str, topics: dict[str, str]) -> None:
@@ -114,7 +114,7 @@ class TestSeenByFastDds:
         came: queue.Queue[SetPointCommand] = queue.Queue()
         sink = open_sink(f"ros2:{domain}", came.put)
         sink.open([ANGLE, OIL, GRIP, *AXES, DISTANCE], STATION)
-        seen = Seen(reader, domain, "rt/bench/hand/force/cmd", TOPICS)
+        seen = ReaderOutput(reader, domain, "rt/bench/hand/force/cmd", TOPICS)
         try:
             names = [name.rstrip("!") for name in TOPICS]
             end = time.monotonic() + 60
@@ -182,9 +182,9 @@ def test_nothing_leaves_this_machine_unless_asked(domain: int) -> None:
         finally:
             sink.close()
 
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         before = in_the_group()
-        one.setsockopt(
+        probe.setsockopt(
             socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, socket.inet_aton("239.255.0.1") + socket.inet_aton("127.0.0.1")
         )
         until(lambda: in_the_group() > before, "whoever joins is seen")

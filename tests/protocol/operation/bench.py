@@ -41,13 +41,13 @@ def channels() -> dict[int, ChannelHardware]:
 
 def channel_teds(facts: ChannelHardware, *, period: float | None = None, **changes: int | None) -> bytes:
     """A TransducerChannel TEDS that says what the hardware is, or something else."""
-    said = {"kind": int(facts.kind), "model": facts.model, "octets": facts.octets, "halt": facts.halt, **changes}
-    block = bytes.fromhex("030400030101") + bytes([11, 1, said["kind"] or 0])
-    block += bytes([18, 9, 40, 1, said["model"] or 0, 41, 1, said["octets"] or 0, 42, 1, 8])
+    values = {"kind": int(facts.kind), "model": facts.model, "octets": facts.octets, "halt": facts.halt, **changes}
+    block = bytes.fromhex("030400030101") + bytes([11, 1, values["kind"] or 0])
+    block += bytes([18, 9, 40, 1, values["model"] or 0, 41, 1, values["octets"] or 0, 42, 1, 8])
     if period is not None:
         block += bytes([23, 4]) + struct.pack(">f", period)
-    if said["halt"] is not None:
-        block += bytes([36, 1, said["halt"]])
+    if values["halt"] is not None:
+        block += bytes([36, 1, values["halt"]])
     return frame(block)
 
 

@@ -28,9 +28,9 @@ commands = st.tuples(
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.tuples(commands, st.integers(0, 50 * MS)), min_size=1, max_size=25), st.binary(max_size=20))
-def test_no_inner_command_makes_the_node_raise(said: list[tuple[tuple, int]], junk: bytes) -> None:
+def test_no_inner_command_makes_the_node_raise(commands: list[tuple[tuple, int]], junk: bytes) -> None:
     bench = Bench().open()
-    for (channel, (group, function), payload), pause in said:
+    for (channel, (group, function), payload), pause in commands:
         reply = bench.send(Command(0 if group == 128 else channel, group, function, payload))
         assert reply.ok or 1 <= (reply.reason or 0) <= 23
         bench.later(pause)
@@ -77,11 +77,11 @@ acts = st.one_of(
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(acts, st.integers(0, 60 * MS)), min_size=3, max_size=20))
-def test_no_key_and_nonce_come_twice_whatever_a_station_asks(said: list[tuple[Command | str, int]]) -> None:
+def test_no_key_and_nonce_come_twice_whatever_a_station_asks(commands: list[tuple[Command | str, int]]) -> None:
     Recording.used = []
     with patch("teds_provision.protocol.operation.streams.DatagramSealer", Recording):
         bench = Bench().open().operate(0)
-        for act, pause in said:
+        for act, pause in commands:
             if isinstance(act, Command):
                 bench.send(act)
             elif act == "idle":

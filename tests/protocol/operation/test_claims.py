@@ -111,10 +111,10 @@ def test_whatever_ends_a_claim_brings_the_actuator_to_its_safe_state(end: str) -
 @pytest.mark.parametrize("value", ["3.2", "Set"])
 def test_the_dead_man_lives_by_values_for_this_channel_alone(value: str) -> None:
     bench = Bench().open().operate(4, 6, dead_man=200)
-    told = write_data_set(4, VALUE) if value == "3.2" else set_values([(4, VALUE)])
+    command = write_data_set(4, VALUE) if value == "3.2" else set_values([(4, VALUE)])
     for _ in range(5):
         bench.later(150 * MS)
-        assert bench.send(told).ok
+        assert bench.send(command).ok
     assert not safe(bench)
     states = bench.operation().channels
     assert states[4] == (ChannelState.ACTUATOR | ChannelState.CLAIMED_HERE, 0xF1)

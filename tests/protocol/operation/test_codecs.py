@@ -171,8 +171,8 @@ def test_operate_and_arm(octets: bytes, life: int, action: int, channel: int, de
 
 @given(st.booleans(), st.dictionaries(st.integers(1, 255), st.tuples(u8.map(ChannelState), u8)))
 def test_operation(measuring: bool, channels: dict[int, tuple[ChannelState, int]]) -> None:
-    told = OperationReply(measuring, channels)
-    assert OperationReply.decode(told.encode()) == told
+    reply = OperationReply(measuring, channels)
+    assert OperationReply.decode(reply.encode()) == reply
 
 
 @given(
@@ -183,14 +183,14 @@ def test_operation(measuring: bool, channels: dict[int, tuple[ChannelState, int]
     st.none() | st.integers(-128, 126),
 )
 def test_power(flags: int, level: int | None, mv: int | None, ma: int | None, celsius: int | None) -> None:
-    told = PowerReply(flags, level, None if mv is None else mv / 1000, None if ma is None else ma / 1000, celsius)
-    assert PowerReply.decode(told.encode()) == told
+    reply = PowerReply(flags, level, None if mv is None else mv / 1000, None if ma is None else ma / 1000, celsius)
+    assert PowerReply.decode(reply.encode()) == reply
 
 
 @given(u64, u8, st.binary(max_size=100), u32)
 def test_samples_and_drive_values(tick: int, flags: int, data: bytes, until: int) -> None:
-    told = SampleReply(tick, flags, data)
-    assert SampleReply.decode(told.encode(), len(data)) == told
+    reply = SampleReply(tick, flags, data)
+    assert SampleReply.decode(reply.encode(), len(data)) == reply
     values = DriveValues(until, data)
     assert DriveValues.decode(values.encode()) == values
     assert drive_length(len(data)) == 4 + len(values.encode()) + 8

@@ -52,13 +52,13 @@ def message_key(bench: Bench) -> bytes:
 
 @pytest.mark.parametrize("fd", [False, True], ids=["classic", "FD"])
 def test_the_node_answers_and_streams_as_published(fd: bool) -> None:
-    bench, told = Bench(), KAT["open"]
-    load_dice(bench, int(told["c"], 16), SoftwareKey(int(told["En"]["d"], 16)))
+    bench, known = Bench(), KAT["open"]
+    load_dice(bench, int(known["c"], 16), SoftwareKey(int(known["En"]["d"], 16)))
     bench.ports["can:f1"] = SessionPort("can", "can", 0xF1, fd=fd)
-    session = StationSession(K, UUID, one_time=SoftwareKey(int(told["Es"]["d"], 16)))
-    opened = bench.tim.handle(bytes.fromhex(told["open_frame"]), link="can:f1", tapped=False)
-    assert opened.hex() == told["open_reply"]
-    assert session.request_counter().encode().hex() == told["c_frame"]
+    session = StationSession(K, UUID, one_time=SoftwareKey(int(known["Es"]["d"], 16)))
+    opened = bench.tim.handle(bytes.fromhex(known["open_frame"]), link="can:f1", tapped=False)
+    assert opened.hex() == known["open_reply"]
+    assert session.request_counter().encode().hex() == known["c_frame"]
 
     events = iter(range(0, 2000 * MS, 50 * MS))
     upcoming = next(events)

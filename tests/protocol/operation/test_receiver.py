@@ -149,7 +149,7 @@ def test_ticks_of_messages_that_do_not_go_forward_are_counted_and_not_believed(k
     taker = receiver(kind=kind, n=1)
     ticks = (0, 10, 10, 3, 20)
     messages = [sealed(k, body=(START + at * MS).to_bytes(8, "big") + b"ab") for k, at in enumerate(ticks)]
-    found = [one.tick - START if (one := taker.open_message(octets, LATER)) else None for octets in messages]
+    found = [opened.tick - START if (opened := taker.open_message(octets, LATER)) else None for octets in messages]
     assert found == [0, 10 * MS, None, None, 20 * MS]
     counted(taker, good=3, back=2)
 
@@ -257,10 +257,10 @@ def test_the_bound_grows_with_the_drift_of_both_clocks() -> None:
 
 
 def test_tokens_are_new_each_time_and_marks_are_held_against_the_frame() -> None:
-    one, other = TriggerToken.draw(), TriggerToken.draw()
-    assert one.octets != other.octets
-    assert len(one.octets) == 8
-    assert one.arm(Action.STOP, 5).commitment == one.commitment != other.commitment
+    first, other = TriggerToken.draw(), TriggerToken.draw()
+    assert first.octets != other.octets
+    assert len(first.octets) == 8
+    assert first.arm(Action.STOP, 5).commitment == first.commitment != other.commitment
     seen = TickBounds(START, START + MS)
     assert mark_is_honest(START, seen)
     assert not mark_is_honest(START + MS + 1, seen)

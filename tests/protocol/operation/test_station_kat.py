@@ -136,10 +136,10 @@ def test_keys_of_runs_are_those_of_the_vectors() -> None:
 
 
 def test_drive_messages_are_sealed_as_published() -> None:
-    told = KAT["drive"]
-    layout = Layout(tuple(told["channels"]), tuple(WIDTHS[channel] for channel in told["channels"]))
-    driver = Driver(layout, DriveReply(told["run"], told["length"]), MESSAGE_KEY, dead_man=10_000)
-    for entry in told["messages"]:
+    drive = KAT["drive"]
+    layout = Layout(tuple(drive["channels"]), tuple(WIDTHS[channel] for channel in drive["channels"]))
+    driver = Driver(layout, DriveReply(drive["run"], drive["length"]), MESSAGE_KEY, dead_man=10_000)
+    for entry in drive["messages"]:
         driver.next = entry["counter"]
         values = tuple(value.to_bytes(2, "big") for value in entry["values"])
         now = entry["until_us"] * 1000 - 20_000_000
@@ -155,13 +155,13 @@ def test_drive_messages_are_sealed_as_published() -> None:
 
 
 def test_the_trigger_is_the_vectors() -> None:
-    told = KAT["trigger"]
-    token = TriggerToken(bytes.fromhex(told["T"]))
-    assert token.commitment.hex() == told["C"]
-    identifier, data = can_frame(told["can"])
+    trigger = KAT["trigger"]
+    token = TriggerToken(bytes.fromhex(trigger["T"]))
+    assert token.commitment.hex() == trigger["C"]
+    identifier, data = can_frame(trigger["can"])
     assert (trigger_identifier(STATION), token.octets) == (identifier, data)
     assert trigger_station(identifier) == STATION
-    assert told["start"] == told["mark"] + START_AFTER_MARK
+    assert trigger["start"] == trigger["mark"] + START_AFTER_MARK
 
 
 def test_the_announce_is_the_vectors() -> None:

@@ -51,13 +51,13 @@ def test_what_a_token_tells_of_the_tries_left():
 def test_a_pin_pad_and_the_last_try():
     from pkcs11 import TokenFlag
 
-    class Shown:
+    class ShownToken:
         flags = TokenFlag.PROTECTED_AUTHENTICATION_PATH
 
     person, uri = Person(), Pkcs11Uri("/m.so", token="t")
-    assert ask_pin(Shown, uri, person) is None
-    Shown.flags = TokenFlag.USER_PIN_FINAL_TRY
-    assert ask_pin(Shown, uri, person) == PIN
+    assert ask_pin(ShownToken, uri, person) is None
+    ShownToken.flags = TokenFlag.USER_PIN_FINAL_TRY
+    assert ask_pin(ShownToken, uri, person) == PIN
     assert person.prompts == ["PIN of the token 't' (last attempt before it locks)"]
 
 
