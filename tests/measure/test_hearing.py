@@ -332,7 +332,7 @@ def test_two_threads_that_take_what_came_take_it_in_order() -> None:
 
 def test_a_message_of_before_its_stream_was_asked_for_is_not_kept_for_it() -> None:
     """It is one of the session before, which waited in the queue of the link."""
-    scene, port = Scene(ago=-60, fd=False), Silent()
+    scene, port = Scene(ago=-60, fd=False), SilentBus()
     with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
         hearing.expect(0x21, 0, scene.plan.length)
         since = hearing._early[0x21, 0].since
