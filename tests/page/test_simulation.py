@@ -25,6 +25,15 @@ def opening(station: client.Client, uuid: str) -> Any:
     return None if last is None or last["value"] is None else round(1000 * last["value"], 1)
 
 
+def await_start(lab: Lab) -> str:
+    """Wait until the one virtual transducer runs: a page that feeds it while it starts is refused after ten seconds."""
+    with client.connect(home=lab.station.home) as station:
+        [made] = until(
+            lambda: [one for one in station.request("GET", "/virtual")["virtual"] if one["state"] == "running"]
+        )
+    return str(made["uuid"])
+
+
 @pytest.mark.parametrize(
     "width",
     [
@@ -92,7 +101,8 @@ def test_values_are_set_by_keyboard_and_one_page_has_the_place(browser: Browser,
 def test_a_page_feeds_on_after_the_service_came_back(browser: Browser, fresh: Lab) -> None:
     fresh.run()
     with client.connect(home=fresh.station.home) as station:
-        made = station.request("POST", "/virtual", {"profile": "gripper", "name": "dummy", "source": "simulation"})
+        station.request("POST", "/virtual", {"profile": "gripper", "name": "dummy", "source": "simulation"})
+    uuid = await_start(fresh)
     with opened(browser, fresh, route="virtual") as page:
         button = page.get_by_role("button", name="Set values of dummy")
         button.click()
@@ -100,10 +110,11 @@ def test_a_page_feeds_on_after_the_service_came_back(browser: Browser, fresh: La
         fresh.end(signal.SIGKILL)
         page.get_by_role("alert").filter(has_text="no longer valid").wait_for()
         fresh.run()
+        await_start(fresh)
         page.get_by_text("Nothing feeds it").wait_for()
         button.click()
         page.get_by_text("Values are set on this page").first.wait_for()
         with client.connect(home=fresh.station.home) as station:
-            until(lambda: (station.node(made["uuid"])["verdict"] or {}).get("verdict") == "authentic")
-            station.request("POST", "/measurements", {"uuids": [made["uuid"]], "rate": 20})
-            until(lambda: opening(station, made["uuid"]) == 55.0)
+            until(lambda: (station.node(uuid)["verdict"] or {}).get("verdict") == "authentic")
+            station.request("POST", "/measurements", {"uuids": [uuid], "rate": 20})
+            until(lambda: opening(station, uuid) == 55.0)
