@@ -120,7 +120,7 @@ run(["--help"])
     assert "The plant" not in help_text
 
 
-def test_the_demo_tells_the_whole_story(core: Path) -> None:
+def test_the_demo_shows_the_whole_story(core: Path) -> None:
     done = run(core, "-m", "teds_provision", "--json", "demo", patience=10 * PATIENCE)
     assert done.returncode == 0, done.stderr[-2000:]
     assert json.loads(done.stdout.splitlines()[-1])["verdict"] == "authentic"

@@ -13,7 +13,7 @@ from teds_provision.errors import EXIT_CODES, LinkError, NotFoundError
 from tests.parsed import parsed
 
 
-def test_a_word_that_nobody_can_read_is_cut_in_the_middle() -> None:
+def test_an_unreadable_word_is_cut_in_the_middle() -> None:
     error = NotFoundError(f"No node is known as {'x' * 5000!r}, and no file.", hint="Look.")
     assert len(error.message) < 400
     assert error.message.startswith("No node is known as 'xxx")

@@ -101,7 +101,7 @@ def test_a_device_is_never_replaced(tmp_path: Path, link: bool) -> None:
 
 
 @pytest.mark.parametrize("folder", ["/tmp", "/dev/shm"])
-def test_a_named_pipe_is_no_file_wherever_it_lies(folder: str) -> None:
+def test_a_named_pipe_is_no_file_in_any_folder(folder: str) -> None:
     """Below /dev/shm it was taken for a shell's ``<(command)``, and reading it waited for ever."""
     with tempfile.TemporaryDirectory(dir=folder) as made:
         pipe = Path(made) / "pipe"
@@ -193,7 +193,9 @@ def test_a_private_folder_that_others_made_or_may_enter_is_refused(tmp_path: Pat
             private_folder(tmp_path / name)
 
 
-def test_a_folder_that_cannot_be_brought_to_the_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_cannot_be_brought_to_the_disk_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     real = os.fsync
 
     def broken(descriptor: int) -> None:

@@ -162,7 +162,7 @@ def test_the_readme_lists_the_sources_of_the_c_library_from_the_bottom_up(house:
     assert too_low == []
 
 
-def test_each_source_of_the_c_library_has_a_header_and_names_of_its_own(house: ModuleType) -> None:
+def test_each_source_of_the_c_library_has_its_own_header_and_unique_names(house: ModuleType) -> None:
     headers = {path.stem for path in (ROOT / "firmware" / "src").glob("*.h")}
     assert house.c_sources().keys() - headers == {"node", "t4t"}, "their interface is the boards' alone, in teds/node.h"
     assert headers - house.c_sources().keys() == {"inside"}, "a header without a source"

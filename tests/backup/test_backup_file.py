@@ -21,7 +21,7 @@ from teds_provision.station.store.records import NodeRecord
 from tests.backup.backups import ONE, POINT, TWO, back_up, copy_of, opened, opened_octets, restored_into
 
 
-def test_the_file_is_private_whole_and_tells_nothing_secret(station: Station, tmp_path: Path) -> None:
+def test_the_file_is_private_whole_and_holds_no_secret(station: Station, tmp_path: Path) -> None:
     path = tmp_path / "station.backup"
     done = back_up(station, path)
     octets = path.read_bytes()
@@ -36,7 +36,7 @@ def test_the_file_is_private_whole_and_tells_nothing_secret(station: Station, tm
     assert "material" not in repr(opened(path))
 
 
-def test_a_wrong_passphrase_and_every_kind_of_damage_are_told_apart(station: Station, tmp_path: Path) -> None:
+def test_a_wrong_passphrase_and_every_kind_of_damage_are_distinguished(station: Station, tmp_path: Path) -> None:
     path = tmp_path / "station.backup"
     back_up(station, path)
     octets = path.read_bytes()

@@ -125,7 +125,7 @@ def test_keys_given_up_since_are_not_brought_back(station: Station, tmp_path: Pa
     assert station.keys.keys_of(ONE) == []
 
 
-def test_a_node_that_was_pinned_anew_keeps_its_new_key(station: Station, tmp_path: Path) -> None:
+def test_a_node_that_was_pinned_again_keeps_its_new_key(station: Station, tmp_path: Path) -> None:
     station.pins.put(WhitelistEntry(ONE, "ab" * 32, assurance="tap"))
     back_up(station, tmp_path / "b")
     station.pins.remove(ONE)
@@ -255,7 +255,7 @@ def test_marks_on_nodes_do_not_go_back_and_come_forward(station: Station, tmp_pa
         assert (store.keys.rotation_due(ONE), store.keys.rotation_due(TWO)) == ("due", "due")
 
 
-def test_a_key_that_the_vault_does_not_open_is_told_when_backing_up(station: Station, tmp_path: Path) -> None:
+def test_a_key_that_the_vault_does_not_open_is_reported_when_backing_up(station: Station, tmp_path: Path) -> None:
     with closing(sqlite3.connect(station.home / "store.sqlite3")) as connection, connection:
         connection.execute("UPDATE keys SET wrapped = zeroblob(60) WHERE uuid = ? AND epoch = 1", (ONE,))
     assert "1 key in the store cannot be opened under this vault" in back_up(station, tmp_path / "b").warnings[0]

@@ -96,7 +96,7 @@ def test_a_fault_of_the_link_is_found(
 
 
 OTHER_CHOICE = pytest.mark.nightly(
-    "tests/check/test_link_rules.py::test_what_a_node_may_choose_is_told_and_not_failed, one choice of four; "
+    "tests/check/test_link_rules.py::test_what_a_node_may_choose_is_reported_and_not_failed, one choice of four; "
     "tests/links/can/test_can_small_nodes.py::test_a_node_asks_for_its_own_block_size_and_gap"
 )
 
@@ -110,7 +110,7 @@ OTHER_CHOICE = pytest.mark.nightly(
         pytest.param("gap of 5 ms", "block size 16, STmin 5 ms", marks=OTHER_CHOICE),
     ],
 )
-def test_what_a_node_may_choose_is_told_and_not_failed(station: Station, choice: str, message: str) -> None:
+def test_what_a_node_may_choose_is_reported_and_not_failed(station: Station, choice: str, message: str) -> None:
     """Small controllers need a block size of 0, or 20 ms between frames: they failed."""
     report = checked(station, choice, "can")
     assert broken(report) == {}

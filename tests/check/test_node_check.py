@@ -296,7 +296,7 @@ def test_a_board_that_is_busy_for_ever_fails_and_is_not_skipped(station: Station
 
 
 @pytest.mark.parametrize("bend", [opening_so(tag_label=b"node open\0"), opening_so(swapped=True)])
-def test_what_needs_a_session_is_skipped_where_none_opens(
+def test_what_needs_a_session_is_skipped_if_none_opens(
     station: Station, patch: pytest.MonkeyPatch, bend: object
 ) -> None:
     """One slip failed 29 rules, each of which accused the key."""
@@ -323,7 +323,7 @@ def test_a_node_of_ours_that_opens_no_session_is_not_taken_for_another_owners(
 
 
 @pytest.mark.parametrize("over", ["nfc", "can"])
-def test_explain_tells_an_agreement_that_is_never_confirmed(
+def test_explain_names_an_agreement_that_is_never_confirmed(
     station: Station, patch: pytest.MonkeyPatch, over: str
 ) -> None:
     board = nodes.made(over)
@@ -347,7 +347,7 @@ def test_explain_shows_what_is_due_beside_what_came(station: Station, patch: pyt
 
 
 @pytest.mark.parametrize("over", ["nfc", "can"])
-def test_explain_of_a_node_of_ours_never_tells_its_key(station: Station, patch: pytest.MonkeyPatch, over: str) -> None:
+def test_explain_of_a_node_of_ours_never_prints_its_key(station: Station, patch: pytest.MonkeyPatch, over: str) -> None:
     board = Board()
     agreed(station, board)
     held = board.state.key

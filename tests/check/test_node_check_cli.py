@@ -61,7 +61,7 @@ def test_a_virtual_node_on_a_bus_keeps_every_rule(desk: Desk) -> None:
     assert "explain" not in report
 
 
-def test_explain_prints_a_test_agreement_and_no_key_of_anybody(desk: Desk) -> None:
+def test_explain_prints_a_test_agreement_and_no_key_of_a_node(desk: Desk) -> None:
     desk.node().start(nfc=False, can=True)
     outcome = check(desk, "bench", "check", "--explain")
     assert outcome.code == 0, outcome

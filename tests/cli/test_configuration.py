@@ -155,7 +155,7 @@ def test_a_shell_is_offered_what_fits(home: Path, words: str, offered: str) -> N
     assert offered in [row.partition(",")[2] for row in done.stdout.splitlines()], done.stdout + done.stderr
 
 
-def test_a_setting_is_written_beside_what_stands_there_and_taken_away_again(home: Path) -> None:
+def test_a_setting_is_written_beside_the_others_and_removed_again(home: Path) -> None:
     file = home / "config.toml"
     before = '# the bench\n\ncan = "socketcan:can9"  # left\n\n[provision]  # one\n# patience\ntimeout = 5\n'
     file.write_text(before)

@@ -61,7 +61,7 @@ def test_a_broken_config_stops_every_command_but_doctor(home: Path) -> None:
     assert "no_input" not in config["why"]
 
 
-def test_values_that_no_command_takes_and_profiles_that_cannot_be_read_are_told(home: Path) -> None:
+def test_values_that_no_command_takes_and_profiles_that_cannot_be_read_are_reported(home: Path) -> None:
     """Both were passed over: only ``config show`` and the command itself said so."""
     (home / "config.toml").write_bytes(b"\xef\xbb\xbf[provision]\ntimeout = -3\n")
     (home / "profiles").mkdir()

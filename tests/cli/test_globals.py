@@ -45,7 +45,7 @@ def test_help_and_version_load_nothing_heavy(words: list[str]) -> None:
     assert done.out
 
 
-def test_version_is_told() -> None:
+def test_version_is_printed() -> None:
     assert spawn("--version").out == f"teds-provision {__version__}\n"
     assert call(Path("/nonexistent"), "--version").out == f"teds-provision {__version__}\n"
 
@@ -139,7 +139,7 @@ def test_debug_alone_shows_a_traceback(home: Path) -> None:
     assert "Traceback" in spawn("--home", home, "nodes", "none", environment=environment).err
 
 
-def test_a_bug_is_told_as_one_without_a_traceback(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bug_is_reported_as_one_without_a_traceback(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError("secret detail")
 
@@ -216,7 +216,7 @@ def test_variables_stand_for_options(home: Path, tmp_path: Path) -> None:
     assert spawn("doctor", environment=environment).code == 5
 
 
-def test_config_toml_stands_for_options_and_the_command_line_goes_before_it(home: Path) -> None:
+def test_config_toml_replaces_options_and_the_command_line_overrides_it(home: Path) -> None:
     (home / "config.toml").write_text('can = "nonsense"\ndry-run = true\n\n[log]\nlast = 0\n')
     assert call(home, "doctor").code == 5
     assert call(home, "doctor", "--can", "udp_multicast:239.74.99.8?port=47008").code == 0
@@ -296,7 +296,7 @@ def test_a_passphrase_that_is_typed_is_not_shown(home: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("line", "code"), [(b"", "wrong-passphrase"), (b"\n", "wrong-passphrase")])
-def test_an_empty_passphrase_descriptor_is_told(home: Path, tmp_path: Path, line: bytes, code: str) -> None:
+def test_an_empty_passphrase_descriptor_is_reported(home: Path, tmp_path: Path, line: bytes, code: str) -> None:
     read, write = os.pipe()
     os.write(write, line)
     os.close(write)
@@ -314,7 +314,7 @@ def test_a_passphrase_descriptor_that_is_closed_is_usage(home: Path, tmp_path: P
     assert "77" in outcome.json["error"]["message"]
 
 
-def test_a_passphrase_that_is_no_text_is_told_and_not_shown(home: Path, tmp_path: Path) -> None:
+def test_a_passphrase_that_is_no_text_is_reported_and_not_shown(home: Path, tmp_path: Path) -> None:
     read, write = os.pipe()
     os.write(write, b"\xff\xfe hidden words \n")
     os.close(write)

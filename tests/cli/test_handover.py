@@ -126,7 +126,7 @@ def test_an_export_again_finds_nothing_to_do(homes: Homes) -> None:
     assert (path.read_bytes(), homes.state(homes.north)) == (octets, before)
 
 
-def test_a_dry_run_tells_and_changes_nothing(homes: Homes) -> None:
+def test_a_dry_run_reports_and_changes_nothing(homes: Homes) -> None:
     before = homes.state(homes.north), homes.state(homes.south)
     output = homes.folder / "keys.jwe"
     plan = homes.run(homes.north, "export-keys", "--to", "south", "--all", "--mode", "move", "--output", output,
@@ -162,7 +162,7 @@ def test_people_are_shown_both_fingerprints_in_fours_and_what_it_means(homes: Ho
     assert "will be trusted for these nodes only" in done.err
 
 
-def test_a_move_tells_who_else_holds_a_copy(homes: Homes) -> None:
+def test_a_move_lists_who_else_holds_a_copy(homes: Homes) -> None:
     from teds_provision.station.store.records import TrustRecord
 
     north = open_station(homes.north)
@@ -177,7 +177,7 @@ def test_a_move_tells_who_else_holds_a_copy(homes: Homes) -> None:
     assert "also held by west from an earlier copy" in outcome.err
 
 
-def test_it_asks_and_nobody_answers(homes: Homes) -> None:
+def test_it_asks_and_gets_no_answer(homes: Homes) -> None:
     output = homes.folder / "keys.jwe"
     homes.refused(6, "export-keys", "--to", "south", "--all", "--output", output, home=homes.north)
     assert not output.exists()
@@ -438,7 +438,7 @@ def test_100_mb_of_junk_are_refused_without_being_read(homes: Homes, tmp_path: P
     homes.refused(8, "import-keys", path, "--yes")
 
 
-def test_no_file_at_all(homes: Homes) -> None:
+def test_no_file(homes: Homes) -> None:
     homes.refused(3, "import-keys", homes.folder / "none", "--yes")
     homes.refused(3, "handover", "receipt", homes.folder / "none")
     homes.refused(3, "handover", "undo", "12345678", "--yes")

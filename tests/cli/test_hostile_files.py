@@ -27,7 +27,7 @@ READERS = (
     "whitelist import --format csv", "whitelist import --format json", "build UUID --profile",
 )  # fmt: skip
 NO_FILE = pytest.mark.nightly(
-    "tests/cli/test_hostile_files.py::test_a_pipe_that_nobody_writes_to_is_no_file holds for each command that it "
+    "tests/cli/test_hostile_files.py::test_a_pipe_without_a_writer_is_no_file holds for each command that it "
     "opens files alone; three of the six are tried with a device too"
 )
 HERE = "tests/cli/test_hostile_files.py::test_a_large_file_of_the_wrong_kind_costs_little"
@@ -98,7 +98,7 @@ def fifo(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("command", READERS)
-def test_a_pipe_that_nobody_writes_to_is_no_file(bench: Path, command: str, fifo: Path) -> None:
+def test_a_pipe_without_a_writer_is_no_file(bench: Path, command: str, fifo: Path) -> None:
     """Every one of them waited for ever."""
     began = time.monotonic()
     outcome = call(bench, "--json", *arranged(bench, command, fifo))

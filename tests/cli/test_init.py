@@ -113,7 +113,7 @@ def test_two_inits_at_once_make_one_station(tmp_path: Path) -> None:
     assert first == second
 
 
-def test_why_where_and_how_long_is_said_before_anybody_is_asked(tmp_path: Path) -> None:
+def test_why_where_and_how_long_is_shown_before_a_question_is_asked(tmp_path: Path) -> None:
     done = call(tmp_path / "new", "init", "--keystore", "file")
     assert done.code == 0, done
     stderr = done.err

@@ -168,7 +168,7 @@ def test_groups_names_and_measurements_follow_the_spare_and_forget_what_is_gone(
         assert station.measurements.names == {}, "the names are free again"
 
 
-def test_revoked_for_good(yard: Yard) -> None:
+def test_revoked_permanently(yard: Yard) -> None:
     node = yard.provisioned()
     assert yard.run("north", "revoke", node.uuid, "--why", "stolen").code == 6
     assert yard.done("north", "revoke", node.uuid, "--why", "stolen", "--dry-run")["keys"] == 1

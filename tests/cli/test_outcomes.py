@@ -153,7 +153,7 @@ def test_json_is_json_whatever_stdout_can_write(tmp_path: Path) -> None:
         assert outcome.json["whitelist"][0]["name"] == name
 
 
-def test_what_is_wrong_with_a_link_is_told_before_anyone_is_asked_for_a_passphrase(tmp_path: Path) -> None:
+def test_what_is_wrong_with_a_link_is_reported_before_a_passphrase_is_asked_for(tmp_path: Path) -> None:
     station = make_station(tmp_path)
     station.pins.put(WhitelistEntry(Board.uuid))
     station.close()
@@ -199,7 +199,9 @@ def test_a_value_has_no_digits_that_its_uncertainty_makes_noise_of(
         (f"measuring-{hashlib.sha256(b'hand').hexdigest()}.lock", ("group", "delete", "hand")),
     ],
 )
-def test_a_home_that_takes_no_lock_is_told_as_a_store_that_fails(home: Path, lock: str, words: tuple[str, ...]) -> None:
+def test_a_home_that_takes_no_lock_is_reported_as_a_store_that_fails(
+    home: Path, lock: str, words: tuple[str, ...]
+) -> None:
     """A disk that is read only from then on refused the lock first of all: that was "a bug" (make faults, EROFS)."""
     assert call(home, "group", "create", "hand").code == 0
     if lock.endswith("/"):

@@ -223,7 +223,7 @@ def test_another_file_of_this_program_is_called_what_it_is(show, tmp_path, octet
     assert command in err
 
 
-def test_several_files_are_told_apart(show, show_json):
+def test_several_files_are_distinguished(show, show_json):
     files = [VECTORS / "x07_name.hex", VECTORS / "x07_meta.hex"]
     _, out, _ = show(*files)
     assert all(file.name in out for file in files)
@@ -374,7 +374,7 @@ def test_usage(show, image):
     assert show(image, "--format", "xml", before=("--json",))[0] == 2
 
 
-def test_an_error_is_json_where_json_is_asked(show, tmp_path):
+def test_an_error_is_json_if_json_is_requested(show, tmp_path):
     code, out, _ = show(tmp_path / "nothing", before=("--json",))
     assert (code, json.loads(out)["error"]["code"]) == (3, "not-found")
 

@@ -72,7 +72,7 @@ def test_usage(home: Path, pem: Path) -> None:
     assert call(home, "--json", "trust", "add", "lab", pem.parent / "none.pem", "--yes").code == 3
 
 
-def test_a_station_without_a_ca_of_its_own(home: Path, tmp_path: Path) -> None:
+def test_a_station_without_its_own_ca(home: Path, tmp_path: Path) -> None:
     east, asked, cert = tmp_path / "east", tmp_path / "east.request", tmp_path / "east.cert"
     for _ in range(2):
         made = unlocked(east, "init", "--name", "east", "--keystore", "file", "--request", asked)

@@ -253,7 +253,7 @@ def test_the_versions_asked_for_are_those_of_the_project() -> None:
     assert {name: declared[name] for name in doctor_machine._LIBRARIES} == doctor_machine._LIBRARIES
 
 
-def test_a_missing_an_old_and_a_shadowing_library_are_told(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_an_old_and_a_shadowing_library_are_reported(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
     real = metadata.version
 
     def version(name: str) -> str:
@@ -269,7 +269,7 @@ def test_a_missing_an_old_and_a_shadowing_library_are_told(system: System, monke
     assert (ndeflib.result, "pip uninstall --yes ndef" in ndeflib.fix) == ("failed", True)
 
 
-def test_a_clock_that_went_back_is_told(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_that_went_back_is_reported(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:
     assert look(stationed, "clock")[0].result == "ok"
     monkeypatch.setattr("teds_provision.station.store.audit.utc_now", lambda: "2099-01-01T00:00:00Z")
     with Store.open(stationed.home) as store:
@@ -283,7 +283,7 @@ def test_a_clock_that_went_back_is_told(stationed: System, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize(("ahead", "result"), [(0, "ok"), (86_000, "warning")])
-def test_a_hardware_clock_that_differs_is_told(system: System, ahead: int, result: str) -> None:
+def test_a_hardware_clock_that_differs_is_reported(system: System, ahead: int, result: str) -> None:
     clock = system.at("/sys/class/rtc/rtc0/since_epoch")
     clock.parent.mkdir(parents=True)
     clock.write_text(f"{int(time.time()) + ahead}\n")
@@ -353,7 +353,7 @@ def test_who_holds_the_store_is_named(stationed: System) -> None:
     assert (lock.result, lock.why) == ("ok", "The store is not locked.")
 
 
-def test_a_lost_passphrase_file_is_told_without_asking_for_anything(stationed: System) -> None:
+def test_a_lost_passphrase_file_is_reported_without_asking_for_anything(stationed: System) -> None:
     (stationed.home / "vault.json").unlink()
     vault = by_name(stationed)["vault"]
     assert (vault.result, "restore" in vault.fix) == ("failed", True)
@@ -447,7 +447,7 @@ def test_the_keys_folder_of_this_project_holds_no_private_key() -> None:
 # -- the fleet ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_broken_config_is_told_and_the_rest_is_still_looked_at(stationed: System) -> None:
+def test_a_broken_config_is_reported_and_the_rest_is_still_looked_at(stationed: System) -> None:
     (stationed.home / "config.toml").write_text("home = [")
     found = by_name(stationed)
     assert (found["config"].result, found["store"].result) == ("failed", "ok")
@@ -473,7 +473,7 @@ def test_a_store_that_is_gone_beside_its_vault_is_a_failure(stationed: System) -
     assert (found.result, "restore" in found.fix) == ("failed", True)
 
 
-def test_what_waits_for_somebody_is_told(stationed: System) -> None:
+def test_what_waits_for_a_person_is_reported(stationed: System) -> None:
     assert look(stationed, "nodes")[0].result == "ok"
     with Station.inspect(stationed.home) as store:
         for number in range(3):
@@ -493,7 +493,7 @@ def test_what_waits_for_somebody_is_told(stationed: System) -> None:
     assert "2099-01-01T00:00:00Z" in found[-1].fix  # a session today would change nothing
 
 
-def test_seals_are_checked_where_the_passphrase_is_given(stationed: System) -> None:
+def test_seals_are_checked_if_the_passphrase_is_given(stationed: System) -> None:
     assert look(stationed, "seals")[0].result == "skipped"
     forget_vaults()
     system = replace(stationed, ask=lambda prompt, confirm: PASSPHRASE)
@@ -540,7 +540,7 @@ def verdicts(system: System) -> dict[str, tuple[str, bool]]:
     }
 
 
-def test_of_a_large_store_a_sample_is_checked_and_said_to_be_one(crowded: System) -> None:
+def test_of_a_large_store_a_sample_is_checked_and_named_as_one(crowded: System) -> None:
     assert verdicts(crowded) == dict.fromkeys(("store", "audit log", "seals"), ("ok", True))
     assert all("--full" in finding.why for finding in look(crowded, "seals"))
     whole = replace(crowded, full=True)

@@ -93,7 +93,7 @@ def test_what_was_put_onto_the_node_by_hand_stays_until_something_else_is_named(
     assert node.octets == written
 
 
-def test_an_older_datasheet_is_brought_back_signed_anew(station: Station, node: Node) -> None:
+def test_an_older_datasheet_is_restored_under_a_new_signature(station: Station, node: Node) -> None:
     node.start()
     links = station.desk.links.over("nfc")
     for name in ("one", "two"):

@@ -155,7 +155,7 @@ def test_a_node_that_moves_away_in_the_transfer_is_5(station: Station, node: Nod
 
 NO_KEY = pytest.mark.nightly(
     "tests/provisioning/test_provision.py::test_power_cut_at_every_flash_commit; the flash that fails at the datasheet "
-    "is here, and tests/provisioning/test_provision.py::test_a_broken_flash_is_told"
+    "is here, and tests/provisioning/test_provision.py::test_a_broken_flash_is_reported"
 )
 
 

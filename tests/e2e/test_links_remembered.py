@@ -53,7 +53,7 @@ def test_a_node_is_found_where_it_was_met_last_and_the_program_alone_says_who_is
     assert station.ask("verify", ARM)["verdict"] == "authentic"
 
 
-def test_a_remembered_bus_keeps_nobody_from_a_tap(desk: Desk, station: Station, node: Node) -> None:
+def test_a_remembered_bus_prevents_no_tap(desk: Desk, station: Station, node: Node) -> None:
     node.start(nfc=False, can=True)
     station.provision("can", "--profile", ANGLE)
     node.stop()
@@ -66,7 +66,7 @@ def test_a_remembered_bus_keeps_nobody_from_a_tap(desk: Desk, station: Station, 
     assert "reader" in agreed["message"], "a key is agreed on by a tap unless a bus is named"
 
 
-def test_an_empty_bus_is_told_with_the_time_that_was_listened(station: Station) -> None:
+def test_an_empty_bus_is_reported_with_the_time_that_was_listened(station: Station) -> None:
     bus = free_bus()
     outcome = station.run("identify", "--can", bus, "--timeout", "1.5")
     assert f"No node answered on {bus.partition(chr(63))[0]} within 1.5 s" in outcome.err

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.link
 LOSSY = (sys.executable, "-m", "tests.links.can.lossy")
 
 
-def test_a_node_is_provisioned_where_one_frame_in_a_hundred_is_lost(desk: Desk, station: Station) -> None:
+def test_a_node_is_provisioned_if_one_frame_in_a_hundred_is_lost(desk: Desk, station: Station) -> None:
     """Nine of ten first tries succeed: here one node, and a second try where it is the tenth."""
     node = desk.node()
     node.start(nfc=False, can=True)

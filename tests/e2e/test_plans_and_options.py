@@ -67,7 +67,7 @@ def test_a_dry_run_on_a_finished_node_changes_nothing(station: Station, finished
     assert not (tmp_path / "i.json").exists()
 
 
-def test_nobody_is_asked_with_no_input(station: Station, node: Node) -> None:
+def test_no_question_is_asked_with_no_input(station: Station, node: Node) -> None:
     node.start()
     links = station.desk.links.over("nfc")
     before = node.octets
@@ -128,7 +128,7 @@ def test_a_config_that_is_no_toml_is_8(station: Station) -> None:
 @pytest.mark.parametrize(
     "bad", ["home = 3\n", 'timeout = "soon"\n', 'via = "radio"\n', "nmae = 1\n[identify]\nx = 1\n"]
 )
-def test_nonsense_in_a_config_is_told_without_a_traceback(station: Station, bad: str) -> None:
+def test_nonsense_in_a_config_is_reported_without_a_traceback(station: Station, bad: str) -> None:
     (station.home / "config.toml").write_text(bad)
     outcome = station.run("--json", "identify", "--timeout", "0.5", "--nfc", station.desk.links.nfc)
     assert outcome.code in (2, 5, 8), outcome

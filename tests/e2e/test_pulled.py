@@ -135,7 +135,7 @@ def serial(field: Field) -> Iterator[tuple[str, subprocess.Popen[str]]]:
 
 @pytest.mark.nightly(
     "tests/e2e/test_pulled_steps.py::test_above_the_udp_driver; the same driver and chip are held by "
-    "tests/e2e/test_pulled.py::test_a_pn532_needs_few_host_commands_and_one_lost_answer_is_not_told"
+    "tests/e2e/test_pulled.py::test_a_pn532_needs_few_host_commands_and_one_lost_answer_is_not_reported"
 )
 def test_pulled_above_a_pn532_on_a_serial_line(
     station: Station, field: Field, boards: list[tuple[str, str]], serial: tuple[str, subprocess.Popen[str]]
@@ -148,7 +148,7 @@ def test_pulled_above_a_pn532_on_a_serial_line(
 
 # Four processes play the chip, which gives a tag its time-outs of a tenth of a second: one late is a tag lifted.
 @pytest.mark.realtime
-def test_a_pn532_needs_few_host_commands_and_one_lost_answer_is_not_told(
+def test_a_pn532_needs_few_host_commands_and_one_lost_answer_is_not_reported(
     station: Station, field: Field, boards: list[tuple[str, str]], serial: tuple[str, subprocess.Popen[str]]
 ) -> None:
     place, process = serial

@@ -108,7 +108,7 @@ def test_a_person_reads_one_line_for_each_node(station: Station, node: Node) -> 
     assert outcome.out.count("\n") == 1
 
 
-def test_several_readers_serve_several_taps_and_a_slow_board_holds_nobody_up(desk: Desk, station: Station) -> None:
+def test_several_readers_serve_several_taps_and_a_slow_board_delays_no_other(desk: Desk, station: Station) -> None:
     """Two readers; the board on one takes its time over each point operation, the other one passes meanwhile."""
     slow, quick = desk.node("slow"), desk.node("quick")
     ports = [desk.links.nfc, free_reader()]

@@ -185,7 +185,7 @@ def test_people_see_steps_on_stderr_and_a_summary_on_stdout(station: Station, no
     assert "authentic" in quiet.out
 
 
-def test_the_log_tells_every_act_and_no_secret(station: Station, node: Node) -> None:
+def test_the_log_has_every_act_and_no_secret(station: Station, node: Node) -> None:
     node.start()
     station.provision("nfc", "--profile", ANGLE)
     outcome = station.run("--json", "log")
@@ -226,7 +226,7 @@ def test_a_fresh_home_needs_only_init(desk: Desk, tmp_path: Path) -> None:
 
 
 @pytest.mark.needs("its own datasheet")
-def test_the_summary_tells_limits_and_readings_in_one_unit(station: Station, desk: Desk, tmp_path: Path) -> None:
+def test_the_summary_states_limits_and_readings_in_one_unit(station: Station, desk: Desk, tmp_path: Path) -> None:
     node = desk.node("hand", type_="gripper").start()
     file = tmp_path / "hand.csv"
     file.write_text("channel,raw,value [mm]\n" + "".join(f"{n},0,0\n{n},4095,110\n" for n in (1, 2)))
@@ -240,7 +240,7 @@ def test_the_summary_tells_limits_and_readings_in_one_unit(station: Station, des
     assert node.uuid in done.out
 
 
-def test_a_draft_renames_nobody_until_it_is_written(station: Station, desk: Desk, node: Node) -> None:
+def test_a_draft_renames_no_node_until_it_is_written(station: Station, desk: Desk, node: Node) -> None:
     """`build --name` renamed the node in every list and topic, and it kept that name when the draft was dropped."""
     node.start(nfc=False, can=True)
     other = desk.node("other").start(nfc=False, can=True)

@@ -257,7 +257,7 @@ def test_a_drive_message_is_one_whole_write_under_0() -> None:
     twins.c.close()
 
 
-def test_it_advertises_after_a_tap_and_drops_whoever_has_no_session() -> None:
+def test_it_advertises_after_a_tap_and_drops_stations_without_a_session() -> None:
     twins = Twins(1)
     node = twins.c
     node.has_nfc()

@@ -136,7 +136,7 @@ def test_a_gripper_moves_and_lets_go_when_its_station_is_gone(desk: Desk) -> Non
     until(lambda: servo(board)[-1]["servo"] == "off")
 
 
-def test_a_board_whose_frames_nobody_acknowledges_leaves_the_processor_to_others(desk: Desk) -> None:
+def test_a_board_whose_frames_are_not_acknowledged_leaves_the_processor_to_others(desk: Desk) -> None:
     """Its plug is out: the Announce stays with the controller, and a reply that is due waits behind it."""
     board = powered(desk, LOAD, 3, TEDS_CAN_DEAF="1")
     bus = Bus(parse_spec(desk.links.can))
@@ -185,7 +185,7 @@ def test_the_sizes_of_kconfig_are_those_that_compile() -> None:
 
 
 @pytest.mark.parametrize("name", [LOAD, GRIPPER])
-def test_what_zephyr_needs_lies_beside_each_board(name: str) -> None:
+def test_what_zephyr_needs_is_beside_each_board(name: str) -> None:
     """West builds it from these; nothing of that can run here."""
     folder = builds.FIRMWARE / "boards" / name
     words = (folder / "CMakeLists.txt").read_text()
@@ -216,7 +216,7 @@ def test_kconfig_takes_in_what_psa_is_asked_for() -> None:
     assert all(f"\tselect PSA_WANT_ALG_{item}\n" in kconfig for item in asked)
 
 
-def test_zephyr_is_skipped_with_a_line_where_there_is_no_tree() -> None:
+def test_zephyr_is_skipped_with_a_line_if_there_is_no_tree() -> None:
     """`make firmware-zephyr` builds against a tree that is given; without one nothing fails."""
     build = str(builds.FIRMWARE / "zephyr" / "build.sh")
     for words, message in (([], "no Zephyr tree. Give one"), ([str(builds.FIRMWARE)], "is no Zephyr tree")):

@@ -35,7 +35,7 @@ _SENSOR, _ACTUATOR, _EVENT = 0, 1, 2
         ([(number, _SENSOR, 1) for number in range(1, 10)], False),
     ],
 )
-def test_a_channel_table_that_cannot_be_served_is_told_at_the_start(
+def test_a_channel_table_that_cannot_be_served_is_reported_at_the_start(
     table: list[tuple[int, int, int]], starts: bool
 ) -> None:
     """-1, and not a channel that is never heard of."""
@@ -132,7 +132,7 @@ int main(void)
 @pytest.mark.parametrize(
     "library", ["-DTEDS_NFC=1", "-DTEDS_BLE=1", "-DTEDS_STAGING=8192", "-DTEDS_OPERATION=0", "-DTEDS_SHA256_OCTETS=256"]
 )
-def test_a_board_that_was_compiled_with_other_options_is_told_before_anything_is_written(
+def test_a_board_that_was_compiled_with_other_options_is_reported_before_anything_is_written(
     library: str, tmp_path: Path
 ) -> None:
     """The library's node may be larger than the board's: the octets behind it are not its own."""

@@ -565,7 +565,7 @@ def test_on_trial_nothing_stored_changes_until_it_is_confirmed() -> None:
     assert desk.node.identity().state == 0
 
 
-def test_a_trial_that_nobody_confirms_restarts_after_ten_minutes() -> None:
+def test_an_unconfirmed_trial_restarts_after_ten_minutes() -> None:
     desk = Board.make().keyed()
     desk.firmware.flags = SIGNED | ON_TRIAL
     desk.restart()

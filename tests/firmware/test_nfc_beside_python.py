@@ -235,7 +235,7 @@ def reader_frame(dice: random.Random, number: int, length: int) -> bytes:
     return dice.choice((b"\xc2", b"\xf2\x01", bytes((dice.choice((0x00, 0x40, 0xD0, 0xFF)),)) + dice.randbytes(2)))
 
 
-def test_what_a_deselected_tag_and_one_that_was_asked_nothing_say() -> None:
+def test_what_a_deselected_tag_and_one_that_was_asked_nothing_reply() -> None:
     node = MemoryNode(lambda kind, size: NODE.secret() if kind == "i" else bytes(size), lambda: 0.0, uuid=UUID)
     node.has_nfc()
     assert node.start() == 0

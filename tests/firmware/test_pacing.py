@@ -67,7 +67,7 @@ def test_an_answer_is_in_the_air_as_long_as_the_reference_says(pacing: ctypes.CD
     assert taken == pytest.approx(command_seconds(command) + answer_seconds(command, bytes(17)) + delays, abs=2e-9)
 
 
-def test_it_tells_at_its_end_what_of_an_exchange_was_its_own(desk: Desk, station: Station, node: CNode) -> None:
+def test_it_reports_at_its_end_its_own_share_of_an_exchange(desk: Desk, station: Station, node: CNode) -> None:
     node.start("--pace")
     assert station.ask("identify", *desk.links.over("can"))["uuid"] == node.uuid
     assert node.process is not None

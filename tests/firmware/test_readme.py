@@ -15,7 +15,7 @@ PORTING = (builds.FIRMWARE / "docs/porting.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("step", budgets.STEPS["m0"])
-def test_it_tells_the_figures_that_are_held(step: str) -> None:
+def test_it_reports_the_figures_that_are_held(step: str) -> None:
     assert budgets.row(step) in FIGURES
 
 

@@ -58,7 +58,7 @@ def test_a_sensor_that_cannot_be_read_is_not_valid() -> None:
     assert payload[8:] == b"\x01\x00\x00"
 
 
-def test_a_set_point_that_nobody_knows_is_0() -> None:
+def test_an_unknown_set_point_is_0() -> None:
     assert claimed("g").send(read_data_set(4)).payload == bytes(6)
 
 
@@ -91,7 +91,7 @@ def test_a_node_with_an_actuator_claimed_stays_where_it_is(acts: bool) -> None:
 
 
 @pytest.mark.parametrize("polled", [False, True], ids=["a command comes first", "its loop does"])
-def test_a_dead_man_that_ran_out_long_ago_is_told(polled: bool) -> None:
+def test_a_dead_man_that_ran_out_long_ago_is_reported(polled: bool) -> None:
     """The loop was held up until its session was over, too: what stopped the actuator was the dead-man, before."""
     replies = []
     for made in (Bench, CBench):
@@ -218,7 +218,7 @@ def test_a_datasheet_that_its_slot_does_not_hold_is_10_and_the_old_one_stays() -
     assert commit_kept(desk, {(3, 130): teds_of(100, 130)}, kept).ok
 
 
-def test_where_the_old_slot_cannot_be_erased_a_write_and_a_reset_are_11() -> None:
+def test_if_the_old_slot_cannot_be_erased_a_write_and_a_reset_are_11() -> None:
     desk = CDesk()
     desk.provision()  # nobody polled: the old slot is to be erased by whoever needs it
     desk.open()

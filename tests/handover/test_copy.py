@@ -59,7 +59,7 @@ def test_sessions_of_both_at_once_on_two_links_do_not_disturb_each_other(pair: P
             assert read_image(here) == read_image(there)
 
 
-def test_a_rotation_by_one_locks_the_other_out_and_is_told(pair: Pair) -> None:
+def test_a_rotation_by_one_locks_the_other_out_and_is_reported(pair: Pair) -> None:
     pair.take(pair.export("copy")[0])
     with talk(pair.board) as node:
         agree(pair.south, node, identify(pair.south, node), rotate=True)

@@ -103,7 +103,7 @@ def test_they_verify_each_others_datasheets(pair: tuple[Station, Station], direc
 
 
 @pytest.mark.parametrize("direction", [1, -1])
-def test_they_rekey_each_others_nodes_by_tap_where_a_person_says_so(
+def test_they_rekey_each_others_nodes_by_tap_if_a_person_confirms(
     pair: tuple[Station, Station], direction: int
 ) -> None:
     """Figure 5 of the paper: whoever holds the present key is locked out, so that somebody is asked before."""
@@ -326,7 +326,7 @@ def test_adopting_again_changes_nothing(tmp_path: Path, owner: Station) -> None:
         station.close()
 
 
-def test_a_station_with_a_ca_of_its_own_joins_for_the_nodes_of_another(tmp_path: Path, owner: Station) -> None:
+def test_a_station_with_its_own_ca_joins_for_the_nodes_of_another(tmp_path: Path, owner: Station) -> None:
     home = tmp_path / "east"
     make_station(home, "east").close()
     certificate = sign_request(owner, read_request(request(home, "east")))

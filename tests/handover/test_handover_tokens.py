@@ -62,7 +62,7 @@ def test_copy_move_receipt_and_revocation_with_keys_in_tokens(uris: dict[str, st
         station.close()
 
 
-def test_a_token_station_without_a_ca_key_of_its_own(uris: dict[str, str], tmp_path: Path) -> None:
+def test_a_token_station_without_its_own_ca_key(uris: dict[str, str], tmp_path: Path) -> None:
     home = tmp_path / "east"
     asked = fleet.ask_for_certificate(home, name="east", keystore=uris["east"], ask=ask)
     owner = initialise(tmp_path / "owner", name="owner", keystore=uris["north"], ask=ask)[0]

@@ -153,7 +153,7 @@ def test_a_uuid_known_with_another_node_key_is_refused_and_the_rest_comes_in(tmp
     pair.close()
 
 
-def test_where_every_node_is_refused_nothing_is_imported(pair: Pair) -> None:
+def test_if_every_node_is_refused_nothing_is_imported(pair: Pair) -> None:
     key_up(pair.south, Board(uuid=pair.board.uuid))
     before = everything(pair.south)
     with pytest.raises(PolicyError, match="another node key"):
@@ -192,7 +192,7 @@ def test_a_ca_whose_trust_ended_counts_again_once_a_person_trusts_its_key(pair: 
     assert [pair.south.policy.counts(ca) for ca in (lab, other)] == [True, False]
 
 
-def test_a_station_that_lost_the_node_to_a_rotation_does_not_agree_anew(pair: Pair) -> None:
+def test_a_station_that_lost_the_node_to_a_rotation_does_not_agree_again(pair: Pair) -> None:
     pair.take(pair.export("move")[0])
     pair.north.policy.take_back([pair.board.uuid])
     with talk(pair.board) as node:

@@ -51,7 +51,7 @@ def test_a_revoked_node_gets_nothing_any_more(pair: Pair) -> None:
     assert not revoke(pair.north, pair.board.uuid, "once more").fresh
 
 
-def test_whitelisting_a_revoked_node_anew_does_not_help(pair: Pair) -> None:
+def test_whitelisting_a_revoked_node_again_does_not_help(pair: Pair) -> None:
     revoke(pair.north, pair.board.uuid, "stolen")
     pair.north.pins.put(WhitelistEntry(pair.board.uuid))
     with talk(pair.board) as node, pytest.raises(PolicyError, match="was revoked"):

@@ -36,7 +36,7 @@ def test_a_handover_is_known_by_the_digest_that_earlier_versions_noted(count: in
     assert content_digest("ab" * 32, ["ef" * 32, "cd" * 32], "copy", b"\x04" * 65, nodes) == whole
 
 
-def test_what_lies_there_before_the_key_rests_opens_for_nobody(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_there_before_the_key_is_stored_cannot_be_opened(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that is killed before the store has the move leaves a draft at most, without signature and tag."""
     left: list[bytes] = []
 

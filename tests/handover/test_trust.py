@@ -97,7 +97,7 @@ def test_its_own_key_needs_no_trust(north: Station, keys: Path) -> None:
         candidate(north, "self", keys / "ca.pem", "ca")
 
 
-def test_a_name_stands_for_one_key(north: Station, keys: Path) -> None:
+def test_a_name_belongs_to_one_key(north: Station, keys: Path) -> None:
     for number in (21, 22):
         (keys / f"{number}.pem").write_text(to_pem(SoftwareKey(number).point))
     add(north, [candidate(north, "lab", keys / "21.pem", "station")])

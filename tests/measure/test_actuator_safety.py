@@ -192,7 +192,7 @@ def test_one_lost_frame_stops_nothing(cut_hall: Hall, wire: Hub) -> None:
     assert acting.end().code == 0
 
 
-def test_a_value_that_nobody_answers_is_given_up_at_the_dead_man(cut_hall: Hall, wire: Hub) -> None:
+def test_a_value_without_an_answer_is_given_up_at_the_dead_man(cut_hall: Hall, wire: Hub) -> None:
     """Replies are lost: a value leaves three times at most, then none until a Clock has had its answer."""
     acting, journal = begin_set(cut_hall), Journal.of(cut_hall)
     cut = time.time()

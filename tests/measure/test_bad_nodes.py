@@ -183,7 +183,7 @@ def test_a_node_whose_samples_fall_behind_is_not_believed(seen: dict[str, NodeEv
 
 
 @pytest.mark.parametrize("fault", ["jumping_clock", "backward_clock"])
-def test_a_clock_that_contradicts_itself_is_told_and_its_data_claim_no_bound(
+def test_a_clock_that_contradicts_itself_is_reported_and_its_data_claim_no_bound(
     seen: dict[str, NodeEvents], fault: str
 ) -> None:
     result = seen[fault]
@@ -226,7 +226,7 @@ def test_what_the_node_calls_invalid_has_no_value(seen: dict[str, NodeEvents]) -
     assert result.count("invalid") == result.count("samples")
 
 
-def test_a_node_that_falls_silent_is_lost_and_told(seen: dict[str, NodeEvents]) -> None:
+def test_a_node_that_falls_silent_is_lost_and_reported(seen: dict[str, NodeEvents]) -> None:
     result = seen["falls_silent"]
     assert "lost" in result.states
     assert "No message from the node" in result.text

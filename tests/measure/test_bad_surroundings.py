@@ -143,7 +143,7 @@ def test_a_terminal_that_is_closed_ends_the_recording_in_order_and_lets_the_node
     assert hall.ask("mode", node.uuid)["mode"] == "configuration"
 
 
-def test_a_measurement_that_nobody_is_to_hang_up_goes_on(hall: Hall) -> None:
+def test_a_measurement_that_ignores_sighup_goes_on(hall: Hall) -> None:
     node = hall.nodes["a"].start()
     held = "import runpy, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN); sys.argv[0] = 'teds-provision'; "
     program = (sys.executable, "-c", f"{held}runpy.run_module('teds_provision', run_name='__main__')")

@@ -24,7 +24,7 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
         made.close()
 
 
-def test_what_is_wrong_is_said_and_what_to_do(hall: Hall, tmp_path: Path) -> None:
+def test_what_is_wrong_is_reported_with_what_to_do(hall: Hall, tmp_path: Path) -> None:
     g, nothing = hall.nodes["g"].uuid, tmp_path / "nothing.toml"
     nothing.write_text("")
     cases = [
@@ -77,7 +77,7 @@ def test_recover_names_what_it_is(hall: Hall, words: tuple[str, ...]) -> None:
     assert message in outcome.out
 
 
-def test_a_broker_that_is_not_there_is_told_and_what_it_cost(hall: Hall) -> None:
+def test_a_broker_that_is_not_there_is_reported_and_what_it_cost(hall: Hall) -> None:
     place = f"mqtt://127.0.0.1:{free_tcp_port()}"
     lines = hall.measure(hall.nodes["g"].uuid, "--rate", 10, "--duration", 5, "--mqtt", place, code=5)
     event = next(line for line in lines if line["event"] == "sink")

@@ -135,12 +135,12 @@ def test_the_end_of_a_duration_is_not_moved_by_a_restart(hall: Hall) -> None:
     hall.station.ask("group", "delete", "short")
 
 
-def test_a_second_measurement_from_a_source_address_that_was_named_is_refused_and_told(hall: Hall) -> None:
+def test_a_second_measurement_from_a_source_address_that_was_named_is_refused_and_reported(hall: Hall) -> None:
     a, g = hall.nodes["a"].uuid, hall.nodes["g"].uuid
     best_of(3, WHOLE, lambda: beside_refused(hall, a, g))
 
 
-def test_where_no_source_address_is_named_the_next_free_one_is_taken(hall: Hall) -> None:
+def test_if_no_source_address_is_named_the_next_free_one_is_used(hall: Hall) -> None:
     a, g = hall.nodes["a"].uuid, hall.nodes["g"].uuid
     best_of(3, WHOLE, lambda: beside_by_itself(hall, a, g))
 
@@ -361,7 +361,7 @@ def test_a_node_that_is_taken_off_the_whitelist_is_measured_and_moved_no_more(ha
     assert all(channel["claimant"] == 0 for channel in mode["channels"]), mode
 
 
-def test_a_set_point_holds_its_source_address_too_where_it_was_named(hall: Hall) -> None:
+def test_a_set_point_holds_its_source_address_too_if_it_was_named(hall: Hall) -> None:
     g = hall.nodes["g"].uuid
     acting = hall.station.start("--json", "set", g, 1, 0.05, "--dead-man", 10_000, "--can", hall.can)
     acting.wait_for('"applied"')

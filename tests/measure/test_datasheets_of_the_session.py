@@ -84,7 +84,7 @@ def test_a_requirement_that_one_of_them_lacks_stops_all_before_anything_is_claim
         assert hall.ask("mode", uuid)["mode"] == "configuration"
 
 
-def test_raw_values_of_an_unsigned_datasheet_come_only_where_asked_for_and_are_marked(hall: Hall) -> None:
+def test_raw_values_of_an_unsigned_datasheet_come_only_if_requested_and_are_marked(hall: Hall) -> None:
     uuid, file = hall.nodes["u"].uuid, hall.folder / "unsigned.csv"
     lines = hall.measure(uuid, "--rate", 20, "--duration", 1, code=4)
     assert not of(lines)
@@ -116,7 +116,7 @@ def test_raw_values_of_an_unsigned_datasheet_come_only_where_asked_for_and_are_m
     assert all("unsigned" not in line and None not in line["value"] for line in signed)
 
 
-def test_a_restart_of_the_node_is_told_by_c_and_sample_says_what_its_values_rest_on(hall: Hall) -> None:
+def test_a_restart_of_the_node_is_seen_by_c_and_sample_states_what_its_values_rest_on(hall: Hall) -> None:
     """Two processes: c of Open goes on within a power-up, whoever asks, and is another one after it."""
     node = hall.nodes["a"]
     hall.ask("verify", "a", "--via", "can")

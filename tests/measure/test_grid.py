@@ -100,7 +100,7 @@ def test_channels_that_do_not_lie_side_by_side_come_into_their_columns() -> None
     np.testing.assert_allclose(got.age[2], [0.01, 0.02, 0.01, 0.02], atol=1e-6)
 
 
-def test_how_far_apart_streams_began_is_told() -> None:
+def test_how_far_apart_streams_began_is_reported() -> None:
     grid = Grid("g", [ANGLE, FORCE])
     grid.add_block(block([[1]]))
     grid.add_block(block([[1]], uuid=HAND, channels=(2,), start=NOW + 0.004))

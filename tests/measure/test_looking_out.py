@@ -109,7 +109,7 @@ def test_an_announcer_whose_answer_is_torn_is_asked_once_in_ten_seconds_too(
 
 
 @pytest.mark.realtime
-def test_a_node_that_somebody_waits_for_is_looked_for_at_once(lookout: CanDiscovery, hub: Hub) -> None:  # noqa: F811
+def test_a_node_that_a_caller_waits_for_is_looked_for_at_once(lookout: CanDiscovery, hub: Hub) -> None:  # noqa: F811
     with looked_for(lookout):
         until(lambda: asked(hub)[0] >= 4, "somebody is missing: at the start, at once, after 1 s, after 2 s")
         hub.frames.clear()
@@ -143,7 +143,7 @@ def test_a_question_that_the_missing_node_did_not_hear_is_asked_again_at_once(
     assert not pace.is_due(wanted=False, missing=True, poll=None), "from there on after 1 s, doubling"
 
 
-def test_who_goes_on_announcing_a_missing_node_does_not_have_everybody_asked_on_and_on(lookout: CanDiscovery) -> None:
+def test_who_goes_on_announcing_a_missing_node_does_not_cause_endless_broadcasts(lookout: CanDiscovery) -> None:
     words = Announce(0x21, NodeState.PROVISIONED, uuid_crc(ONE))
     frame = Frame(words.identifier, words.encode())
     with looked_for(lookout):
@@ -175,7 +175,7 @@ def test_a_node_that_is_lost_is_looked_for_at_once_while_another_one_is_missing_
     stop.set()
 
 
-def test_everybody_is_asked_now_and_then_so_that_a_node_is_found_whose_announce_nobody_heard(
+def test_a_broadcast_now_and_then_finds_a_node_whose_announce_was_lost(
     lookout: CanDiscovery,
     hub: Hub,  # noqa: F811
 ) -> None:

@@ -102,7 +102,7 @@ def test_what_turned_out_wrong_goes_behind_another_that_says_the_same() -> None:
     assert find(sightings, ONE).address == 8
 
 
-def test_the_node_itself_is_waited_for_where_a_copy_of_its_identity_answers_sooner(
+def test_the_node_itself_is_waited_for_if_a_copy_of_its_identity_answers_sooner(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Who answers at once was taken again and again, and the node, after its random wait, never."""
@@ -180,7 +180,7 @@ def test_nothing_is_opened_under_an_address_that_two_nodes_have() -> None:
     assert messages
 
 
-def test_an_announce_is_told_to_whom_it_concerns_by_address_or_by_uuid() -> None:
+def test_an_announce_is_passed_on_by_address_or_by_uuid() -> None:
     sightings, heard = Presence(), list[str]()
     for name, uuid, address in (("one", ONE, 7), ("two", TWO, 8)):
         sightings.on_announce(seen(uuid, address), lambda name=name: heard.append(name))
@@ -226,7 +226,7 @@ def test_nodes_that_are_there_in_time_begin_at_one_moment_and_a_late_one_when_it
     assert common.start(THREE, clock(0)) == SOON
 
 
-def test_a_node_alone_waits_for_nobody_and_one_that_is_gone_is_not_waited_for() -> None:
+def test_a_node_alone_waits_for_no_other_and_one_that_is_gone_is_not_waited_for() -> None:
     assert CommonStart({ONE}).start(ONE, clock(0)) == SOON
     common = CommonStart({ONE, TWO}, waiting=60)
     common.drop_node(TWO)
@@ -258,7 +258,7 @@ def test_datasheets_are_judged_once_all_are_there_and_one_that_is_gone_is_not_wa
     assert [fit["uuid"] for fit in required.fits] == [ONE.hex()]
 
 
-def test_a_mark_names_its_holder_and_tells_of_one_that_was_killed(tmp_path: Path) -> None:
+def test_a_mark_names_its_holder_and_shows_one_that_was_killed(tmp_path: Path) -> None:
     place = tmp_path / "marks" / "bus.lock"
     with UsageLock(place, command="measure crane") as held:
         assert not held.left_behind

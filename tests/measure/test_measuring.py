@@ -208,7 +208,7 @@ def test_a_rate_that_the_datasheet_does_not_give_is_6_with_the_fastest(bench: Be
     assert end["event"] == "end"
 
 
-def test_a_node_that_starts_anew_is_carried_on_with(bench: Bench) -> None:
+def test_a_node_that_restarts_is_carried_on_with(bench: Bench) -> None:
     running = bench.station.start("--json", "measure", bench.gripper.uuid, "--rate", 20, *bench.can)
     running.wait_for('"event":"data"')
     bench.gripper.kill()
@@ -286,7 +286,7 @@ def test_a_dead_station_leaves_a_safe_actuator(bench: Bench) -> None:
         bench.gripper.process.read(0.1)
 
 
-def test_mode_tells_who_claims_what(bench: Bench) -> None:
+def test_mode_shows_who_claims_what(bench: Bench) -> None:
     running = bench.station.start("--json", "measure", bench.gripper.uuid, "--rate", 20, *bench.can)
     running.wait_for('"event":"data"')
     other = [word + "&source=0xF2" if "udp_multicast" in word else word for word in bench.can]

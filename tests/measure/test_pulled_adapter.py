@@ -85,7 +85,7 @@ def hall(tmp_path: Path) -> Iterator[Hall]:
         made.close()
 
 
-def test_a_pulled_adapter_is_told_as_itself_before_anything_is_asked_over_it(hall: Hall) -> None:
+def test_a_pulled_adapter_is_reported_as_itself_before_anything_is_asked_over_it(hall: Hall) -> None:
     """`measure` said: No message from the node came.
 
     With a lease of 60 s, and the datasheet read later, nothing is asked over the bus for 20 s: silence shows first.

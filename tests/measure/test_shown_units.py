@@ -55,14 +55,14 @@ def test_a_profile_that_is_gone_or_of_another_dimension_changes_nothing(hall: Ha
     assert Channel(1, units=units_of(radians=1), display="no unit").shown.text == "°"
 
 
-def test_limits_are_told_in_the_unit_that_was_given(hall: Hall) -> None:
+def test_limits_are_stated_in_the_unit_that_was_given(hall: Hall) -> None:
     for unit, words in (("mm", "0 to 110 mm"), ("m", "0 to 0.11 m"), ("cm", "0 to 11 cm")):
         reply = hall.ask("set", "g", "1", "5000", "--unit", unit, "--hold", "0.1", code=6)
         assert words in reply["error"]["message"]
         assert f"5000 {unit} exceeds the limits" in reply["error"]["message"]
 
 
-def test_a_bare_number_of_a_person_is_refused_where_another_unit_is_shown(hall: Hall) -> None:
+def test_a_bare_number_is_refused_if_another_unit_is_shown(hall: Hall) -> None:
     words = ["set", "g", "1", "0.05", "--hold", "0.1", "--can", hall.can]
     outcome = on_terminal(hall.station.home, *words, passphrase=hall.station.passphrase)
     assert (outcome.code, "--unit mm or --unit m" in " ".join(outcome.screen.split())) == (2, True), outcome

@@ -89,7 +89,7 @@ def test_fast_set_points_go_as_drive_messages() -> None:
     ],
     ids=["another length", "run 0", "half a reply", "unknown", "no room"],
 )
-def test_a_node_that_cannot_be_driven_is_moved_by_command_and_that_is_told_once(driven: Answer) -> None:
+def test_a_node_that_cannot_be_driven_is_moved_by_command_and_that_is_reported_once(driven: Answer) -> None:
     """Each set point was refused: what moved at 40 values a second stood in its safe state at 60."""
     scene = Scene(driven)
     scene.give(3 * WATCHED)
@@ -111,7 +111,7 @@ def test_a_claim_that_is_gone_says_nothing_about_drive() -> None:
     assert not scene.warnings
 
 
-def test_a_set_point_older_than_the_dead_man_moves_nothing_and_is_told() -> None:
+def test_a_set_point_older_than_the_dead_man_moves_nothing_and_is_reported() -> None:
     scene = Scene(lambda: reply(1))
     for age in (10.5, 9.0):
         scene.actuators.queue_command(SetPointCommand(SHEET.uuid.hex(), 1, 0.05, time.monotonic() - age))
@@ -138,7 +138,7 @@ def test_a_set_point_that_grew_old_while_the_node_was_busy_moves_nothing() -> No
     assert "s old" in scene.warnings[0]
 
 
-def test_a_set_point_beyond_the_limits_moves_nothing_and_is_told() -> None:
+def test_a_set_point_beyond_the_limits_moves_nothing_and_is_reported() -> None:
     scene = Scene(lambda: reply(1))
     scene.actuators.queue_command(SetPointCommand(SHEET.uuid.hex(), 1, 5.0, time.monotonic()))
     until(lambda: scene.actuators.refused > 0)

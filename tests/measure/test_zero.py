@@ -204,7 +204,7 @@ def test_two_at_once_follow_each_other(hall: Hall, angle: Shaft) -> None:
     assert reads(hall) == pytest.approx(last["after"], abs=1e-5)
 
 
-def test_a_trial_build_beside_it_is_told_and_the_next_provisioning_keeps_the_zero(hall: Hall, angle: Shaft) -> None:
+def test_a_trial_build_beside_it_is_reported_and_the_next_provisioning_keeps_the_zero(hall: Hall, angle: Shaft) -> None:
     uuid = angle.node.uuid
     hall.station.ask("build", uuid, "--name", "elbow")
     angle.turn("angle", 55_000)
@@ -241,7 +241,7 @@ def test_a_running_ncap_lets_the_node_go_and_measures_it_by_its_new_zero(hall: H
         service.end()  # in order: the claim of one that was killed would last until its lease ends, into the next test
 
 
-def test_while_somebody_else_measures_it_nothing_is_signed(hall: Hall, angle: Shaft) -> None:
+def test_while_another_station_measures_it_nothing_is_signed(hall: Hall, angle: Shaft) -> None:
     angle.turn("angle", 12_345)
     sequence = hall.ask("calibrate", "zero", "angle", 1, "--dry-run")["sequence"]
     elsewhere = hall.begin("angle", "--rate", 20, can=f"{hall.can}&source=0xF4", station=hall.copy("other"))

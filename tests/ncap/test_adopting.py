@@ -82,7 +82,7 @@ def test_without_it_a_yes_by_the_api_or_a_command_beside_it_signs(desk: Desk) ->
     service.end()
 
 
-def test_a_hostile_one_is_refused_once_and_told(desk: Desk) -> None:
+def test_a_hostile_one_is_refused_once_and_reported(desk: Desk) -> None:
     node = brings(desk, blocks=named(factory(b"\0" * 10), 1, "angle\x1b[2J"))
     service = adopting(desk, "--yes")
     until(lambda: any(event["state"] == "not adopted" for event in events(service, "node", node.uuid)))
@@ -98,7 +98,7 @@ def test_a_hostile_one_is_refused_once_and_told(desk: Desk) -> None:
     service.end()
 
 
-def test_one_with_very_many_channels_gets_no_key_and_holds_nobody_up(desk: Desk) -> None:
+def test_one_with_very_many_channels_gets_no_key_and_delays_no_other(desk: Desk) -> None:
     own = factory(b"\0" * 10)
     many = {**own, **{(n, code): own[1, code] for n in range(2, 151) for code in (3, 5)}}
     hostile, good = brings(desk, blocks=many), brings(desk)

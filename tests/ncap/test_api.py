@@ -196,7 +196,7 @@ def test_a_datasheet_that_another_client_wrote_after_the_review_is_not_overwritt
     assert asked.request("PUT", path, {"content": document}, if_match="*")["verdict"] == "authentic"
 
 
-def test_a_datasheet_of_another_type_makes_no_board_another_one_unless_it_is_said(
+def test_a_datasheet_of_another_type_retypes_no_board_without_the_option(
     service: Service, asked: Client, hand: str
 ) -> None:
     virtual(service, ANGLE, "elbow")
@@ -227,9 +227,7 @@ def test_an_entry_of_an_earlier_clock_hides_no_other_entry(
     assert older == both["entries"][0]
 
 
-def test_a_refused_change_stands_in_the_log_with_who_asked_for_what_and_why(
-    service: Service, asked: Client, hand: str
-) -> None:
+def test_a_refused_change_is_logged_with_who_asked_for_what_and_why(service: Service, asked: Client, hand: str) -> None:
     asked.request("POST", "/groups", {"name": "robot", "uuids": [hand]})
     asked.request("POST", "/measurements", {"group": "robot", "rate": 50})
     measured(asked, hand)
@@ -383,7 +381,7 @@ def test_an_actuator_moves_within_its_limits_and_is_let_go(asked: Client, hand: 
     assert {"set", "virtual", "provision"} & {entry["act"] for entry in log["entries"]}
 
 
-def test_an_actuator_that_nobody_asks_for_again_is_safe_soon(asked: Client, hand: str) -> None:
+def test_an_actuator_that_is_not_requested_again_is_safe_soon(asked: Client, hand: str) -> None:
 
     def let_go() -> float:
         asked.request("PUT", f"/nodes/{hand}/channels/1", {"value": 0.02, "hold": 0.4})
@@ -478,7 +476,7 @@ def test_a_running_measurement_follows_its_group_to_a_spare_and_ends_with_its_la
     until(lambda: asked.request("GET", "/measurements")["measurements"] == [])
 
 
-def test_a_virtual_transducer_is_made_from_a_document_under_a_uuid_of_its_own(
+def test_a_virtual_transducer_is_made_from_a_document_under_a_new_uuid(
     service: Service, asked: Client, hand: str
 ) -> None:
     document = asked.request("GET", f"/nodes/{hand}/teds?format=xml")
@@ -529,7 +527,7 @@ def test_a_virtual_transducer_is_either_measured_or_removed(service: Service, as
                 asked.request("DELETE", f"/virtual/{uuid}")
 
 
-def test_the_mode_that_holds_already_forgets_nobody(asked: Client, hand: str) -> None:
+def test_the_mode_that_holds_already_forgets_no_node(asked: Client, hand: str) -> None:
     until(lambda: asked.node(hand)["present"])
     for _ in range(5):
         asked.request("PUT", "/detection", {"mode": "whitelist"})

@@ -165,7 +165,7 @@ def test_off_the_whitelist_it_is_let_go_and_measured_on(
 
 
 @pytest.mark.parametrize("how", ["daemon", "measurement", pytest.param("whitelist", marks=OFF_THE_LIST)])
-def test_without_leave_nobody_listens(hall: Hall, master: Master, publishers: Publishers, how: str) -> None:  # noqa: F811
+def test_without_leave_no_topic_is_listened_to(hall: Hall, master: Master, publishers: Publishers, how: str) -> None:  # noqa: F811
     master.start()
     ros = Ros1(master)
     if how == "whitelist":

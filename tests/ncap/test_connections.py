@@ -103,7 +103,7 @@ def test_silent_connections_make_room_for_the_next_one(monkeypatch: pytest.Monke
     served(work)
 
 
-def test_slow_bodies_without_a_token_keep_nobody_out_and_end_nobodys_connection(
+def test_slow_bodies_without_a_token_keep_no_client_out_and_end_no_connection(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Five hundred of them, each with one octet of its body, were 503 for everybody else."""

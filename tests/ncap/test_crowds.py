@@ -85,7 +85,7 @@ def test_a_node_of_the_whitelist_does_not_wait_for_strangers(hall: Hall, tmp_pat
 
 
 @pytest.mark.link
-def test_the_count_of_strangers_is_told_now_and_then(hall: Hall) -> None:
+def test_the_count_of_strangers_is_reported_now_and_then(hall: Hall) -> None:
     """Each new UUID was a line of the log: with five a second half a million a day."""
     group, port = of_spec(hall.desk.links.can)
     service = Service(hall.desk, hall.station, ("--detection", "whitelist"))

@@ -181,7 +181,7 @@ def test_a_read_only_token_reads_and_changes_nothing(service: Service) -> None:
         assert (answer.status, answer.code) == (403, "read-only"), (method, path)
 
 
-def test_an_act_that_nobody_wrote_is_no_failure_of_the_store(service: Service, bearer: dict[str, str | None]) -> None:
+def test_an_unwritten_act_is_no_failure_of_the_store(service: Service, bearer: dict[str, str | None]) -> None:
     answer = service.raw("GET", "/api/v1/log?act=%00", bearer)
     assert (answer.status, answer.json["entries"]) == (200, [])
 
@@ -233,7 +233,7 @@ def test_a_token_that_is_removed_is_refused_at_once(service: Service) -> None:
     assert service.raw("GET", "/api/v1/status", bearer).status == 401
 
 
-def test_tokens_that_cannot_be_read_let_nobody_in_and_say_so(service: Service) -> None:
+def test_tokens_that_cannot_be_read_let_no_client_in_and_are_reported(service: Service) -> None:
     bearer = {"Authorization": f"Bearer {service.token('file')}"}
     file = service.station.home / "ncap-tokens.json"
     whole = file.read_bytes()

@@ -49,7 +49,7 @@ def test_moments_are_iso_8601_as_everywhere_on_the_command_line(desk: Desk) -> N
         assert moment.endswith("Z")
 
 
-def test_what_waits_is_told_at_the_end(desk: Desk) -> None:
+def test_what_waits_is_reported_at_the_end(desk: Desk) -> None:
     service = Service(desk, desk.station()).start()
     with service.client() as asked:
         for mode in ("transparent", "whitelist") * 20:

@@ -154,7 +154,7 @@ def test_a_client_that_does_not_read_costs_one_slot_and_is_told_what_it_missed()
     )
 
 
-def test_a_client_that_leaves_too_many_events_is_told_to_ask_anew() -> None:
+def test_a_client_that_leaves_too_many_events_is_told_to_ask_again() -> None:
     async def run() -> list[dict[str, Any]]:
         live = Live()
         listener, fan = live.join(), asyncio.create_task(live.run())
@@ -171,7 +171,7 @@ def test_a_client_that_leaves_too_many_events_is_told_to_ask_anew() -> None:
     assert len(messages) < 60
 
 
-def test_the_last_value_can_be_told_whatever_the_raw_value_is() -> None:
+def test_the_last_value_can_be_shown_for_every_raw_value() -> None:
     live = Live()
     for raw, expected in (
         (np.array([[2**70]], dtype=object), 2**70),

@@ -40,7 +40,7 @@ def test_a_request_names_a_sink_and_never_says_where_it_is(tmp_path: Path) -> No
             sinks.whole(spec)
 
 
-def test_a_name_stands_for_its_url_when_it_is_opened_and_is_told_where_it_is_gone(tmp_path: Path) -> None:
+def test_a_name_is_replaced_by_its_url_at_the_start_and_reported_if_it_is_gone(tmp_path: Path) -> None:
     sinks = DaemonSinks(tmp_path, ("mqtt://own",), actuators=True, brokers={"lab": LAB})
     assert (sinks.open("lab").name, sinks.open("mqtt").name) == ("mqtts://broker.lab", "mqtt://own")
     kept = KeptMeasurement("m", sinks=("mqtt",))
@@ -96,9 +96,7 @@ def test_readers_see_names_of_files_and_no_users() -> None:
         (("--mqtt", "mqtts://host?cafile=/x"), "'cafile'"),
     ],
 )
-def test_words_of_a_link_or_sink_that_nobody_knows_end_the_start(
-    desk: Desk, words: tuple[str, str], message: str
-) -> None:
+def test_unknown_words_of_a_link_or_sink_end_the_start(desk: Desk, words: tuple[str, str], message: str) -> None:
     done = desk.station().start("--json", "ncap", "run", *words).end()
     assert (done.code, message in done.out) == (2, True), done
 

@@ -193,7 +193,7 @@ def test_a_node_that_is_carried_to_another_bus_of_the_station_goes_on_there_at_o
     lab.service.end()
 
 
-def test_a_node_is_written_while_it_is_matched_and_nobody_else_notices(lab: Lab) -> None:
+def test_a_node_is_written_while_it_is_matched_and_no_other_is_affected(lab: Lab) -> None:
     """With another datasheet it joins again; two writers at once take turns; recordings take it in."""
     left, right = lab.nodes
     folder = lab.desk.folder / "recorded"
@@ -218,7 +218,7 @@ def test_a_node_is_written_while_it_is_matched_and_nobody_else_notices(lab: Lab)
     assert len({json.loads(line.removeprefix("# channel: "))["fingerprint"] for line in channels}) == 3
 
 
-def test_a_sensor_is_zeroed_while_everybody_is_measured_and_the_gap_is_told(lab: Lab) -> None:
+def test_a_sensor_is_zeroed_while_all_nodes_are_measured_and_the_gap_is_reported(lab: Lab) -> None:
     """Let go, zeroed, given back: it reads 0 after; the other goes on."""
     left, right = lab.nodes
     right.kill()
@@ -352,7 +352,7 @@ def test_an_expression_on_a_running_station_takes_in_whom_it_means(lab: Lab) -> 
     station.ask("group", "delete", "arm")
 
 
-def test_a_type_that_nobody_knows_is_told_while_its_measurement_waits(lab: Lab) -> None:
+def test_an_unknown_type_is_reported_while_its_measurement_waits(lab: Lab) -> None:
     lab.service.start()
     outcome = lab.service.station.run("ncap", "measure", "type:load-cel")
     assert outcome.code == 0, "a node of that type may come from another station"

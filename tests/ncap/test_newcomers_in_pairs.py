@@ -118,7 +118,7 @@ def test_a_new_key_is_agreed_while_it_is_measured(lab: Lab) -> None:
     lab.service.end()
 
 
-def test_a_reset_node_leaves_for_good_and_joins_again_once_it_is_provisioned(lab: Lab) -> None:
+def test_a_reset_node_leaves_and_joins_again_once_it_is_provisioned(lab: Lab) -> None:
     left, right = lab.nodes
     third = lab.provisioned("third")
     station, over = lab.service.station, lab.desk.links.over("can")

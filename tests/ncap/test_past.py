@@ -71,7 +71,7 @@ def test_the_last_minute_is_fine_and_what_is_older_is_not() -> None:
     assert (min(thin["low"]), max(thin["high"]), sum(thin["count"])) == (0.0, 99999.0, 100_000)
 
 
-def test_gaps_invalid_and_lost_samples_are_told_apart() -> None:
+def test_gaps_invalid_and_lost_samples_are_distinguished() -> None:
     past = History()
     past.block(block(NOW - 8, [[1.0, 5.0]] * 100, index=0))
     past.block(block(NOW - 5, [[1.0, 5.0]] * 100, index=300, valid=[[False, True]] * 100))  # 200 were lost before it
@@ -90,7 +90,7 @@ def test_gaps_invalid_and_lost_samples_are_told_apart() -> None:
     assert sum(first["lost"]) == 200
 
 
-def test_a_clock_that_is_set_back_writes_that_time_anew_and_one_set_forward_leaves_a_gap() -> None:
+def test_a_clock_that_is_set_back_rewrites_that_time_and_one_set_forward_leaves_a_gap() -> None:
     past = History()
     ramp(past, NOW - 300, 100)
     past.block(block(NOW - 250, [[7.0]] * 100, run=1))  # put back by 150 s

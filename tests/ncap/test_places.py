@@ -31,7 +31,7 @@ def test_one_token_never_takes_all_places() -> None:
     assert places.acquire("other", lambda: None)
 
 
-def test_where_all_are_taken_the_one_that_has_most_gives_its_newest_up() -> None:
+def test_if_all_are_taken_the_one_that_has_most_gives_its_newest_up() -> None:
     places, left = LiveSlots(most=6, of_one=3), list[str]()
 
     def leaves(name: str) -> Any:
@@ -89,7 +89,7 @@ def test_a_token_that_is_removed_ends_its_open_channel_and_no_other(service: Ser
         assert json.loads(stays.recv(PATIENCE))["type"] in ("beat", "event", "values")
 
 
-def test_who_may_only_read_is_told_no_paths() -> None:
+def test_who_may_only_read_is_shown_no_paths() -> None:
     async def paths_seen() -> list[list[str]]:
         live = Live()
         every = [live.join(), live.join(reader=True)]

@@ -121,7 +121,7 @@ def refused(service: Service, name: str = "hand", **headers: str) -> int:
     return why.value.response.status_code
 
 
-def test_values_reach_the_measurement_and_what_was_not_taken_is_told(service: Service, token: str, hand: str) -> None:
+def test_values_reach_the_measurement_and_rejected_ones_are_reported(service: Service, token: str, hand: str) -> None:
     with simulation(service, token) as socket:
         assert (fed(service, "hand") or {})["by"] == "api:sim"
         socket.send('{"value": {"opening": 0.055, "grip force": 70}}')
@@ -204,7 +204,9 @@ def test_who_may_not_is_refused_before_anything_is_taken(service: Service, token
     assert fed(service, "hand") is None
 
 
-def test_a_flood_is_read_no_faster_than_the_limit_and_holds_nobody_up(service: Service, token: str, hand: str) -> None:
+def test_a_flood_is_read_no_faster_than_the_limit_and_delays_no_other_node(
+    service: Service, token: str, hand: str
+) -> None:
     line = '{"value": {"opening": 0.033}}\n'
     message = line * (60_000 // len(line))
     size = 3 * MOST_OCTETS // 2

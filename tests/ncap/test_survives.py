@@ -103,7 +103,7 @@ def lab(one_lab: Lab) -> Iterator[Lab]:
     one_lab.tidy()
 
 
-def test_one_daemon_in_a_home_and_without_one_nobody_answers(lab: Lab) -> None:
+def test_one_daemon_in_a_home_and_without_one_no_answer(lab: Lab) -> None:
     station = lab.service.station
     assert station.refuses("ncap", "open", code=5)["hint"].endswith("ncap run")
     lab.service.start()
@@ -189,7 +189,7 @@ def test_kill_loses_a_fifth_of_a_second_at_most_and_a_start_carries_on(lab: Lab)
     lab.service.end()
 
 
-def test_a_node_that_starts_anew_is_measured_on(lab: Lab) -> None:
+def test_a_node_that_restarts_is_measured_on(lab: Lab) -> None:
     lab.service.start()
     lab.measure()
     lab.node.kill()
@@ -223,7 +223,7 @@ def test_a_node_that_leaves_is_shown_as_away_and_comes_back_verified(lab: Lab) -
     lab.service.end()
 
 
-def test_a_link_that_is_missing_is_tried_again_and_holds_up_nobody(lab: Lab) -> None:
+def test_a_link_that_is_missing_is_tried_again_and_delays_no_other(lab: Lab) -> None:
     lab.service.start("--can", "socketcan:nowhere", "--nfc", "tty:nowhere:pn532")
     verified(lab.service, lab.node.uuid)
     links = {link["place"].partition("?")[0]: link for link in lab.service.station.ask("ncap", "status")["links"]}
@@ -334,7 +334,7 @@ def test_an_actuator_that_another_command_holds_is_423(desk: Desk) -> None:
     service.end()
 
 
-def test_factory_nodes_of_a_bus_are_taken_up_where_that_was_asked_for(desk: Desk) -> None:
+def test_factory_nodes_of_a_bus_are_added_if_requested(desk: Desk) -> None:
     node = desk.node("new", called="new").start(nfc=False, can=True)
     service = Service(desk, desk.station()).start("--detection", "transparent", "--adopt")
     with service.client() as asked:

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.link
 CURVE = "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n"
 
 
-def test_a_provisioning_waits_for_the_tap_and_every_step_is_told(desk: Desk) -> None:
+def test_a_provisioning_waits_for_the_tap_and_every_step_is_reported(desk: Desk) -> None:
     service = Service(desk, desk.station()).start("--nfc", desk.links.nfc)
     node = desk.node("board", called="board")
     events: list[dict[str, Any]] = []
@@ -109,7 +109,7 @@ def test_a_request_whose_work_the_system_refuses_has_failed(desk: Desk) -> None:
 @pytest.mark.parametrize(
     ("error", "code"), [(OSError(errno.EIO, "Input/output error"), "store"), (ZeroDivisionError(), "bug")]
 )
-def test_whoever_waits_for_an_errand_learns_of_any_failure(error: Exception, code: str) -> None:
+def test_a_thread_that_waits_for_an_errand_gets_any_failure(error: Exception, code: str) -> None:
     node: Any = None
 
     def work(_node: Any) -> None:

@@ -78,7 +78,7 @@ def confined(desk: Desk, filter_file: Path) -> Service:
     return service.start("--record", desk.folder / "recordings", program=program, fork=False)
 
 
-def test_what_is_denied_gives_an_error_and_kills_nobody() -> None:
+def test_what_is_denied_gives_an_error_and_kills_no_process() -> None:
     """numpy's OpenBLAS calls mbind and lives with a no; a filter without an error number kills it at the start."""
     assert settings("SystemCallErrorNumber") == ["EPERM"]
     calls = allowed()

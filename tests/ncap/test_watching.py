@@ -103,7 +103,7 @@ def present(watch: LinkWatch) -> int:
     return watch._directory.present(watch.place)
 
 
-def test_a_node_that_went_just_before_everybody_was_asked_is_seen_to_leave(watch: LinkWatch) -> None:
+def test_a_node_that_went_just_before_the_broadcast_is_seen_to_leave(watch: LinkWatch) -> None:
     """What was known was forgotten at POST /discover, so nobody ever saw that it did not answer."""
     looked: list[str] = []
     watch._for_strangers = SimpleNamespace(submit=lambda _work, contact: looked.append(contact.identity.uuid.hex()))  # type: ignore[assignment]
@@ -121,7 +121,7 @@ def test_a_node_that_went_just_before_everybody_was_asked_is_seen_to_leave(watch
     assert watch._directory.seen(stays.uuid.hex()).present
 
 
-def test_whoever_makes_up_uuids_fills_no_more_than_the_limit(watch: LinkWatch, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_made_up_uuids_fill_no_more_than_the_limit(watch: LinkWatch, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that were being looked at when others came in their place stayed present for ever: 1,127 of them."""
     count, most = 3 * MOST_KNOWN, 0
 

@@ -67,7 +67,7 @@ def calibrated(lab: Lab, most: float) -> Path:
     return file
 
 
-def test_a_node_is_provisioned_while_it_is_measured_and_the_gap_is_told(lab: Lab) -> None:
+def test_a_node_is_provisioned_while_it_is_measured_and_the_gap_is_reported(lab: Lab) -> None:
     """Its values follow the new calibration from then on, in the same measurement and the same recording."""
     lab.service.start()
     measurement = lab.measure(sinks=["gap.jsonl"])
@@ -207,7 +207,7 @@ def test_a_measurement_that_is_deleted_under_a_writer_stays_deleted(lab: Lab) ->
     lab.service.end()
 
 
-def test_what_nobody_measures_need_not_be_let_go(lab: Lab) -> None:
+def test_what_is_not_measured_need_not_be_released(lab: Lab) -> None:
     home = lab.service.station.home
     with client.connect(home=home).released(lab.node.uuid, "write") as had:
         assert had is False, "no base station runs"

@@ -91,7 +91,7 @@ def test_a_battery_is_charged_in_the_field_and_emptied_outside() -> None:
     assert battery.power().level == 0
 
 
-def test_what_could_not_be_sent_is_told_to_the_last_when_all_streams_have_ended(
+def test_what_could_not_be_sent_is_reported_to_the_last_when_all_streams_have_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every ten seconds while one runs; nothing was left to do then, and what was missed last was told by nobody."""

@@ -75,7 +75,7 @@ def test_a_new_image_runs_once_on_trial_and_stays_if_it_is_confirmed(owner: Owne
     assert state(started(folder)) == ("1.1.0", False, False)
 
 
-def test_without_a_confirm_the_next_start_runs_the_old_one_for_good(owner: Owner, folder: Path) -> None:
+def test_without_a_confirm_every_later_start_runs_the_old_one(owner: Owner, folder: Path) -> None:
     slots = started(folder)
     put(slots, owner.new)
     slots.start_next(owner.new.digest)

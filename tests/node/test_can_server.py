@@ -177,7 +177,7 @@ def test_a_station_outside_f1_to_f7_is_not_heard(hub: Hub, server: CanServer, no
         outsider.bus.close()
 
 
-def test_an_overlong_message_is_told_off_and_the_line_goes_on(station: RawStation) -> None:
+def test_an_overlong_message_is_refused_and_the_line_goes_on(station: RawStation) -> None:
     station.bus.send(Frame(physical_id(0x21, 0xF1), bytes.fromhex("1000000010000000")))
     assert wait_for(lambda: bool(station.silence(0x21, seconds=0.1) or station.frames))
     assert [frame.data for frame in station.frames] == [bytes.fromhex("05000000010acccc")], (

@@ -49,7 +49,7 @@ def test_the_security_teds_of_a_file_is_left_out(tmp_path: Path, image: Image) -
     assert SECURITY not in node_template.create(tmp_path / "node", teds=path).load().blocks
 
 
-def test_another_uuid_stands_in_its_meta_teds_too(tmp_path: Path, image: Image) -> None:
+def test_another_uuid_is_in_its_meta_teds_too(tmp_path: Path, image: Image) -> None:
     path = tmp_path / "node.json"
     path.write_text(image.to_json())
     made = node_template.create(tmp_path / "node", teds=path, uuid=OTHER)
@@ -76,7 +76,7 @@ def test_a_profile_gives_its_channels_and_a_random_uuid(tmp_path: Path) -> None:
     assert any(channel.actuator for channel in sheet.channels)
 
 
-def test_what_no_node_can_be_made_of_is_told(tmp_path: Path, image: Image) -> None:
+def test_what_no_node_can_be_made_of_is_reported(tmp_path: Path, image: Image) -> None:
     path = tmp_path / "node.json"
     damaged = image.blocks[1, AccessCode.CHANNEL][:-1] + b"\0"
     for blocks, match in (

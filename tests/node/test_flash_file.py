@@ -69,7 +69,7 @@ def test_what_the_disk_took_and_reads_back_as_something_else_takes_no_place_of_t
     assert FlashFile(tmp_path / "node").load().epoch == 9
 
 
-def test_the_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_the_file_is_replaced_whole_or_not_replaced(tmp_path: Path) -> None:
     """The process is killed at each call that changes the folder: the old state or the new one, never a part."""
     flash = FlashFile.create(tmp_path / "node")
     before = flash.load()

@@ -41,7 +41,7 @@ def test_create_says_the_channels_of_its_datasheet(tmp_path: Path) -> None:
     assert run("node", "create", tmp_path / "x", "--profile", "gripper", "--teds", "y.json").code == 2
 
 
-def test_a_reader_on_which_another_node_lies_is_told(tmp_path: Path) -> None:
+def test_a_reader_with_another_node_on_it_is_reported(tmp_path: Path) -> None:
     run("node", "create", tmp_path / "node")
     links = Links()
     port = int(links.nfc.rpartition(":")[2])
@@ -53,7 +53,7 @@ def test_a_reader_on_which_another_node_lies_is_told(tmp_path: Path) -> None:
     assert links.nfc in json.loads(done.out)["error"]["message"]
 
 
-def test_a_source_that_is_unknown_or_of_no_use_is_told(tmp_path: Path) -> None:
+def test_a_source_that_is_unknown_or_of_no_use_is_reported(tmp_path: Path) -> None:
     run("node", "create", tmp_path / "plain")
     links = Links()
     assert run("node", "run", tmp_path / "plain", "--can", links.can, "--source", "sinus:2").code == 2
@@ -89,7 +89,7 @@ def test_many_nodes_on_one_bus_in_one_process_are_all_found(tmp_path: Path, coun
         assert found == uuids, done
 
 
-def test_a_copy_of_a_known_node_gets_a_uuid_of_its_own_or_is_refused(tmp_path: Path) -> None:
+def test_a_copy_of_a_known_node_gets_a_new_uuid_or_is_refused(tmp_path: Path) -> None:
     """A datasheet's UUID that this station knows is never taken over without a word."""
     home, file = tmp_path / "home", tmp_path / "real.json"
     with closing(make_station(home)) as station:

@@ -183,7 +183,7 @@ def test_nothing_of_a_stream_comes_after_the_reply_to_stop(scene: Scene) -> None
         assert late == []
 
 
-def test_a_switch_tells_its_events_with_their_times(scene: Scene) -> None:
+def test_a_switch_reports_its_events_with_their_times(scene: Scene) -> None:
     scene.run("switch", "--source", "sine:0.4", profile="limit-switch")
     station = scene.station("switch")
     station.operate(lease=60)
@@ -331,7 +331,7 @@ def _children(pid: int) -> list[int]:
     return [int(number) for number in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
-def test_a_battery_tells_its_level_and_too_low_does_not_measure(scene: Scene) -> None:
+def test_a_battery_reports_its_level_and_a_low_one_does_not_measure(scene: Scene) -> None:
     scene.run("angle", "--battery", "3")
     station = scene.station("angle")
     power = PowerReply.decode(station.send(security_command(Function.POWER)))

@@ -119,7 +119,7 @@ def test_a_file_is_played_back_and_nothing_is_valid_behind_it(tmp_path: Path) ->
         ("t,angle\n\n#\n,1\n", "line 4"),
     ],
 )
-def test_a_bad_file_is_told_with_its_line(tmp_path: Path, text: str, place: str) -> None:
+def test_a_bad_file_is_reported_with_its_line(tmp_path: Path, text: str, place: str) -> None:
     path = tmp_path / "run.csv"
     path.write_text(text)
     with pytest.raises(BadDataError, match=place):
@@ -213,7 +213,7 @@ def test_no_octets_stop_the_source(octets: bytes) -> None:
     assert clock.seconds >= 0
 
 
-def test_the_next_simulation_goes_on_where_the_clock_stands() -> None:
+def test_the_next_simulation_goes_on_from_the_present_clock() -> None:
     source, clock = lines([])
     source.feed_line(b'{"t": 5, "value": {"angle": 1}}')
     source.end()

@@ -151,7 +151,7 @@ def test_no_message_is_longer_than_announced(frame: bytes, max_ndef: int) -> Non
 
 
 @pytest.mark.parametrize("max_ndef", [300, 499])
-def test_a_battery_stands_first_in_the_initial_message_and_the_service_is_found(max_ndef: int) -> None:
+def test_a_battery_is_first_in_the_initial_message_and_the_service_is_found(max_ndef: int) -> None:
     power = [PowerReply(PowerFlag.BATTERY, 80)]
     tag = Type4Memory(max_ndef)
     node = TnepTag(
@@ -181,7 +181,7 @@ def test_a_battery_stands_first_in_the_initial_message_and_the_service_is_found(
         node.stop()
 
 
-def test_a_charging_reader_that_writes_its_power_disturbs_nobody(desk: Desk) -> None:
+def test_a_charging_reader_that_writes_its_power_disturbs_nothing(desk: Desk) -> None:
     before = desk.mailbox.read()
     assert desk.exchange(
         message.encode([message.NdefRecord(message.WELL_KNOWN, b"WLCINF", bytes(6))])

@@ -355,7 +355,7 @@ def test_iio_devices_that_cannot_be_wrapped(sysfs: Callable[..., Path], tmp_path
         require_match(SensorPlace("iio:bmp280"), [origin, origin], ["a", "b"])
 
 
-def test_what_a_device_sends_by_default_is_measured_whoever_may_write_it(tmp_path: Path) -> None:
+def test_what_a_device_sends_by_default_is_measured_regardless_of_who_may_write_it(tmp_path: Path) -> None:
     path = tmp_path / "cell.eds"
     text = EDS.read_text()
     before, torque, after = text.partition("ParameterName=torque")

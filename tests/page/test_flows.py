@@ -183,7 +183,7 @@ def test_an_actuator_moves_while_it_is_held_and_the_node_says_that_it_is_safe(br
 
 
 @pytest.mark.realtime
-def test_whoever_closes_the_page_lets_go_of_the_actuator(browser: Browser, lab: Lab) -> None:
+def test_closing_the_page_releases_the_actuator(browser: Browser, lab: Lab) -> None:
     with opened(browser, lab, route=f"nodes/{lab.nodes['hand'].uuid}/live") as page:
         page.get_by_role("spinbutton", name="Value, mm").fill("30")
         page.get_by_role("button", name="Hold to move").hover()

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.system
 
 
-def test_a_full_disk_is_told_with_its_time_and_so_is_what_was_not_recorded(
+def test_a_full_disk_is_reported_with_its_time_and_so_is_what_was_not_recorded(
     browser: Browser, fresh: Lab, tmp_path: Path
 ) -> None:
     disk = SmallDisk(tmp_path / "disk")

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.system, pytest.mark.realtime]
 
 
-def test_twenty_channels_at_100_hz_lose_nothing_that_is_not_told_and_need_no_more_memory(
+def test_twenty_channels_at_100_hz_lose_nothing_unreported_and_need_no_more_memory(
     browser: Browser, fresh: Lab
 ) -> None:
     fresh.run(program=PROGRAM)

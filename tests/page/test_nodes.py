@@ -69,7 +69,7 @@ def test_an_empty_home_says_what_to_do_next_and_a_tap_opens_the_node(browser: Br
         page.get_by_role("link", name="provision it first").wait_for()
 
 
-def test_measuring_is_said_of_a_node_that_is_measured_and_of_no_other(browser: Browser, lab: Lab) -> None:
+def test_only_a_node_that_is_measured_is_shown_as_measuring(browser: Browser, lab: Lab) -> None:
     """A node that was refused had the word for as long as the measurement was kept."""
     with opened(browser, lab) as page:
         texts = page.evaluate(
@@ -121,7 +121,7 @@ def test_a_browser_whose_token_was_removed_is_told_how_to_sign_in(browser: Brows
         page.locator("#connection", has_text="Live").wait_for()
 
 
-def test_a_browser_whose_token_was_removed_stops_asking_also_where_others_guess_tokens(
+def test_a_browser_whose_token_was_removed_stops_asking_even_if_others_guess_tokens(
     browser: Browser, fresh: Lab
 ) -> None:
     """After ten wrong tokens of anybody the page was told 429 in place of 401, and tried again for ever."""
@@ -139,7 +139,7 @@ def test_a_browser_whose_token_was_removed_stops_asking_also_where_others_guess_
         assert (sockets, page.locator("#connection").inner_text()) == ([], "Signed out")
 
 
-def test_a_verdict_that_rests_on_what_was_read_before_says_so_and_what_no_session_said_stands_beside_it(
+def test_a_verdict_from_an_earlier_reading_is_marked_and_unverified_values_are_shown_beside_it(
     browser: Browser, lab: Lab
 ) -> None:
     uuid = lab.nodes["hand"].uuid

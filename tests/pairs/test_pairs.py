@@ -41,9 +41,9 @@ NIGHTLY = {
     "test_a_new_passphrase_and_two_new_master_keys_do_not_lock_a_running_ncap",
     "agree --rotate during ncap run": "test_newcomers_in_pairs.py::test_a_new_key_is_agreed_while_it_is_measured",
     "write --from during ncap run": "test_newcomers.py::"
-    "test_a_node_is_written_while_it_is_matched_and_nobody_else_notices",
+    "test_a_node_is_written_while_it_is_matched_and_no_other_is_affected",
     "provision during ncap run": "test_written_while_measured.py::"
-    "test_a_node_is_provisioned_while_it_is_measured_and_the_gap_is_told",
+    "test_a_node_is_provisioned_while_it_is_measured_and_the_gap_is_reported",
 }
 """Cells left out of the gate, and the test of the service that has the same two commands in it."""
 

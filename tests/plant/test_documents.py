@@ -114,7 +114,7 @@ def test_a_payload_that_readers_might_read_differently_is_refused(content: bytes
         document.open_document(octets, POINTS.get, document.PAGE)
 
 
-def test_a_document_of_a_newer_format_is_told_as_one() -> None:
+def test_a_document_of_a_newer_format_is_reported_as_one() -> None:
     octets = document.jose.sign_compact(b'{"format":"teds-page/2"}', KEYS["west"], typ=document.PAGE.typ)
     with pytest.raises(NewerFormatError, match="newer version"):
         document.open_document(octets, POINTS.get, document.PAGE)
@@ -165,7 +165,7 @@ def test_the_known_rosters_are_read_and_follow_each_other() -> None:
     assert document.payload(first.unsigned()) == document.payload(KAT["documents"]["roster 1"]["payload"])
 
 
-def test_two_rosters_of_one_version_are_told_and_the_next_version_cures() -> None:
+def test_two_rosters_of_one_version_are_reported_and_the_next_version_cures() -> None:
     first, other = a_roster(1, (NORTH,)), a_roster(1, (NORTH, WEST))
     assert taking(other, first, first.registry)[0] == "two rosters"
     assert taking(a_roster(2, (NORTH, WEST), other.hash), first, first.registry)[0] == "taken, two rosters"
@@ -173,7 +173,7 @@ def test_two_rosters_of_one_version_are_told_and_the_next_version_cures() -> Non
     assert taking(a_roster(5, (NORTH, WEST), "ab" * 32), first, first.registry)[0] == "taken"
 
 
-def test_nobody_leaves_a_roster_without_being_removed_and_nobody_comes_back() -> None:
+def test_no_station_leaves_a_roster_without_being_removed_and_none_comes_back() -> None:
     both, gone = a_roster(1, (NORTH, WEST)), a_roster(2, (NORTH,), removed=(left(WEST),), previous="ab" * 32)
     assert taking(a_roster(2, (NORTH,), both.hash), both, both.registry)[0] == "refused"
     assert taking(a_roster(3, (NORTH, WEST), gone.hash), gone, gone.registry)[0] == "refused"
@@ -208,7 +208,7 @@ def test_a_roster_that_does_not_add_up_is_refused_with_words(change: dict[str, o
         open_roster(document.seal(members, CA, document.ROSTER), CA.point)
 
 
-def test_a_key_or_a_name_stands_once_in_a_roster() -> None:
+def test_a_key_or_a_name_occurs_once_in_a_roster() -> None:
     namesake = Member("north", WEST.point, WEST.certificate, WEST.roles)
     for members, removed in (((NORTH, NORTH), ()), ((NORTH, namesake), ()), ((NORTH, WEST), (left(WEST),))):
         with pytest.raises(BadDataError):
@@ -272,7 +272,7 @@ def test_a_page_without_its_place_in_a_chain_is_junk(change: dict[str, object]) 
         page.open_page(document.seal(members, KEYS["west"], document.PAGE), KAT["registry"], POINTS.get)
 
 
-def test_an_event_that_is_not_of_its_form_is_told_and_one_that_is_not_known_is_passed_over() -> None:
+def test_an_event_that_is_not_of_its_form_is_reported_and_one_that_is_not_known_is_passed_over() -> None:
     good = KAT["documents"]["west 1"]["payload"]["events"][0]
     assert isinstance(event.read(good), event.Event)
     assert isinstance(event.read({**good, "more": 1}), event.Event)
@@ -311,7 +311,7 @@ def test_a_page_takes_no_more_than_readers_do() -> None:
     )
 
 
-def test_an_event_is_made_in_the_order_of_the_contract_or_not_at_all() -> None:
+def test_an_event_is_made_in_the_order_of_the_contract_or_not_made() -> None:
     made = event.made("agreed", "0" * 16, "2026-02-01T12:00:00Z", bytes(10), {
         "key_id": "0" * 16, "epoch": 1, "fingerprint": "0" * 64,
     })  # fmt: skip

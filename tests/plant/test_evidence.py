@@ -122,7 +122,7 @@ def test_its_own_station_cannot_change_a_fact(
         (lambda s: s["predicate"]["station"].update(certificate="AA=="), "not certified"),
     ],
 )
-def test_what_its_own_station_signs_anew_is_told(
+def test_what_its_own_station_signs_again_is_reported(
     station: Station, document: bytes, change: Callable[[dict[str, Any]], object], why: str
 ) -> None:
     anew = signed_anew(document, station.credentials(codec.read(document).uuid).key, change)

@@ -276,7 +276,9 @@ def test_a_calibration_that_is_rewritten_while_it_is_read_is_not_used(
     assert board.state.state == NodeState.FACTORY
 
 
-def test_evidence_names_the_calibration_that_was_read_whatever_lies_there_later(tmp_path: Path, owner: Station) -> None:
+def test_evidence_names_the_calibration_that_was_read_even_if_the_file_changes_later(
+    tmp_path: Path, owner: Station
+) -> None:
     board, file = make_board(1), tmp_path / "angle.csv"
     file.write_text(TABLE)
     read = hashlib.sha256(file.read_bytes()).hexdigest()

@@ -162,7 +162,7 @@ def test_a_deferred_rotation_begins_at_its_time_without_another_sync(scene: Scen
         assert scene.south.keys.rotates_now(uuid) == now
 
 
-def test_a_clock_that_was_ahead_does_not_keep_anybody_from_looking_again(scene: Scene) -> None:
+def test_a_clock_that_was_ahead_prevents_no_later_search(scene: Scene) -> None:
     scene.keyed_by(scene.west)
     scene.remove(scene.west, "lost")
     scene.sync(scene.south)
@@ -236,7 +236,7 @@ def test_what_only_the_lost_one_held_is_counted_as_a_tap(scene: Scene) -> None:
     assert (review.alone, removed_members.rotations_due(scene.north)) == (1, 0)
 
 
-def test_nobody_left_and_nothing_is_due(scene: Scene) -> None:
+def test_no_station_left_and_nothing_is_due(scene: Scene) -> None:
     scene.keyed_by(scene.west)
     assert (removed_members.last(scene.north), removed_members.rotations_due(scene.west)) == (None, 0)
 
@@ -258,7 +258,7 @@ def test_a_running_measurement_ends_for_a_thief_alone(scene: Scene, why: Why, cu
     measuring.close()
 
 
-def test_a_key_that_was_due_for_somebody_else_is_cut_off_when_one_is_stolen(scene: Scene) -> None:
+def test_a_key_that_was_due_for_another_station_is_cut_off_when_one_is_stolen(scene: Scene) -> None:
     uuid = board_of(scene.west, os.urandom(10)).uuid
     to = (scene.south.fingerprint, scene.north.fingerprint)
     scene.plant.change(plant.owner.unshared(scene.north, ("all", "")))

@@ -175,7 +175,7 @@ def test_a_job_and_what_it_says_are_not_both_named(owner: Station) -> None:
     owner.refuses("job", "new", "--title", "x", "--profile", ANGLE, "--station", "owner", *ENDS, code=2)
 
 
-def test_no_job_is_made_of_a_profile_that_nobody_can_build(owner: Station) -> None:
+def test_no_job_is_made_of_a_profile_that_cannot_be_built(owner: Station) -> None:
     folder = owner.home / "profiles"
     folder.mkdir(exist_ok=True)
     (folder / "broken.toml").write_text('title = "Broken"\nextends = "smart-sensor"\nchannels = 3\n')
@@ -279,7 +279,7 @@ def test_an_office_signs_for_a_line_over_a_folder(desk: Desk, owner: Station, we
     "tests/plant/test_line_commands.py::test_an_office_signs_for_a_line_over_a_folder; what signs in a token is held "
     "by tests/vault/token/test_token_keys.py::test_the_station_key_and_the_ca_key_sign_low_s_and_verify"
 )
-def test_an_office_whose_key_lies_in_a_token_signs_for_a_line(
+def test_an_office_whose_key_is_in_a_token_signs_for_a_line(
     desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its key is in SoftHSM; the line, whose role is not to sign, makes authentic boards through it."""

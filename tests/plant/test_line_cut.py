@@ -239,7 +239,7 @@ def test_a_home_out_of_an_old_backup_gives_no_unit_before_it_knows_those_given_s
     plant.north.close()
 
 
-def test_an_office_out_of_an_old_backup_answers_nobody_before_it_knows_its_pages(tmp_path: Path) -> None:
+def test_an_office_out_of_an_old_backup_answers_no_request_before_it_knows_its_pages(tmp_path: Path) -> None:
     plant = Plant(tmp_path)
     plant.north.unlock()
     plant.north.plant.begin_restored()

@@ -253,7 +253,7 @@ def pages_of(speakers: list[Speaker]) -> list[bytes]:
     return [octets for current in speakers for octets in current.pages]
 
 
-def test_keepers_pin_for_everybody_while_they_agree(four: list[Speaker]) -> None:
+def test_keepers_pin_for_all_stations_while_they_agree(four: list[Speaker]) -> None:
     keep, keep2, line, _ = four
     keep.page(pinned(keep, PIN))
     line.page(pinned(line, OTHER))
@@ -266,13 +266,13 @@ def test_keepers_pin_for_everybody_while_they_agree(four: list[Speaker]) -> None
     assert Reader(roster_of(four), pages_of(four)).view(A).pin == PIN
 
 
-def test_a_pin_here_that_differs_from_the_keepers_stays_and_is_told(four: list[Speaker]) -> None:
+def test_a_local_pin_that_differs_from_the_keepers_stays_and_is_reported(four: list[Speaker]) -> None:
     four[0].page(pinned(four[0], PIN))
     seen = Reader(roster_of(four), pages_of(four)).view(A, LocalState("f" * 64, pin=OTHER, assurance="tap", met=True))
     assert (list(seen.conflicts), seen.key_it) == (["other pin"], True)
 
 
-def test_two_keys_hold_back_who_has_not_met_the_node_and_nobody_else(four: list[Speaker]) -> None:
+def test_two_keys_hold_back_only_stations_that_have_not_met_the_node(four: list[Speaker]) -> None:
     _, _, line, base = four
     line.page(pinned(line, PIN))
     base.page(agreed(base, 1, key=OTHER))
@@ -286,7 +286,7 @@ def test_two_keys_hold_back_who_has_not_met_the_node_and_nobody_else(four: list[
     assert not reader.view(A, LocalState("f" * 64, pin=PIN, assurance="registry")).key_it
 
 
-def test_the_highest_epoch_is_the_holder_and_two_keys_of_it_are_told(four: list[Speaker]) -> None:
+def test_the_highest_epoch_is_the_holder_and_two_keys_of_it_are_reported(four: list[Speaker]) -> None:
     _, _, line, base = four
     line.page(agreed(line, 2))
     base.page(handed(base, "took", line, 1))

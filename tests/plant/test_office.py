@@ -431,7 +431,7 @@ def test_an_answer_waits_for_the_line_that_asked_and_for_no_person(desk: Desk) -
     assert parcels.received(desk.line, "signed") == []
 
 
-def test_a_refusal_is_told_with_its_word_and_the_board_is_finished_later(desk: Desk) -> None:
+def test_a_refusal_is_reported_with_its_word_and_the_board_is_finished_later(desk: Desk) -> None:
     run, board = desk.run(), make_board(1)
     assert run.job is not None
     desk.office.plant.line.set_job_state(run.job.id, "closed")

@@ -29,7 +29,7 @@ def station(tmp_path: Path) -> Iterator[Station]:
     station.close()
 
 
-def test_who_joined_no_registry_tells_nothing(station: Station) -> None:
+def test_a_station_without_a_registry_reports_nothing(station: Station) -> None:
     station.plant.record_event("named", UUID, name="grip")
     assert station.plant.unsent() == 0
 
@@ -53,7 +53,7 @@ def test_an_event_shares_the_fate_of_its_act(station: Station) -> None:
     assert station.plant.claims.to_judge(10) == [UUID]
 
 
-def test_who_left_tells_nothing_any_more(station: Station) -> None:
+def test_a_station_that_left_reports_nothing_any_more(station: Station) -> None:
     station.plant.put_record(PlantRecord(REGISTRY, left="2026-01-31T12:00:00Z"))
     station.plant.record_event("named", UUID, name="grip")
     assert station.plant.unsent() == 0

@@ -160,7 +160,7 @@ def test_a_rebuilt_home_goes_on_once_it_has_looked_where_its_pages_would_be(
     )
 
 
-def test_a_rebuilt_home_goes_on_where_a_stick_brings_its_pages(west: West) -> None:
+def test_a_rebuilt_home_goes_on_if_a_stick_brings_its_pages(west: West) -> None:
     west.page()
     back = west.copy()
     joined_by(back, "postgresql://plant")

@@ -102,7 +102,7 @@ def test_who_forgets_keeps_nothing_once_all_have_it(plant: Plant) -> None:
     assert plant.transport.there == {}
 
 
-def test_a_copy_that_nobody_shares_waits_for_a_person(plant: Plant) -> None:
+def test_a_copy_without_a_share_waits_for_a_person(plant: Plant) -> None:
     plant.roster(ROLES)
     board = board_of(plant["west"], os.urandom(10))
     station = plant["west"]
@@ -128,7 +128,7 @@ def test_a_copy_that_expired_while_it_waited_makes_room_for_the_next_one(plant: 
     assert waits(plant["south"]) == []
 
 
-def test_requests_that_nobody_answers_any_more_do_not_keep_jobs_out(plant: Plant) -> None:
+def test_abandoned_requests_do_not_keep_jobs_out(plant: Plant) -> None:
     from teds_provision.protocol.plant import document
 
     plant.roster(ROLES)
@@ -268,7 +268,7 @@ def test_a_bundle_of_which_nothing_is_taken_is_refused_and_never_sent_again(plan
     assert plant.transport.there == {}
 
 
-def test_a_copy_without_receipt_is_made_anew_after_seven_days(plant: Plant) -> None:
+def test_a_copy_without_receipt_is_made_again_after_seven_days(plant: Plant) -> None:
     plant.roster(ROLES, everything(plant, "south"))
     board = board_of(plant["west"], os.urandom(10))
     sync(plant, "west")
@@ -336,7 +336,7 @@ def test_a_removed_station_gets_nothing(plant: Plant) -> None:
     assert plant.transport.there == {}
 
 
-def test_junk_and_what_is_for_others_is_thrown_away_and_told(plant: Plant) -> None:
+def test_junk_and_what_is_for_others_is_thrown_away_and_reported(plant: Plant) -> None:
     plant.roster(ROLES)
     station = plant["south"]
     for octets in (b"junk", b"{}", b'{"a": 1}', b"", b"a.b.c", os.urandom(100)):

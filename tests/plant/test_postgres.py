@@ -215,7 +215,7 @@ def test_a_closed_station_is_told_that_it_is_no_member(transport: Registry, logi
         transport.append(chain(1))
 
 
-def test_a_database_without_schema_and_one_of_a_newer_version_are_told(cluster: Cluster, login: Login) -> None:
+def test_a_database_without_schema_and_one_of_a_newer_version_are_reported(cluster: Cluster, login: Login) -> None:
     database = Database.new(cluster)
     newer = registry(database.member())
     database.sql("update registry.meta set version = 3")
@@ -284,7 +284,7 @@ def test_a_server_that_dies_during_a_push_has_all_of_it_or_nothing(login: Login,
     far.append(pages)
 
 
-def test_no_server_at_all_and_one_that_comes_back() -> None:
+def test_no_server_and_one_that_comes_back() -> None:
     with own_cluster() as cluster:
         database = Database.new(cluster)
         transport = registry(database.member())

@@ -176,7 +176,7 @@ def test_a_roster_is_drafted_here_and_signed_where_the_ca_key_is(desk: Desk) -> 
     assert signed.read_bytes().count(b".") == 2
 
 
-def test_the_doctor_sees_the_registry_and_none_where_none_was_joined(desk: Desk) -> None:
+def test_the_doctor_sees_the_registry_and_none_if_none_was_joined(desk: Desk) -> None:
     def found(station: str) -> list[tuple[str, str]]:
         checks = json.loads(desk.run(station, "--json", "doctor").out)["checks"]
         return [(check["result"], check["why"]) for check in checks if check["name"] == "registry"]
@@ -277,7 +277,7 @@ def test_a_second_request_is_the_same_and_a_plan_changes_nothing(desk: Desk) -> 
     assert desk.run("north", "registry", "status").code == 6
 
 
-def test_leaving_is_asked_for_and_said(desk: Desk) -> None:
+def test_leaving_is_confirmed_and_reported(desk: Desk) -> None:
     joined(desk)
     assert desk.run("south", "registry", "disconnect").code == 6
     desk.ask("south", "registry", "disconnect", "--yes")

@@ -148,7 +148,7 @@ def test_only_a_change_is_an_event(plants: Plant) -> None:
     assert waiting(plants.north) == []
 
 
-def test_what_was_not_said_in_a_session_and_an_image_on_trial_reach_no_page(plants: Plant) -> None:
+def test_what_was_received_outside_a_session_and_an_image_on_trial_reach_no_page(plants: Plant) -> None:
     board = board_with(plants.north, OLD)
     for plain in (OLD, NEW, None):
         keep_firmware(plants.north, board.uuid, FirmwareReading(plain, sealed=False))
@@ -163,7 +163,7 @@ def test_what_was_not_said_in_a_session_and_an_image_on_trial_reach_no_page(plan
     assert waiting(plants.north) == [list(OLD.stated), list(NEW.stated)]
 
 
-def test_it_is_kept_and_reported_together_or_not_at_all(plants: Plant) -> None:
+def test_it_is_kept_and_reported_together_or_not(plants: Plant) -> None:
     board = board_with(plants.north, OLD)
 
     def fails() -> None:

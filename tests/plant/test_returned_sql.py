@@ -66,7 +66,7 @@ def test_a_page_of_a_station_without_a_row_is_taken_once(own: Connection, login:
         assert rows_of(other, author) == [(7, digest(text), login.fingerprint)]
 
 
-def test_a_forged_signature_keeps_nobody_elses_page_out(own: Connection, login: Login, author: str) -> None:
+def test_a_forged_signature_keeps_no_other_page_out(own: Connection, login: Login, author: str) -> None:
     """The same signing input has the same H: the row of who hands in first is not the only one."""
     text = page()
     forged = text[:-1] + "t"

@@ -39,7 +39,7 @@ def test_a_report_of_pages_that_are_missing_is_shown_until_a_person_has_seen_it(
     made.close()
 
 
-def test_an_alarm_that_was_seen_is_raised_anew_by_one_more_occurrence_and_not_by_a_state_that_lasts(
+def test_an_alarm_that_was_seen_is_raised_again_by_one_more_occurrence_and_not_by_a_state_that_lasts(
     tmp_path: Path,
 ) -> None:
     made = Plant(tmp_path)

@@ -86,7 +86,7 @@ def test_what_another_station_pushes_arrives_without_waiting_for_the_minute(offi
         watch.stop()
 
 
-def test_a_registry_that_is_gone_is_told_once_and_stops_nothing(office: Office, cluster: Cluster) -> None:
+def test_a_registry_that_is_gone_is_reported_once_and_stops_nothing(office: Office, cluster: Cluster) -> None:
     south = by_url(office, office.plant.stations[1])
     cluster.psql(f"alter database {office.database.name} allow_connections false")
     watch, published, _ = watching(south)
@@ -100,7 +100,7 @@ def test_a_registry_that_is_gone_is_told_once_and_stops_nothing(office: Office, 
         watch.stop()
 
 
-def test_an_alarm_is_told(office: Office) -> None:
+def test_an_alarm_is_reported(office: Office) -> None:
     from teds_provision.station.plant.alarms import Alarm
 
     south = by_url(office, office.plant.stations[1])

@@ -143,7 +143,7 @@ def test_who_has_the_contract_alone_comes_to_the_same_verdict(owner: Station, do
     assert not holds(document, owner.point)
 
 
-def test_no_member_that_its_own_station_changes_and_signs_anew_holds(owner: Station, document: bytes) -> None:
+def test_no_member_that_its_own_station_changes_and_signs_again_holds(owner: Station, document: bytes) -> None:
     """Each text, number and null of the statement in turn, at the stranger's and here."""
     key, ca = owner.credentials().key, owner.identity.ca
     statement = json.loads(base64.b64decode(json.loads(document)["payload"]))
@@ -187,12 +187,12 @@ def known(payload: bytes) -> dict[str, Any]:
     return statement
 
 
-def test_an_octet_changed_and_signed_anew_by_its_own_station_is_noticed(owner: Station, document: bytes) -> None:
+def test_an_octet_changed_and_signed_again_by_its_own_station_is_noticed(owner: Station, document: bytes) -> None:
     size = len(base64.b64decode(json.loads(document)["payload"]))
     assert changed_octets(document, owner.credentials().key, owner.identity.ca, range(0, size, 29)) > 100
 
 
 @pytest.mark.soak
-def test_no_octet_changed_and_signed_anew_by_its_own_station_holds(owner: Station, document: bytes) -> None:
+def test_no_octet_changed_and_signed_again_by_its_own_station_holds(owner: Station, document: bytes) -> None:
     size = len(base64.b64decode(json.loads(document)["payload"]))
     assert changed_octets(document, owner.credentials().key, owner.identity.ca, range(size)) > 3000

@@ -108,7 +108,7 @@ def test_a_folder_of_another_registry_gives_nothing(plants: Plant, tmp_path: Pat
     stranger.close()
 
 
-def test_a_stick_that_is_not_plugged_in_is_said(plants: Plant) -> None:
+def test_a_stick_that_is_not_plugged_in_is_reported(plants: Plant) -> None:
     with pytest.raises(LinkError, match="no folder"):
         plants.sync(plants.north, plants.folder / "nothing")
 
@@ -202,7 +202,7 @@ def test_a_home_that_a_backup_rebuilt_takes_its_pages_back_before_it_says_more(p
     back.close()
 
 
-def test_a_rebuilt_home_waits_where_somebody_has_seen_more_of_it(plants: Plant) -> None:
+def test_a_rebuilt_home_waits_if_another_station_has_seen_more_of_it(plants: Plant) -> None:
     west = plants.member("west", "line", "sign")
     pin(west)
     plants.sync(west)
@@ -272,7 +272,7 @@ def test_a_person_names_the_branch_or_the_roster_does(plants: Plant) -> None:
     assert plants.north.plant.pages.chain("f" * 64) == chain
 
 
-def test_a_roster_that_lies_behind_is_no_news(plants: Plant) -> None:
+def test_an_older_roster_is_no_news(plants: Plant) -> None:
     plants.member("south", "base")
     first = (plants.north.plant.held_roster() or pytest.fail("no roster")).version
     plants.sync(plants.north)
@@ -355,7 +355,7 @@ def test_syncs_at_once_in_one_home_write_every_event_once(plants: Plant) -> None
         station.close()
 
 
-def test_a_page_of_another_history_lies_beside_the_first_one(tmp_path: Path) -> None:
+def test_a_page_of_another_history_is_stored_beside_the_first_one(tmp_path: Path) -> None:
     """Two pages of one number are a fork, which readers have to see."""
     folder, station = FolderTransport(tmp_path), "ab" * 32
     for octets in (b"h.one.s", b"h.another.s", b"h.another.s"):

@@ -78,7 +78,7 @@ def roster_with(office: Office, share: Share) -> None:
     office.plant.change(plant_room.owner.shared(office.north, share))
 
 
-def test_pages_and_rosters_reach_everybody(office: Office) -> None:
+def test_pages_and_rosters_reach_all_stations(office: Office) -> None:
     south = office.member("south", "base")
     board = board_of(office.north, os.urandom(10))
     office.sync(office.north, south)
@@ -171,7 +171,7 @@ def test_rows_that_a_stolen_login_wrote_stop_the_push_until_they_are_mended(offi
     transport.close()
 
 
-def test_a_database_without_room_is_told_and_nothing_is_lost(office: Office) -> None:
+def test_a_database_without_room_is_reported_and_nothing_is_lost(office: Office) -> None:
     office.database.sql(
         "create function registry.no_room() returns trigger language plpgsql as $$ begin"
         " raise exception 'could not extend file: No space left on device' using errcode = '53100'; end $$;"

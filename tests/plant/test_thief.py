@@ -281,7 +281,7 @@ def test_what_others_ask_is_not_seen(thief: Connection, hall: Hall) -> None:
     assert not any("a word of the victim" in (text or "") for (text,) in rows)
 
 
-def test_what_is_allowed_hurts_nobody(own: Connection, hall: Hall) -> None:
+def test_what_is_allowed_does_no_harm(own: Connection, hall: Hall) -> None:
     """NOTIFY, a lock on a table, time-outs of his own: the victim works on."""
     with own.transaction(force_rollback=True), hall.victim.connect() as victim:
         own.execute("notify teds, 'x'")

@@ -76,7 +76,7 @@ def test_with_an_actuator_claimed_it_stays_and_announces() -> None:
     assert claim.due(1.0) == 1.0
 
 
-def test_other_addresses_and_equal_crcs_move_nobody() -> None:
+def test_other_addresses_and_equal_crcs_move_no_node() -> None:
     claim = AddressClaim(6, uniform=soon)
     assert claim.handle_announce(Announce(34, 0, 5), 33, 1.0) == 33
     assert not claim.conflict

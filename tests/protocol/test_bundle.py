@@ -80,7 +80,7 @@ def test_every_receiver_opens_the_same_bundle():
     assert opened(octets).bundle == opened(octets, by=THIRD).bundle == made
 
 
-def test_what_lies_in_the_clear_holds_no_payload():
+def test_the_clear_part_holds_no_payload():
     made = bundle(1)
     octets = seal_bundle(made, SENDER, [RECEIVER.point])
     header = peek_bundle(octets)
@@ -90,7 +90,7 @@ def test_what_lies_in_the_clear_holds_no_payload():
         assert secret not in octets
 
 
-def test_no_link_key_stands_in_a_repr():
+def test_no_link_key_is_in_a_repr():
     made = bundle(1, nodes=(node(key=bytes(range(16))),))
     assert repr(bytes(range(16))) not in repr(opened(seal_bundle(made, SENDER, [RECEIVER.point])))
 
@@ -301,7 +301,7 @@ def test_hex_may_stand_in_either_case():
         {"nodes": (node(name="a\nb"),)},
     ],
 )
-def test_a_bundle_that_nobody_would_open_is_not_sealed(wrong):
+def test_a_bundle_without_a_recipient_that_could_open_it_is_not_sealed(wrong):
     with pytest.raises(BadDataError):
         seal_bundle(replace(bundle(), **wrong), SENDER, [RECEIVER.point])
 

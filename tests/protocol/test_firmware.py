@@ -81,7 +81,7 @@ def test_the_published_reports_mean_what_the_file_states(vector: dict[str, Any])
 
 
 @pytest.mark.parametrize("vector", VECTORS["announce"], ids=lambda vector: vector["name"])
-def test_the_published_announces_say_whether_the_button_was_pressed(vector: dict[str, Any]) -> None:
+def test_the_published_announces_show_whether_the_button_was_pressed(vector: dict[str, Any]) -> None:
     identifier, _, data = vector["can"].partition("#")
     announce = Announce.decode(int(identifier, 16), bytes.fromhex(data))
     assert announce is not None

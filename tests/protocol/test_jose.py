@@ -223,7 +223,7 @@ def protected(**changes):
 
 
 @pytest.mark.parametrize("receivers", [1, 2, 50])
-def test_each_recipient_opens_and_nobody_else(receivers):
+def test_only_recipients_can_open_it(receivers):
     keys = [SoftwareKey(1000 + number) for number in range(receivers)]
     octets = jose.encrypt(PAYLOAD, [key.point for key in keys], cty="JWS")
     assert all(opened(octets, key) == PAYLOAD for key in keys)
@@ -306,7 +306,7 @@ def test_other_content_is_refused(cty):
         opened(protected(cty=cty))
 
 
-def test_enc_must_be_protected_and_no_parameter_stands_twice():
+def test_enc_must_be_protected_and_no_parameter_occurs_twice():
     with pytest.raises(BadDataError, match="no content encryption"):
         opened(protected(enc=...))
     with pytest.raises(BadDataError, match="two headers"):
@@ -345,7 +345,7 @@ def test_a_shortened_tag_is_refused():
         opened(dump(jwe(tag=encode_base64url(short))))
 
 
-def test_what_stands_in_aad_is_authenticated():
+def test_what_is_in_aad_is_authenticated():
     with pytest.raises(NotAuthenticError, match="tag does not fit"):
         opened(dump(jwe(aad="AAAA")))
 

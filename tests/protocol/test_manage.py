@@ -195,7 +195,7 @@ def test_a_body_of_another_form_is_refused(wrong: SmpPacket) -> None:
     assert desk.refuses(wrong) == Reason.BAD_FORM
 
 
-def test_maps_of_indefinite_length_pass_where_nothing_hangs_on_their_octets() -> None:
+def test_maps_of_indefinite_length_pass_if_nothing_depends_on_their_octets() -> None:
     desk = ManagedDesk()
     assert desk.refuses(SmpPacket(STATES, 7, b"\xbf\xff", True)) is None
     assert desk.refuses(SmpPacket(UPLOAD, 7, b"\xbf\x63off\x01\xff", True)) is None

@@ -29,7 +29,7 @@ def octets_of(name):
 
 
 @pytest.mark.parametrize("entry", INDEX, ids=lambda entry: entry["name"])
-def test_messages_are_told_from_teds_in_every_given_string(entry):
+def test_messages_are_distinguished_from_teds_in_every_given_string(entry):
     assert looks_like_message(octets_of(entry["name"])) == (entry["verdict"] == "message")
 
 
@@ -163,7 +163,7 @@ def test_identify_and_list_replies_of_the_profile():
 @pytest.mark.parametrize(
     ("reason", "meaning"), [(1, "unknown command"), (14, "untrusted station"), (200, "unknown reason")]
 )
-def test_refusals_say_their_reason(reason, meaning):
+def test_refusals_name_their_reason(reason, meaning):
     message = decode_message(bytes([0, 0, 1, reason]))
     assert message.ok is False
     assert message.arguments[0].meaning == meaning

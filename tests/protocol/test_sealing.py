@@ -57,7 +57,7 @@ def test_what_was_sealed_in_pieces_is_opened_by_either_reader(pieces, size):
 
 @settings(max_examples=200)
 @given(st.data())
-def test_both_readers_say_the_same_of_a_changed_file(data):
+def test_both_readers_give_the_same_result_for_a_changed_file(data):
     octets, _ = seal([NOTE * 9])
     at, size = data.draw(st.integers(0, len(octets) - 1)), data.draw(st.sampled_from([16, 33, 64, 4096]))
     change = data.draw(st.sampled_from([b"", b"A", b'"', b"\\", b"\\u0041", b" ", b"\xff", b"}", b"-_-_"]))
@@ -80,7 +80,7 @@ def test_a_long_member_beside_the_ciphertext_is_passed_over(size, monkeypatch):
 
 
 @pytest.mark.parametrize("size", [16, 64])
-def test_an_escape_is_read_wherever_a_piece_of_the_file_ends(size, monkeypatch):
+def test_an_escape_is_read_at_every_boundary_of_the_pieces(size, monkeypatch):
     monkeypatch.setattr(envelope, "PIECE", size)
     text = seal([NOTE * 9])[0].decode()
     begin = text.index('"ciphertext"') + len('"ciphertext":"') + 1
@@ -103,7 +103,7 @@ def test_a_bundle_that_is_cut_off_anywhere_is_no_bundle():
             unseal(octets[:at])
 
 
-def test_what_was_written_before_the_end_opens_for_nobody():
+def test_what_was_written_before_the_end_cannot_be_opened():
     made = envelope.EnvelopeWriter([NOTE * 2000], SENDER, [RECEIVER.point], typ="note", cty="JWS")
     body = b"".join(made.body())
     for closed in (body, body + b'"}', body + b'","tag":"' + strict_json.base64url(bytes(16)) + b'"}'):

@@ -171,7 +171,7 @@ def test_the_station_ends_a_session_whose_counters_are_used_up() -> None:
         desk.session.seal(IDENTIFY)
 
 
-def test_a_sealed_reply_whose_padding_is_wrong_is_not_told_as_a_wrong_tag() -> None:
+def test_a_sealed_reply_whose_padding_is_wrong_is_not_reported_as_a_wrong_tag() -> None:
     """A node that adds no block of padding to a multiple of 16 octets: its key is right, and was accused."""
     station, key = StationSession(bytes(16), UUID), bytes(16)
     node = NodeSession(key, UUID, station.open(bytes(8)).payload[8:73], SoftwareKey(31))

@@ -191,7 +191,7 @@ def test_a_node_without_can_has_no_address_and_does_not_know_128_10() -> None:
     assert desk.sealed(address(0x21)) == refusal(Reason.UNKNOWN_COMMAND)
 
 
-def test_the_address_that_stands_in_flash_is_not_written_again_and_a_claim_is_undone() -> None:
+def test_the_address_that_is_in_flash_is_not_written_again_and_a_claim_is_undone() -> None:
     desk = Desk()
     assert desk.plain(address(0x21)).ok
     desk.memory.fail = True  # a write would be refused with 11

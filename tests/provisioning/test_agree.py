@@ -363,7 +363,7 @@ def test_a_second_agreement_whose_confirm_is_lost_keeps_every_pending_key(statio
     assert held(station, board) == [("active", 1)]
 
 
-def test_a_rotation_by_another_station_is_told_never_healed_by_itself(station: Station, board: Board) -> None:
+def test_a_rotation_by_another_station_is_reported_and_never_healed_by_itself(station: Station, board: Board) -> None:
     whitelist(station, board)
     run(station, board)
     board.flash.state = board.flash.state.__class__(**{**vars(board.flash.state), "key": bytes(16)})
@@ -383,7 +383,7 @@ def test_a_copy_with_the_uuid_of_a_known_node_is_named_as_such(station: Station,
         require_session(station, node)
 
 
-def test_a_lost_store_is_healed_by_a_tap_where_identity_and_ca_were_kept(station: Station, board: Board) -> None:
+def test_a_lost_store_is_healed_by_a_tap_if_identity_and_ca_were_kept(station: Station, board: Board) -> None:
     whitelist(station, board)
     run(station, board)
     station.keys.remove(board.uuid)

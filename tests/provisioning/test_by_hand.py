@@ -49,7 +49,7 @@ def test_a_datasheet_signed_by_hand_after_a_cut_agreement_is_taken(
     assert board.state.provisioned
 
 
-def test_a_node_that_refuses_at_the_last_of_all_attempts_is_told_as_such(station: Station, board: Board) -> None:
+def test_a_node_that_refuses_at_the_last_of_all_attempts_is_reported_as_such(station: Station, board: Board) -> None:
     station.pins.put(WhitelistEntry(board.uuid))
     with talk(board) as node:
         agree(station, node, identify(station, node))
@@ -91,7 +91,7 @@ def test_what_the_node_lost_since_it_was_read_is_sent_again(station: Station, bo
     assert board.state.sequence == 2
 
 
-def test_a_digest_that_never_fits_is_told_and_nothing_is_sent_a_third_time(station: Station, board: Board) -> None:
+def test_a_digest_that_never_fits_is_reported_and_nothing_is_sent_a_third_time(station: Station, board: Board) -> None:
     provision(station, board)
     build(station, board.uuid, replace(ANGLE, name="renamed"))
     signed = sign_image(station, SignOrder(board.uuid), None).signed.image

@@ -41,7 +41,7 @@ def test_below_ten_per_cent_nothing_is_written_without_a_word(station: Station, 
 
 
 @pytest.mark.parametrize("percent", [10, 100, None])
-def test_with_enough_nobody_is_asked(station: Station, board: Board, percent: int | None) -> None:
+def test_with_enough_no_node_is_asked(station: Station, board: Board, percent: int | None) -> None:
     assert run(station, board, percent).verified.verdict == "authentic"
 
 

@@ -95,7 +95,7 @@ def test_a_board_that_cannot_prove_the_key_it_shows_is_not_recalled(station: Sta
         examine(station, node, recall=True)
 
 
-def test_a_key_that_is_agreed_on_anew_without_a_session_is_agreed_over_the_teds_of_now(
+def test_a_key_that_is_agreed_on_again_without_a_session_is_agreed_over_the_present_teds(
     station: Station, board: Board
 ) -> None:
     """Its transcript has the Security TEDS that the node has now, which another holder of its key may have written."""

@@ -218,7 +218,7 @@ def look(station: Station, board: Board) -> str:
         return verify_at_node(station, node, identify(station, node)).verified.verdict
 
 
-def test_another_image_stands_beside_the_verdict_until_it_is_signed_anew_or_accepted(
+def test_another_image_is_shown_beside_the_verdict_until_it_is_signed_again_or_accepted(
     station: Station, tmp_path: Path
 ) -> None:
     board, wanted = FirmwareBoard(), profile(tmp_path, TABLE)

@@ -81,7 +81,7 @@ def test_a_worker_that_is_killed_ends_the_work_with_an_error(number: signal.Sign
     assert len(seen) <= 10
 
 
-def test_a_worker_that_ctrl_c_reached_first_is_no_error_of_its_own() -> None:
+def test_a_worker_that_ctrl_c_reached_first_is_no_separate_error() -> None:
     def work(places: range) -> int:
         os.kill(os.getpid(), signal.SIGINT)
         return places.start

@@ -78,7 +78,7 @@ def test_the_nodes_of_a_bus_are_asked_side_by_side(station: Station, tmp_path: P
     assert all(arrival.result is not None for arrival in came)
 
 
-def test_a_node_that_starts_meanwhile_is_found_while_somebody_listens(station: Station, tmp_path: Path) -> None:
+def test_a_node_that_starts_meanwhile_is_found_while_a_caller_listens(station: Station, tmp_path: Path) -> None:
     with bus(tmp_path / "first", 1, threading.Barrier(1)) as (spec, (early,)):
         FlashFile.create(tmp_path / "late", uuid=bytes(range(10)))
         late = CanServer(spec)
@@ -96,7 +96,7 @@ def test_a_node_that_starts_meanwhile_is_found_while_somebody_listens(station: S
     assert time.monotonic() - began >= 6
 
 
-def test_a_node_without_a_proof_is_told_of_beside_the_others(station: Station, tmp_path: Path) -> None:
+def test_a_node_without_a_proof_is_reported_of_beside_the_others(station: Station, tmp_path: Path) -> None:
     recorder = CollectingReporter()
     with bus(tmp_path, 1, threading.Barrier(1), without=1) as (spec, (good, bad)):
         came = list(identify_at(station, LinkSettings("can", can=spec, timeout=PATIENCE), recorder))

@@ -131,7 +131,7 @@ def test_a_kept_image_that_lacks_a_teds_of_field_108_is_none(station: Station, b
 # -- kept, and read again --------------------------------------------------------------------------------------------
 
 
-def test_a_kept_image_stands_for_no_row_but_the_one_that_was_read_of_it_in_a_session(
+def test_a_kept_image_replaces_no_row_but_the_one_that_was_read_of_it_in_a_session(
     station: Station, board: Board
 ) -> None:
     row = station.datasheets.reading(board.uuid)
@@ -158,7 +158,7 @@ def test_in_the_same_power_up_nothing_is_read_again(station: Station, board: Boa
     assert shown(station, board) == ("authentic", "session")
 
 
-def test_after_a_restart_the_rest_is_kept_until_somebody_reads_it(station: Station, board: Board) -> None:
+def test_after_a_restart_the_rest_is_kept_until_it_is_read(station: Station, board: Board) -> None:
     board.power_on()
     found = looked(station, board)
     assert (found.verified.verdict, found.kept) == ("authentic", True)
@@ -204,7 +204,7 @@ def test_another_security_teds_makes_everything_be_read(station: Station, board:
 
 
 @given(first=st.integers(0, 2**64 - 1), opens=st.integers(0, 2**64 - 1))
-def test_c_tells_a_restart(first: int, opens: int) -> None:
+def test_c_shows_a_restart(first: int, opens: int) -> None:
     row = NodeReading(bytes(10), utc_now(), "verify", first.to_bytes(8, "big"), True, b"")
     later = ((first + opens) % 2**64).to_bytes(8, "big")
     assert row.is_of_this_start(later) == (opens < 2**32)
@@ -213,7 +213,7 @@ def test_c_tells_a_restart(first: int, opens: int) -> None:
 # -- who may change it -----------------------------------------------------------------------------------------------
 
 
-def test_what_is_said_in_no_session_changes_no_row(station: Station, board: Board) -> None:
+def test_what_is_received_outside_a_session_changes_no_row(station: Station, board: Board) -> None:
     """A stranger on the bus answers for the node: the row that was read in a session stays, and so does the verdict."""
     before = station.datasheets.reading(board.uuid)
     changed_in_flash(board)

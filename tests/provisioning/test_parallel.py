@@ -81,7 +81,7 @@ def test_what_was_not_begun_is_dropped_and_what_was_begun_is_finished() -> None:
     assert seen == begun
 
 
-def test_ctrl_c_ends_a_process_of_which_a_thread_waits_for_good() -> None:
+def test_ctrl_c_ends_a_process_of_which_a_thread_waits_for_ever() -> None:
     """A pool of the library has its threads waited for when the interpreter ends."""
     with subprocess.Popen([sys.executable, "-c", ENDS], stdout=subprocess.PIPE, cwd=ROOT) as process:
         try:

@@ -220,7 +220,7 @@ def test_another_owners_station_is_refused(station: Station, board: Board, tmp_p
     assert board.state == before
 
 
-def test_a_broken_flash_is_told(station: Station, board: Board) -> None:
+def test_a_broken_flash_is_reported(station: Station, board: Board) -> None:
     board.flash.fail = True
     with pytest.raises(NodeRefusedError) as refused:
         run(station, board)
@@ -310,7 +310,7 @@ def test_nothing_is_read_twice_that_says_nothing_new(station: Station, board: Bo
     assert asked.count((1, TedsFunction.READ, bytes([128]))) == 1, asked
 
 
-def test_what_is_said_of_several_channels_is_one_sentence() -> None:
+def test_what_is_reported_of_several_channels_is_one_sentence() -> None:
     messages = [f"Channel {number} has no calibration: raw values cannot be turned into N." for number in (1, 2, 3)]
     assert merged(messages) == ("Channels 1 to 3 have no calibration: raw values cannot be turned into N.",)
     assert merged(messages[::2]) == ("Channels 1, 3 have no calibration: raw values cannot be turned into N.",)

@@ -52,7 +52,7 @@ def test_noise_on_a_plain_read_is_read_again_and_a_teds_that_is_bad_stays_bad(bo
         read_block(talk(board, restless), SECURITY)
 
 
-def test_a_refusal_that_nobody_vouches_for_is_asked_for_again(board: Board) -> None:
+def test_an_unauthenticated_refusal_is_asked_for_again(board: Board) -> None:
     """Noise made another question of a frame: the fault bench saw exit 6 at 2 % of corrupted frames."""
     good = read_block(talk(board, MemoryLink(board)), SECURITY)
     disturbed = MemoryLink(board, tamper=lambda count, reply: REFUSED if count < 3 else reply)
@@ -64,7 +64,7 @@ def test_a_refusal_that_nobody_vouches_for_is_asked_for_again(board: Board) -> N
     assert steady.count == 3
 
 
-def test_an_offset_that_nobody_asked_for_is_asked_again_outside_a_session(board: Board) -> None:
+def test_an_unexpected_offset_is_asked_again_outside_a_session(board: Board) -> None:
     """A reply to the command before, whose process was killed, ended the next one (5) on a busy machine."""
     good = read_block(talk(board, MemoryLink(board)), SECURITY)
 

@@ -7,7 +7,7 @@ from teds_provision.protocol.messages.tables import REASONS
 from teds_provision.provisioning.conversation import refused
 
 
-def test_every_reason_is_told_in_words() -> None:
+def test_every_reason_has_words() -> None:
     for reason in Reason:
         error = refused(reason, "to do it")
         assert f"(reason {int(reason)})" in error.message

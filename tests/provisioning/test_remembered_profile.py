@@ -50,7 +50,7 @@ def test_a_relative_path_is_remembered_whole(
     assert build(station, board.uuid, BuildOrder(name="a")).image.unsigned_blocks() == before.unsigned_blocks()
 
 
-def test_a_profile_that_changed_since_is_told_and_asked(station: Station, board: Board, here: Path) -> None:
+def test_a_profile_that_changed_since_is_reported_and_asked(station: Station, board: Board, here: Path) -> None:
     provisioned(station, board, BuildOrder("./own.toml"))
     assert not any("has changed since" in text for text in build(station, board.uuid, BuildOrder(name="a")).warnings)
     (here / "own.toml").write_text(CELL.replace("\n", "\n# a comment changes nothing\n", 1))

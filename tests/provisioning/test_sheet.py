@@ -43,7 +43,7 @@ def read(station: Station, folder: Path, text: str | bytes) -> BatchSheet:
     return read_sheet(station, file, BuildOrder(profile="load-cell"))
 
 
-def test_a_mistake_of_many_lines_is_told_once_with_all_of_them(station: Station, tmp_path: Path) -> None:
+def test_a_mistake_of_many_lines_is_reported_once_with_all_of_them(station: Station, tmp_path: Path) -> None:
     rows = "".join(f",b{number},none.csv\n" for number in range(30))
     with pytest.raises(BadDataError) as caught:
         read(station, tmp_path, f"uuid,name,calibration\n{rows}")
@@ -58,12 +58,12 @@ def test_a_spreadsheet_separates_by_comma_semicolon_or_tab(station: Station, tmp
     assert [row.prepared.order.name for row in sheet.rows] == ["left knee"]
 
 
-def test_a_sheet_that_is_not_utf8_is_told_with_the_line_and_the_cure(station: Station, tmp_path: Path) -> None:
+def test_a_sheet_that_is_not_utf8_is_reported_with_the_line_and_the_cure(station: Station, tmp_path: Path) -> None:
     with pytest.raises(BadDataError, match=r"boards.csv:3: it is not UTF-8 .*CSV UTF-8"):
         read(station, tmp_path, b"uuid,name\n,a\n,caf\xe9\n,b\n,c\n")
 
 
-def test_rows_without_the_calibration_that_their_type_asks_for_are_told_before_the_tap(
+def test_rows_without_the_calibration_that_their_type_asks_for_are_reported_before_the_tap(
     station: Station, tmp_path: Path
 ) -> None:
     (tmp_path / "cal.csv").write_text("# date: 2026-11-20\nraw,value [N]\n4194304,-500\n12582912,500\n")

@@ -114,7 +114,7 @@ def test_an_old_datasheet_without_a_session_is_not_authentic(station: Station, b
         require_authentic(verified)
 
 
-def test_where_no_key_is_held_the_stores_own_values_still_count(station: Station, board: Board) -> None:
+def test_if_no_key_is_held_the_stores_own_values_still_count(station: Station, board: Board) -> None:
     old = run(station, board).image
     new = run(station, board, order=replace(ANGLE, name="renamed")).image
     station.keys.remove(board.uuid)
@@ -189,7 +189,7 @@ def test_a_stranger_without_the_key_judges_by_signatures(station: Station, board
     assert verified.verdict == "not authentic"
 
 
-def test_a_refused_challenge_where_a_key_is_held_is_unproven_not_an_error(
+def test_a_refused_challenge_is_unproven_and_no_error_if_a_key_is_held(
     station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run(station, board)
@@ -207,7 +207,7 @@ def test_a_refused_challenge_where_a_key_is_held_is_unproven_not_an_error(
         verify_at(station, LinkSettings(), stranger.hex(), SilentReporter())
 
 
-def test_read_where_a_key_is_held_needs_a_session_or_a_proof_of_reset(
+def test_read_needs_a_session_or_a_proof_of_reset_if_a_key_is_held(
     station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorded = run(station, board).image
@@ -234,7 +234,7 @@ def test_read_where_a_key_is_held_needs_a_session_or_a_proof_of_reset(
     assert read().error is None, "its signature shows that it was reset"
 
 
-def test_a_key_that_nobody_knows_does_not_move_last_seen_over_a_bus(station: Station, board: Board) -> None:
+def test_an_unknown_key_does_not_move_last_seen_over_a_bus(station: Station, board: Board) -> None:
     """Whoever answers on a bus may sign with a key of his own as long as the UUID is pinned to none."""
     station.pins.put(WhitelistEntry(board.uuid, None))
     with talk(board, MemoryLink(board, via="can")) as node:
@@ -257,7 +257,7 @@ def test_a_session_moves_last_seen(station: Station, board: Board) -> None:
     assert str(known.last_seen) > "2026"
 
 
-def test_a_refusal_outside_a_session_is_told_as_heard_and_not_proven(station: Station, board: Board) -> None:
+def test_a_refusal_outside_a_session_is_reported_as_not_proven(station: Station, board: Board) -> None:
     run(station, board)
     board.flash.state = replace(board.flash.state, key=bytes(16))
     board.power_on()

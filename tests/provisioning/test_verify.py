@@ -253,7 +253,7 @@ def test_the_same_build_signed_as_draft_and_as_file_has_one_signature(station: S
     assert (again.signature, again.reused) == (first.signature, True)
 
 
-def test_a_draft_that_is_not_above_the_nodes_sequence_is_signed_anew(station: Station, board: Board) -> None:
+def test_a_draft_that_is_not_above_the_nodes_sequence_is_signed_again(station: Station, board: Board) -> None:
     """Another station has written meanwhile: the signature says the same, and the node would not take it."""
     run(station, board)
     built = build(station, board.uuid, replace(ANGLE, name="renamed")).image

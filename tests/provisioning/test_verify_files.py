@@ -92,7 +92,7 @@ def test_a_folder_gives_a_line_for_each_image_and_totals(home: Path, tmp_path: P
     assert last == {"totals": {"files": 3, "authentic": 3}}
 
 
-def test_each_fault_is_told_in_its_line_and_the_worst_one_ends_the_command(home: Path, tmp_path: Path) -> None:
+def test_each_fault_is_reported_in_its_line_and_the_worst_one_ends_the_command(home: Path, tmp_path: Path) -> None:
     folder = tmp_path / "images"
     harmful = Calibration(1, "linear", (CalibrationInput(1, 1, (0.0, 65535.0), (0.0,)),), (0.0, 0.0))
     changed = signed(3)
@@ -192,7 +192,7 @@ def test_output_that_is_closed_ends_the_command_and_every_process_of_it(home: Pa
         assert program.wait(PATIENCE) == BROKEN_PIPE
 
 
-def test_every_check_of_an_image_is_its_own_whoever_it_is_checked_with(
+def test_every_check_of_an_image_is_independent_of_the_others_in_the_batch(
     home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     good, unsigned, strange = signed(1), Image(bytes(10), signed(2).unsigned_blocks()), signed(3)
@@ -246,7 +246,7 @@ def test_images_without_a_calibration_load_no_guard(home: Path, tmp_path: Path) 
     assert not {"teds_provision.teds.guard", "teds_provision.teds.codec.decode"}.intersection(done.stderr.split())
 
 
-def test_a_folder_without_images_is_said_and_doubles_count_once(tmp_path: Path) -> None:
+def test_a_folder_without_images_is_reported_and_doubles_count_once(tmp_path: Path) -> None:
     with pytest.raises(NotFoundError, match="no image"):
         json_files([tmp_path], "image")
     image = write(tmp_path, "1.json", signed(1))

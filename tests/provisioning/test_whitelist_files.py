@@ -136,7 +136,7 @@ def test_entity_bombs_and_external_entities_are_refused(tmp_path: Path, text: st
         read(tmp_path, text)
 
 
-def test_a_missing_file_and_other_encodings_are_told(tmp_path: Path) -> None:
+def test_a_missing_file_and_other_encodings_are_reported(tmp_path: Path) -> None:
     with pytest.raises(NotFoundError):
         read_whitelist(tmp_path / "none.xml")
     with pytest.raises(NotFoundError, match="is a folder"):

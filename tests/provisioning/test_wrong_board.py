@@ -156,7 +156,7 @@ def test_a_board_without_a_datasheet_says_nothing(station: Station, board: Board
     assert [step.result for step in done.steps if step.name == "check"] == ["skipped"], "it does not measure"
 
 
-def test_every_pair_of_types_that_differ_is_told_apart_and_each_fits_itself(station: Station) -> None:
+def test_every_pair_of_types_that_differ_is_distinguished_and_each_fits_itself(station: Station) -> None:
     names = [ANGLE, GRIPPER, FORCE, "temperature-sensor"]
     made = {name: load_profile(name) for name in names}
     built = {name: dict(made[name].build(bytes(10)).blocks) for name in names}
@@ -167,7 +167,7 @@ def test_every_pair_of_types_that_differ_is_told_apart_and_each_fits_itself(stat
             assert bool(differences(built[text], Image(bytes(10), built[other]))) == (text != other)
 
 
-def test_a_raw_unit_says_nothing_where_a_calibration_is_wanted(tmp_path: Path) -> None:
+def test_a_raw_unit_is_not_mentioned_if_a_calibration_is_requested(tmp_path: Path) -> None:
     profile = load_profile(ANGLE)
     raw = dict(profile.build(bytes(10)).blocks)
     text = (Path("profiles") / f"{ANGLE}.toml").read_text()
@@ -215,7 +215,7 @@ def test_reason_6_and_23_of_operate_have_words_of_their_own(
         assert borne.channels == {1: True}
 
 
-def test_a_session_that_the_node_lost_before_the_check_is_opened_anew(
+def test_a_session_that_the_node_lost_before_the_check_is_opened_again(
     station: Station, angle: VirtualNode, tmp_path: Path
 ) -> None:
     """Another one may be opened from this station's address at any time; exit 1, a bug, was the end of that."""
@@ -227,7 +227,7 @@ def test_a_session_that_the_node_lost_before_the_check_is_opened_anew(
         assert check_hardware(node, image).channels == {1: True}
 
 
-def test_a_node_that_keeps_no_session_is_told_and_is_no_bug(
+def test_a_node_that_keeps_no_session_is_reported_and_is_no_bug(
     station: Station, angle: VirtualNode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given(station, on_reader(angle), order(tmp_path, ANGLE))

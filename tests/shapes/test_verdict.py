@@ -68,7 +68,7 @@ WORDS = [
 
 
 @pytest.mark.parametrize(("failed", "word"), WORDS)
-def test_one_word_stands_for_all_checks(failed: tuple[str, ...], word: str) -> None:
+def test_one_word_sums_up_all_checks(failed: tuple[str, ...], word: str) -> None:
     checks = (PASSED, *(Check(name, "failed", "it is so") for name in failed))
     assert replace(VERDICT.verified, checks=checks).verdict == word
 

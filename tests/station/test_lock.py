@@ -66,7 +66,7 @@ def test_the_lock_is_free_after_use_and_after_an_error(place: Path) -> None:
         assert (place / "store.lock").stat().st_mode & 0o777 == 0o600
 
 
-def test_what_the_last_holder_left_names_nobody(place: Path) -> None:
+def test_what_the_last_holder_left_names_no_holder(place: Path) -> None:
     with StoreLock(place, command="a command with a longer name than the next one"):
         pass
     with (

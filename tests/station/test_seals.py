@@ -192,7 +192,7 @@ def test_an_end_of_trust_and_a_lifting_that_a_person_made_hold(opened: Open) -> 
         "UPDATE whitelist SET mac = NULL",
     ],
 )
-def test_a_changed_pin_is_not_believed_and_can_be_made_anew(home: Path, opened: Open, statement: str) -> None:
+def test_a_changed_pin_is_not_believed_and_can_be_made_again(home: Path, opened: Open, statement: str) -> None:
     behind_its_back(home, statement.replace("OTHER", fingerprint(OTHER)))
     station = opened()
     station.unlock()

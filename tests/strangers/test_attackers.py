@@ -30,7 +30,7 @@ def identified(hall: Hall) -> list[str]:
     return [node["uuid"] for node in outcome.json.get("nodes", [outcome.json])]
 
 
-def test_a_node_that_answers_nothing_but_identify_hides_nobody(hall: Hall) -> None:
+def test_a_node_that_answers_nothing_but_identify_hides_no_other(hall: Hall) -> None:
     with Attacker(*of_spec(hall.desk.links.can), silent_strangers(range(1, 2))):
         assert set(identified(hall)) == {placed.uuid for placed in hall.nodes.values()}
 

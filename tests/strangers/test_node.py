@@ -301,7 +301,7 @@ def test_a_node_that_contradicts_itself_is_reported(fd_angle: StrangerNode, faul
     assert asked["mode"] == "configuration"
 
 
-def test_a_node_that_is_busy_for_ever_is_told_until_when_and_holds_up_nobody(
+def test_a_node_that_is_busy_for_ever_is_reported_and_delays_no_other(
     fd_angle: StrangerNode, gripper: StrangerNode
 ) -> None:
     fd_angle.start("busy for ever", program="tests.strangers.liar")

@@ -116,7 +116,7 @@ def test_every_value_that_was_published_is_what_the_sensor_showed_then(seen: dic
             assert abs(apart - (high - low) % 65536) <= bounds, "milliseconds by stamp and by sensor"
 
 
-def test_a_bound_of_the_error_is_claimed_where_the_clock_is_good(seen: dict[str, NodeEvents]) -> None:
+def test_a_bound_of_the_error_is_claimed_if_the_clock_is_good(seen: dict[str, NodeEvents]) -> None:
     known = [error for name in UNDISTURBED for _, _, error in seen[name].samples]
     assert known
     assert None not in known

@@ -183,7 +183,7 @@ def test_too_few_points_are_refused(method: str) -> None:
         fit([(5, 1.0), (5, 2.0)], method, channel=1)  # type: ignore[arg-type]
 
 
-def test_points_that_a_float32_cannot_tell_apart_are_refused() -> None:
+def test_points_that_a_float32_cannot_distinguish_are_refused() -> None:
     with pytest.raises(BadDataError, match="Float32"):
         fit([(16777216, 0.0), (16777217, 1.0), (16777219, 2.0)], "table", channel=1)
 
@@ -274,7 +274,7 @@ def test_an_overdue_calibration_is_warned_about() -> None:
     assert "longer than" in replace(old, date=now).date_warnings(now, 30 * 86400.0)[0]
 
 
-def test_a_calibration_is_told_in_one_line_and_as_data(tactile: Profile) -> None:
+def test_a_calibration_is_shown_in_one_line_and_as_data(tactile: Profile) -> None:
     text = "# channel: 1\n# method: linear\n# date: 2026-01-01\n0,0\n32768,5.3\n65535,10\n"
     calibration = read_calibrations(text, "x.csv", tactile)[1]
     assert sentence(calibration) == (
@@ -347,7 +347,7 @@ def test_a_channel_that_the_type_has_not_is_answered_with_those_that_it_has(
             read_calibrations("# channel: 40\n0,0\n65535,10\n", "x.csv", profile)
 
 
-def test_the_residual_of_a_fit_becomes_its_uncertainty_where_it_is_greater(tactile: Profile) -> None:
+def test_the_residual_of_a_fit_becomes_its_uncertainty_if_it_is_greater(tactile: Profile) -> None:
     text = "# channel: 1\n# method: linear\n# uncertainty: 0.01\n0,0\n1,1\n2,0\n"
     assert read_calibrations(text, "x.csv", tactile)[1].uncertainty == pytest.approx(2 / 3)
 

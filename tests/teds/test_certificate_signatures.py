@@ -21,7 +21,7 @@ def read(octets: bytes, *trusted: bytes, later: float = 0) -> DigitalCertificate
 
 
 @pytest.mark.parametrize("xades", [True, False], ids=["XAdES", "XMLDSig"])
-def test_a_signature_is_good_by_the_laboratory_that_is_trusted_and_by_nobody_else(xades: bool) -> None:
+def test_a_signature_is_good_by_the_trusted_laboratory_alone(xades: bool) -> None:
     lab, other = signer(), signer("Another laboratory")
     signed = lab.sign(ANGLE, xades=xades)
     good = read(signed, other.certificate, lab.certificate)
@@ -35,7 +35,7 @@ def test_a_signature_is_good_by_the_laboratory_that_is_trusted_and_by_nobody_els
         read(signed, other.certificate)
 
 
-def test_a_changed_certificate_is_refused_whoever_is_trusted() -> None:
+def test_a_changed_certificate_is_refused_regardless_of_trust() -> None:
     lab = signer()
     forged = changed(lab.sign(ANGLE), ("91.6", "81.6"))
     for trusted in ((), (lab.certificate,)):
@@ -43,7 +43,7 @@ def test_a_changed_certificate_is_refused_whoever_is_trusted() -> None:
             read(forged, *trusted)
 
 
-def test_a_signature_cannot_be_left_out_where_one_is_required() -> None:
+def test_a_signature_cannot_be_left_out_if_one_is_required() -> None:
     lab = signer()
     assert read(ANGLE).unchecked == ("The certificate has no signature.",)
     with pytest.raises(NotAuthenticError, match="has no signature"):
@@ -98,7 +98,7 @@ def test_a_signature_wrapped_into_another_certificate_covers_nothing() -> None:
                 read(etree.tostring(forged), *trusted)
 
 
-def test_what_stands_beside_the_signed_part_is_not_read() -> None:
+def test_what_is_beside_the_signed_part_is_not_read() -> None:
     """Of a document that was signed as a whole nothing can be added; comments are no part of it, and not read."""
     lab = signer()
     commented = changed(lab.sign(ANGLE), ("B2-2026-0042", "B2-<!-- 9 -->2026-0042"))

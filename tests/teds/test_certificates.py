@@ -166,7 +166,7 @@ def test_two_indications_of_one_table_are_two_items(angle: Profile) -> None:
     assert read_certified(both, "c.xml", angle, CertificateChoice(item="channel-1.2"))[1].points[0][0] == 401
 
 
-def test_a_channel_must_be_named_where_the_type_has_several() -> None:
+def test_a_channel_must_be_named_if_the_type_has_several() -> None:
     hand = load_profile("tactile-finger-sensor")
     with pytest.raises(BadDataError, match=r"say which one c\.xml is for") as caught:
         read_certified(ANGLE, "c.xml", hand)
@@ -366,7 +366,7 @@ def test_the_example_is_what_the_command_writes() -> None:
     assert lines == kept
 
 
-def test_what_nobody_stated_is_written_as_not_stated() -> None:
+def test_what_was_not_stated_is_written_as_not_stated() -> None:
     known = read(written(laboratory=Laboratory()).encode())
     assert (known.laboratory, known.country) == ("not stated", "ZZ")
     assert known.number.startswith("teds-provision-2026-10-12-")

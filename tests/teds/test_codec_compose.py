@@ -79,7 +79,7 @@ def test_half_powers() -> None:
     assert teds.decode(teds.compose(3, {**KELVIN, "PhyUnits": noise})).get("PhyUnits") == noise
 
 
-def test_width_grows_only_where_it_must() -> None:
+def test_width_grows_only_if_it_must() -> None:
     assert unframe(teds.compose(5, {"Coefs": [1.0] * 63}))[5] == 1
     assert unframe(teds.compose(5, {"Coefs": [1.0] * 64}))[5] == 2
     long = teds.compose(5, {"Coefs": [0.5] * 1000})
@@ -142,13 +142,13 @@ def test_refusals_name_the_field(fields: object, named: str) -> None:
     "units",
     [3, "K", {"kelvin": 1}, {"kelvins": "x"}, {"meters": 100}, {"meters": 0.3}, {"interpretation": 300}, b"\0" * 3],
 )
-def test_units_that_cannot_be_said(units: object) -> None:
+def test_units_that_cannot_be_expressed(units: object) -> None:
     with pytest.raises(BadDataError, match="PhyUnits"):
         teds.compose(3, {**KELVIN, "PhyUnits": units})
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "today", 1 << 40, teds.TimeInstance(0, 1 << 31)])
-def test_times_that_cannot_be_said(value: object) -> None:
+def test_times_that_cannot_be_expressed(value: object) -> None:
     with pytest.raises(BadDataError, match="LstCalDt"):
         teds.compose(5, {"LstCalDt": value})
 

@@ -46,7 +46,7 @@ def test_there_and_back_is_no_change(access_code: int, data: st.DataObject) -> N
     assert older.octets == octets
 
 
-def test_a_uuid_cannot_be_said_in_the_other_edition() -> None:
+def test_a_uuid_cannot_be_expressed_in_the_other_edition() -> None:
     decoded, findings = to(octets_of("x07_meta"), 2024)
     assert [(finding.severity, finding.code, finding.field) for finding in findings] == [("error", "lost", "UUID")]
     assert decoded.field("UUID") is None

@@ -85,7 +85,7 @@ def test_infinity_is_a_warning() -> None:
     ("field", "value", "severity"),
     [("ChanType", 9, "error"), ("SelfTest", 7, "error"), ("CalKey", 2, "warning"), ("DataXmit", 99, "warning")],
 )
-def test_illegal_values_are_errors_where_the_table_is_sure(field: str, value: int, severity: str) -> None:
+def test_illegal_values_are_errors_if_the_table_is_sure(field: str, value: int, severity: str) -> None:
     octets = teds.compose(3, {**CHANNEL, field: value})
     assert only(octets, "enumeration").severity == severity
 
@@ -169,7 +169,7 @@ def test_erased_and_empty_memory_is_no_teds(octets: bytes) -> None:
 
 
 @pytest.mark.parametrize("width", [0, 5, 255])
-def test_a_tuple_width_that_nobody_has_is_an_error(width: int) -> None:
+def test_an_unknown_tuple_width_is_an_error(width: int) -> None:
     octets = frame(bytes([3, 4, 0, 12, 1, width, 4, 1, 0]))
     assert codes(octets)["tuple-width"] == "error"
 

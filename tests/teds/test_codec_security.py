@@ -101,14 +101,14 @@ def test_reserved_codes_are_warned_about() -> None:
     assert [finding.field for finding in findings if finding.code == "enumeration"] == ["UsedSecScheme"]
 
 
-def test_somebody_elses_class_128_does_not_become_an_error() -> None:
+def test_a_foreign_class_128_does_not_become_an_error() -> None:
     block = bytes.fromhex("030400800101") + bytes.fromhex("0104DEADBEEF") + bytes.fromhex("4D0101") + b"\x96\x00"
     decoded = teds.decode(frame(block))
     assert decoded.verdict == "clean"
     assert teds.recompose(decoded) == decoded.octets
 
 
-def test_security_of_2024_keeps_what_nobody_knows() -> None:
+def test_security_of_2024_keeps_unknown_fields() -> None:
     octets = teds.compose(16, {"Level": "E", "NumOfStandards": 1, "12": b"\x0a", "13": b"\x04"}, edition=2024)
     decoded = teds.decode(octets)
     assert decoded.verdict == "clean"

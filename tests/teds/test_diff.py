@@ -46,7 +46,7 @@ def test_the_same_blocks_have_no_difference(finger: Profile) -> None:
     assert diff_blocks(blocks, blocks) == []
 
 
-def test_a_gain_is_told_in_percent_and_at_full_scale(finger: Profile) -> None:
+def test_a_gain_is_stated_in_percent_and_at_full_scale(finger: Profile) -> None:
     old = finger.build(UUID, calibration={1: line(0, 43.75 / 65535)}).blocks
     new = finger.build(UUID, calibration={1: line(0, 1.008 * 43.75 / 65535)}).blocks
     assert texts(diff_blocks(old, new)) == [
@@ -57,7 +57,7 @@ def test_a_gain_is_told_in_percent_and_at_full_scale(finger: Profile) -> None:
     assert "gain -0.794 %, at full scale -0.35 N" in back.text
 
 
-def test_an_offset_is_told_at_both_ends_and_without_gain(finger: Profile) -> None:
+def test_an_offset_is_stated_at_both_ends_and_without_gain(finger: Profile) -> None:
     old = finger.build(UUID, calibration={1: line(0, 1e-4)}).blocks
     new = finger.build(UUID, calibration={1: line(0.125, 1e-4)}).blocks
     (change,) = diff_blocks(old, new)
@@ -65,7 +65,7 @@ def test_an_offset_is_told_at_both_ends_and_without_gain(finger: Profile) -> Non
     assert "gain" not in change.text
 
 
-def test_a_bend_is_told_where_it_is_largest(finger: Profile) -> None:
+def test_a_bend_is_reported_at_its_largest_point(finger: Profile) -> None:
     straight = replace(fit([(0, 0.0), (30000, 5.0), (65535, 10.0)], "table", channel=1), unit=parse_unit("N"))
     bent = replace(fit([(0, 0.0), (30000, 5.5), (65535, 10.0)], "table", channel=1), unit=parse_unit("N"))
     (change,) = diff_blocks(
@@ -74,7 +74,7 @@ def test_a_bend_is_told_where_it_is_largest(finger: Profile) -> None:
     assert "at most +0.5 N (at raw 30000)" in change.text
 
 
-def test_a_change_of_method_date_and_uncertainty_is_told(finger: Profile) -> None:
+def test_a_change_of_method_date_and_uncertainty_is_reported(finger: Profile) -> None:
     moment = datetime(2026, 10, 31, 12, tzinfo=UTC)
     yearly = line(0, 1e-4, date=moment, interval=180 * 86400.0, uncertainty=0.1)
     other = replace(
@@ -87,7 +87,7 @@ def test_a_change_of_method_date_and_uncertainty_is_told(finger: Profile) -> Non
     assert "stated uncertainty 0.1 -> 0.05" in text
 
 
-def test_blocks_added_and_removed_are_told(finger: Profile) -> None:
+def test_blocks_added_and_removed_are_reported(finger: Profile) -> None:
     plain, calibrated = finger.build(UUID).blocks, finger.build(UUID, calibration={1: line(0, 1e-4)}).blocks
     assert "channel 1 (taxel 1): calibration added." in texts(diff_blocks(plain, calibrated))
     assert "channel 1 (taxel 1): calibration removed." in texts(diff_blocks(calibrated, plain))
@@ -96,7 +96,7 @@ def test_blocks_added_and_removed_are_told(finger: Profile) -> None:
     ]
 
 
-def test_fields_of_a_channel_are_told_in_its_unit() -> None:
+def test_fields_of_a_channel_are_stated_in_its_unit() -> None:
     profile = load_profile("magnetic-angular-position-sensor", [shipped_profiles()])
     channel = profile.channels[0]
     fields = {
@@ -114,7 +114,7 @@ def test_fields_of_a_channel_are_told_in_its_unit() -> None:
     assert len(text) == 4
 
 
-def test_fields_added_and_removed_and_repeated_are_told() -> None:
+def test_fields_added_and_removed_and_repeated_are_reported() -> None:
     meta = [("UUID", UUID), ("OholdOff", 1.0), ("TestTime", 0.0), ("MaxChan", 3)]
     group = ("VGroup", (("GrpType", 0), ("MemList", [1, 2])))
     other = ("VGroup", (("GrpType", 1), ("MemList", [3])))
@@ -126,7 +126,7 @@ def test_fields_added_and_removed_and_repeated_are_told() -> None:
     assert "node: VGroup 2, MemList removed (was 3)." in texts(diff_blocks(new, old))
 
 
-def test_the_same_content_in_other_octets_is_said() -> None:
+def test_the_same_content_in_other_octets_is_reported() -> None:
     fields = [("UUID", UUID), ("OholdOff", 1.0), ("TestTime", 0.0), ("MaxChan", 3)]
     old, new = {(0, 1): teds.compose(1, fields)}, {(0, 1): teds.compose(1, fields, width=2)}
     assert any("other octets" in text or "TEDSID" in text for text in texts(diff_blocks(old, new)))

@@ -91,7 +91,7 @@ def test_a_field_without_a_key_is_named_by_a_profile():
     assert losses == ("MetaTEDS of channel 0: MaxChan, type 200.",)
 
 
-def test_teds_without_a_channel_make_no_profile_and_that_is_said():
+def test_teds_without_a_channel_make_no_profile_and_that_is_reported():
     assert "does not load" in lost([TedsBlock(0, 1, META)], "toml")[0]
 
 
@@ -127,7 +127,7 @@ def _vector(name):
         (b"\xff\xfe\x00\x01", "binary"),
     ],
 )
-def test_files_are_told_apart_by_content(content, kind):
+def test_files_are_distinguished_by_content(content, kind):
     assert detect(content) == kind
 
 

@@ -134,7 +134,7 @@ def test_boundaries_that_do_not_ascend_are_refused(tactile: Profile) -> None:
     assert codes(check_calibration(built(tactile, line), None, tactile)) == {"inconsistent"}
 
 
-def test_a_calibration_of_another_kind_is_not_judged_but_said(tactile: Profile) -> None:
+def test_a_calibration_of_another_kind_is_not_judged_but_reported(tactile: Profile) -> None:
     blocks = built(tactile, force_line())
     findings = check_calibration({**blocks, (1, 5): teds.compose(5, [("LinOnly", (0.0, 1.0))])}, None, tactile)
     assert (codes(findings), codes(findings, "warning")) == (set(), {"unknown"})
@@ -262,7 +262,7 @@ def test_an_adjusted_zero_of_a_full_turn_is_not_beyond_its_limits(magnetic: Prof
     assert codes(check_calibration(doubled, None, magnetic)) == {"limits"}
 
 
-def test_a_turn_of_the_scale_is_told_by_the_shorter_way(magnetic: Profile) -> None:
+def test_a_turn_of_the_scale_is_stated_by_the_shorter_way(magnetic: Profile) -> None:
     before = built(magnetic, angle_table())
     near = built(magnetic, replace(angle_table(), zero_offset=355.0))
     assert check_calibration(near, before, magnetic) == [], "5 degrees back"
@@ -299,7 +299,7 @@ def test_a_jump_in_a_table_is_refused(magnetic: Profile) -> None:
     assert "jump" in codes(findings)
 
 
-def test_a_large_change_and_a_lost_calibration_are_said(tactile: Profile) -> None:
+def test_a_large_change_and_a_lost_calibration_are_reported(tactile: Profile) -> None:
     findings = check_calibration(built(tactile, force_line(0.0, 8 / 65535)), built(tactile, force_line()), tactile)
     assert (codes(findings), codes(findings, "warning")) == (set(), {"changed"})
     assert "up to 2 N (20 % of the range)" in text(findings, "changed")
@@ -307,7 +307,7 @@ def test_a_large_change_and_a_lost_calibration_are_said(tactile: Profile) -> Non
     assert codes(gone, "warning") == {"removed"}
 
 
-def test_an_overdue_calibration_is_said_where_the_time_is_given(tactile: Profile) -> None:
+def test_an_overdue_calibration_is_reported_if_the_time_is_given(tactile: Profile) -> None:
     line = force_line(date=datetime(2024, 1, 1, tzinfo=UTC), interval=86400.0 * 365)
     blocks = built(tactile, line)
     assert check_calibration(blocks, None, tactile) == []
@@ -320,7 +320,7 @@ def test_a_node_that_was_of_another_type_is_not_compared(tactile: Profile, magne
     assert check_calibration(built(tactile, force_line()), built(magnetic, falling), tactile) == []
 
 
-def test_a_channel_without_limits_is_said(tactile: Profile) -> None:
+def test_a_channel_without_limits_is_reported(tactile: Profile) -> None:
     blocks = {key: octets for key, octets in built(tactile, force_line()).items() if key == (1, 5)}
     assert codes(check_calibration(blocks), "warning") == {"unlimited"}
 

@@ -205,7 +205,7 @@ ANGLE = sheet_of("magnetic-angular-position-sensor", {1: TABLE})
 LESS_THAN_A_TURN = changed(ANGLE, high=math.radians(359.9))
 
 
-def test_limits_and_uncertainty_are_told_in_the_unit_of_the_values() -> None:
+def test_limits_and_uncertainty_are_stated_in_the_unit_of_the_values() -> None:
     interpreter = ChannelInterpreter(ANGLE, 1)
     assert interpreter.unit.text in ("°", "degree")
     assert interpreter.uncertainty == pytest.approx(0.5)
@@ -235,7 +235,7 @@ def turned(zero: float, low: float = 0.0, counts: int = 4096) -> Sheet:
 
 @pytest.mark.parametrize("low", [0.0, -math.pi])
 @given(zero=st.floats(-1000, 1000), raw=st.integers(0, 4095))
-def test_every_angle_of_a_full_turn_is_valid_wherever_its_zero_is(low: float, zero: float, raw: int) -> None:
+def test_every_angle_of_a_full_turn_is_valid_for_every_zero(low: float, zero: float, raw: int) -> None:
     interpreter = ChannelInterpreter(turned(zero, low), 1)
     values = interpreter.values(np.array([raw], dtype=np.uint64))
     assert values.valid.all()

@@ -76,7 +76,7 @@ def test_several_inputs_and_actuators_are_drawn(finger, tmp_path: Path) -> None:
     assert "value [mm]" in (tmp_path / "grip.svg").read_text()
 
 
-def test_what_cannot_be_drawn_is_said(finger, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_what_cannot_be_drawn_is_reported(finger, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     calibrations = read_calibrations(f"# channel: 1\n{ROWS}", "x.csv", finger)
     blocks = finger.build(UUID, calibration=calibrations).blocks
     with pytest.raises(UsageError, match="picture"):

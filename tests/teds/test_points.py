@@ -43,7 +43,7 @@ def test_a_file_grows_and_is_one_for_calibration() -> None:
     assert points_of(text, "joint3.csv")[1] == {"channel": 1, "raw": 32768, "value": 180, "spread": 0.5, "count": 32}
 
 
-def test_a_later_point_dates_the_file_and_stands_in_its_unit() -> None:
+def test_a_later_point_dates_the_file_and_is_in_its_unit() -> None:
     text = grown((0, 0)).replace("2026-11-23", "2026-10-01").replace("[degree]", "[rad]")
     more = grown((16384, 90), text=text)
     assert "# date: 2026-11-23\n" in more
@@ -81,7 +81,7 @@ def test_residuals_of_a_known_line() -> None:
     assert left_out(found) == pytest.approx((1 - 2.5,), abs=1e-6), "the line through its neighbours gives 2.5"
 
 
-def test_a_table_has_no_residuals_and_what_is_left_out_tells_what_it_is_worth() -> None:
+def test_a_table_has_no_residuals_and_points_that_are_left_out_show_its_worth() -> None:
     found = fit_points("raw,value\n" + "".join(f"{x},{x * x}\n" for x in range(5)), "x.csv")[1]
     left = residuals(found)
     assert left is not None

@@ -79,7 +79,7 @@ def test_the_two_types_of_the_papers_and_more_are_shipped() -> None:
 
 @pytest.mark.parametrize("edition", [2007, 2024])
 @pytest.mark.parametrize("name", shipped())
-def test_every_shipped_profile_builds_clean_teds_without_a_warning_of_its_own(name: str, edition: teds.Edition) -> None:
+def test_every_shipped_profile_builds_clean_teds_without_a_warning(name: str, edition: teds.Edition) -> None:
     profile = load_profile(name, [shipped_profiles()])
     assert profile.warnings == ()
     if profile.abstract:
@@ -207,7 +207,7 @@ def test_a_uuid_of_the_wrong_length_and_a_foreign_channel_are_refused(tmp_path: 
     assert teds.decode(built.blocks[0, 1]).get("UUID") == bytes(6) + UUID
 
 
-def test_texts_and_phy_are_built_where_the_profile_has_them(tmp_path: Path) -> None:
+def test_texts_and_phy_are_built_if_the_profile_has_them(tmp_path: Path) -> None:
     text = GOOD + '[phy]\nradio = "bluetooth"\nbattery = true\n[[text]]\nkind = "title"\nxml = "<Title>Ä</Title>"\n'
     built = load_profile(write(tmp_path, "force", text)).build(UUID)
     phy = teds.decode(built.blocks[0, 13])

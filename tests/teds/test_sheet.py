@@ -83,7 +83,7 @@ def test_a_calibration_gives_unit_uncertainty_and_due_date() -> None:
     assert channel.uncertainty != channel.stated_uncertainty
 
 
-def test_a_calibration_that_cannot_be_computed_is_said_and_left_out() -> None:
+def test_a_calibration_that_cannot_be_computed_is_reported_and_left_out() -> None:
     broken = {
         "not finite": line(zero_offset=math.inf),
         "ascend": Calibration(
@@ -102,7 +102,7 @@ def test_a_calibration_that_cannot_be_computed_is_said_and_left_out() -> None:
         assert "calibration" in {finding.code for finding in sheet.findings}
 
 
-def test_what_the_teds_say_against_each_other_is_found() -> None:
+def test_contradictions_between_teds_are_found() -> None:
     blocks = dict(image_of("tactile-finger-sensor").blocks)
     blocks[2, AccessCode.NAME] = blocks[1, AccessCode.NAME]
     blocks[40, AccessCode.CALIBRATION] = teds.compose(AccessCode.CALIBRATION, line(40).fields())

@@ -65,7 +65,7 @@ def test_a_uuid_of_2007_is_unpacked():
     assert summary["made in"].startswith("2012-01-01")
 
 
-def test_calibration_limits_are_in_the_calibrated_unit_when_the_channel_lies_beside():
+def test_calibration_limits_are_in_the_calibrated_unit_if_the_channel_is_given():
     channel = teds.compose(3, {"PhyUnits": Units(radians=1), "LowLimit": 0.0, "HiLimit": 6.2831855})
     degree = 0.017453292
     calibration = teds.compose(

@@ -218,7 +218,7 @@ def test_every_possible_unit_can_be_shown(units: Units) -> None:
     assert isinstance(text, str)
 
 
-def test_values_are_shown_in_the_unit_the_person_prefers_where_it_fits() -> None:
+def test_values_are_shown_in_the_unit_the_person_prefers_if_it_fits() -> None:
     rad = u.parse_units("degree")
     assert u.in_display_units(math.pi, rad) == (pytest.approx(180.0), "°")
     assert u.in_display_units(math.pi, rad, "turn") == (pytest.approx(0.5), "turn")

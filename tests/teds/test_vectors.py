@@ -32,7 +32,7 @@ def test_every_problem_of_the_index_is_an_error_finding(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", TEDS)
-def test_form_and_edition_are_told_from_the_octets(name: str) -> None:
+def test_form_and_edition_are_recognised_from_the_octets(name: str) -> None:
     decoded = teds.decode(octets_of(name))
     assert decoded.framed == (ALL[name]["form"] == "full")
     has_tedsid = name not in {"n07_no_tedsid", "f07_wanberg_chan_txt", "f07_wanberg_phy_txt"}
@@ -56,7 +56,7 @@ def test_missing_fields_and_old_versions_are_seen_but_are_no_errors(name: str) -
 
 
 @pytest.mark.parametrize("name", TEDS)
-def test_strict_raises_exactly_where_there_are_errors(name: str) -> None:
+def test_strict_raises_if_and_only_if_there_are_errors(name: str) -> None:
     if ALL[name]["verdict"] in GOOD:
         assert teds.decode(octets_of(name), strict=True).verdict in GOOD
     else:

@@ -83,7 +83,7 @@ def test_only_the_offset_and_its_date_move() -> None:
 
 
 @pytest.mark.parametrize("width", [1, 2, 3])
-def test_fields_that_nobody_knows_are_kept_octet_for_octet(width: int) -> None:
+def test_unknown_fields_are_kept_octet_for_octet(width: int) -> None:
     strange = frame(unframe(composed(LINE, width)) + raw_tuple(200, b"\xde\xad", width=width))
     after = with_zero_offset(strange, 1.0, AT)
     assert raw_tuple(200, b"\xde\xad", width=width) in after

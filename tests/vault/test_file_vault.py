@@ -53,7 +53,7 @@ def test_the_file_is_for_its_owner_alone_and_nothing_else_is_left(tmp_path: Path
     assert stat.S_IMODE((tmp_path / "vault.json").stat().st_mode) == 0o600
 
 
-def test_no_secret_stands_in_the_file_or_in_a_repr(tmp_path: Path, vault: FileVault) -> None:
+def test_no_secret_is_in_the_file_or_in_a_repr(tmp_path: Path, vault: FileVault) -> None:
     material = vault._material
     text = (tmp_path / "vault.json").read_text() + repr(vault) + repr(material) + repr(vault._key) + str(vars(vault))
     for secret in (material.identity, material.ca or b"", *material.masters.keys.values(), vault._key.key):
@@ -64,7 +64,7 @@ def test_no_secret_stands_in_the_file_or_in_a_repr(tmp_path: Path, vault: FileVa
 
 
 @pytest.mark.parametrize("wrong", ["", "four random words her", GOOD + " ", GOOD.upper(), "x" * 5000])
-def test_a_wrong_passphrase_is_told_apart_from_damage(tmp_path: Path, vault: FileVault, wrong: str) -> None:
+def test_a_wrong_passphrase_is_distinguished_from_damage(tmp_path: Path, vault: FileVault, wrong: str) -> None:
     with pytest.raises(VaultError) as caught:
         FileVault.open(tmp_path, STORE, Person(wrong))
     assert isinstance(caught.value, WrongPassphraseError) or len(wrong) > 1024
@@ -388,7 +388,7 @@ def test_an_unknown_keystore_is_a_usage_error(tmp_path: Path) -> None:
         open_vault(tmp_path, STORE, "floppy", Person())
 
 
-def test_nobody_to_ask_makes_nothing(tmp_path: Path) -> None:
+def test_without_a_person_to_ask_nothing_is_made(tmp_path: Path) -> None:
     def nobody(prompt: str, confirm: bool) -> str:
         raise VaultError("No passphrase, and nobody may be asked.")
 

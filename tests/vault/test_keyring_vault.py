@@ -133,7 +133,7 @@ class MemoryKeyring:
         del self.entries[service, entry]
 
 
-def test_what_is_written_is_made_from_what_lies_in_the_keyring_now(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_written_is_made_from_what_is_in_the_keyring_now(monkeypatch: pytest.MonkeyPatch) -> None:
     """The CA key was dropped by writing back what was read before another process changed the master key."""
     name = f"{MemoryKeyring.__module__}.{MemoryKeyring.__qualname__}"
     backend = MemoryKeyring()
@@ -327,7 +327,7 @@ def test_a_keyring_that_stays_locked_is_not_taken_and_not_waited_for(session: Se
 
 
 @pytest.mark.system
-def test_a_secret_service_that_nobody_unlocked_is_locked(session: Session) -> None:
+def test_a_secret_service_without_an_unlock_is_locked(session: Session) -> None:
     results = session.run('attempt(lambda: create_vault(home, store, "keyring", never))', password=None)
     assert results["error"] in ("VaultError", "KeyringUnavailableError")
     assert results["hint"]

@@ -20,7 +20,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / ".cache"
 
 
-def test_the_lock_lies_in_a_private_folder_of_this_user_alone(cache: Path) -> None:
+def test_the_lock_is_in_a_private_folder_of_this_user_alone(cache: Path) -> None:
     with pkcs11.exclusive("/lib/module.so"):
         (folder,) = cache.iterdir()
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700

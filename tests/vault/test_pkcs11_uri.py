@@ -75,7 +75,7 @@ def test_any_text_is_read_or_refused(text):
 
 @settings(deadline=None)
 @given(st.text(alphabet=st.characters(min_codepoint=33, max_codepoint=0x2FF), min_size=1).filter(str.isprintable))
-def test_any_printable_label_can_be_said(label):
+def test_any_printable_label_can_be_expressed(label):
     from urllib.parse import quote
 
     assert Pkcs11Uri.parse(f"pkcs11:token={quote(label, safe='')}{M}").token == label

@@ -110,7 +110,7 @@ def test_rewrap_cut_at_every_durable_write_loses_no_key(home: Path) -> None:
     assert step > 15
 
 
-def test_a_run_that_was_cut_is_carried_on_and_not_begun_anew(home: Path) -> None:
+def test_a_run_that_was_cut_is_carried_on_and_not_begun_again(home: Path) -> None:
     station = opened(home)
     station.vault.add_master()
     station.identity.begin_rewrapping(2)
@@ -222,7 +222,7 @@ def test_rewrap_by_command_and_its_plan(home: Path) -> None:
     assert (done.code, done.json) == (0, {"keystore": "file", "rewrapped": 5, "damaged": 0})
 
 
-def test_nobody_changes_the_vault_while_another_command_holds_the_store(home: Path) -> None:
+def test_the_vault_is_not_changed_while_another_command_holds_the_store(home: Path) -> None:
     with StoreLock(home, command="provision"):
         process = spawn("--home", home, "--json", "vault", "rewrap", passphrase=PASSPHRASE)
     assert process.code == 7
@@ -238,7 +238,7 @@ def changed_passphrase(home: Path) -> Station:
     return station
 
 
-def test_a_process_that_is_handed_the_master_key_loses_no_key_wherever_rewrap_is_cut(home: Path) -> None:
+def test_a_process_that_is_handed_the_master_key_loses_no_key_if_rewrap_is_cut_anywhere(home: Path) -> None:
     long_running = opened(home)
     before = keys(long_running)
     changed_passphrase(home).close()

@@ -65,7 +65,7 @@ def description(step: dict[str, Any]) -> str:
 
 
 @pytest.mark.system
-def test_the_vectors_say_the_same_in_c(tmp_path: Path) -> None:
+def test_the_vectors_are_the_same_in_c(tmp_path: Path) -> None:
     gcc = compiler()
     assert main([str(tmp_path)]) == 0
     (tmp_path / "player.c").write_text(PLAYER)

@@ -44,7 +44,7 @@ def test_a_switch_of_the_machine_is_named(tmp_path: Path) -> None:
     assert "switch" in hard.fix
 
 
-def test_no_bus_is_a_failure_only_where_ble_was_asked_for(tmp_path: Path) -> None:
+def test_no_bus_is_a_failure_only_if_ble_was_requested(tmp_path: Path) -> None:
     nowhere = f"unix:path={tmp_path}/nothing"
     (quiet,) = links.bluetooth(system(tmp_path, nowhere))
     (asked,) = links.bluetooth(system(tmp_path, nowhere, ble="auto"))

@@ -115,7 +115,7 @@ def test_twenty_nodes_are_asked_one_after_the_other(air: Air, port: Ports) -> No
     assert contacts[7].link.exchange(IDENTIFY), "and each is connected again when its turn comes"
 
 
-def test_who_collects_listens_for_as_long_as_it_was_told(air: Air, port: Ports, tmp_path: Path) -> None:
+def test_who_collects_listens_for_as_long_as_requested(air: Air, port: Ports, tmp_path: Path) -> None:
     """`identify --timeout 120` ended after 1.5 s of silence, with one node of two."""
     keyed_node(tmp_path / "keyed", profile=ANGLE)
     FlashFile.create(tmp_path / "new", uuid=bytes(range(10)))
@@ -176,7 +176,7 @@ def test_a_stale_cache_of_services_is_removed_once(air: Air, port: Ports) -> Non
     assert radio.do("counts")["removed"] == 1
 
 
-def test_a_device_that_never_has_the_service_is_told(air: Air, port: Ports) -> None:
+def test_a_device_that_never_has_the_service_is_reported(air: Air, port: Ports) -> None:
     radio = air(manners={"always_stale": True})
     notices: list[Notice] = []
     with pytest.raises(NoNodeError):
@@ -193,7 +193,7 @@ def test_bluez_may_have_forgotten_the_node(air: Air, port: Ports) -> None:
     assert contact.link.exchange(IDENTIFY)
 
 
-def test_where_the_adapter_is_full_an_idle_connection_makes_room(air: Air, port: Ports) -> None:
+def test_if_the_adapter_is_full_an_idle_connection_makes_room(air: Air, port: Ports) -> None:
     radio = air(3, manners={"limit": 2})
     contacts = port().find_all(seconds=30, notice=quiet)
     for contact in contacts:
@@ -201,7 +201,7 @@ def test_where_the_adapter_is_full_an_idle_connection_makes_room(air: Air, port:
     assert radio.do("counts")["most_held"] == 2
 
 
-def test_a_full_adapter_is_named_where_every_connection_is_needed(air: Air, port: Ports) -> None:
+def test_a_full_adapter_is_named_if_every_connection_is_needed(air: Air, port: Ports) -> None:
     air(3, manners={"limit": 2})
     contacts = port().find_all(seconds=30, notice=quiet)
     for contact in contacts[:2]:
@@ -278,7 +278,7 @@ def test_an_adapter_that_is_not_there(air: Air, port: Ports) -> None:
 
 
 @pytest.mark.parametrize("text", ["hci0?address=11:22", "hci0?speed=9", "a b"])
-def test_what_ble_may_not_say(text: str) -> None:
+def test_what_ble_may_not_send(text: str) -> None:
     with pytest.raises(UsageError):
         parse_spec(text)
 

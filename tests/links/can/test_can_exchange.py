@@ -150,7 +150,7 @@ def test_twenty_nodes_answer_one_identify(hub: Hub, nodes: Start) -> None:
         assert port.find(lambda seen: seen.uuid == wanted, seconds=PATIENCE, notice=quiet).address == addresses[19]
 
 
-def test_watch_tells_again_of_a_node_back_in_factory_state(hub: Hub) -> None:
+def test_watch_reports_a_node_back_in_factory_state_again(hub: Hub) -> None:
     node = EchoNode(0x21)
     node.state = NodeState.PROVISIONED
     with serving(hub.spec, node), opened(hub.spec) as port:
@@ -256,7 +256,7 @@ def test_watch_survives_a_bus_that_goes_away() -> None:
     port.close()
 
 
-def test_a_node_pulled_in_the_middle_of_its_answer_holds_up_nobody_else() -> None:
+def test_a_node_pulled_in_the_middle_of_its_answer_delays_no_other() -> None:
     """It was waited for a whole second in each round, in which the next board on the bus was not looked for."""
     broken_off = {(0x18DAF121, 2), (0x18DA21F1, 0)}  # its consecutive frames; asked by itself it is silent
     hub = Hub(lambda identifier, data: (identifier, data[0] >> 4) in broken_off)
@@ -365,7 +365,7 @@ def test_a_node_is_asked_first_where_it_is_thought_to_be(hub: Hub) -> None:
         assert find(port, address=0x22).address == 0x21, "the guess is wrong: then everyone is asked"
 
 
-def test_nobody_is_there(hub: Hub) -> None:
+def test_no_node_is_there(hub: Hub) -> None:
     with opened(hub.spec) as port:
 
         def looked() -> float:
@@ -379,7 +379,7 @@ def test_nobody_is_there(hub: Hub) -> None:
         best_of(5, 3.0, looked, because="a try is 1.2 s of waiting and two of patience")
 
 
-def test_another_node_than_the_wanted_is_told_and_waited_past(hub: Hub) -> None:
+def test_another_node_than_the_wanted_is_reported_and_waited_past(hub: Hub) -> None:
     spec = hub.spec + "&node=0x21"
     with serving(hub.spec, EchoNode(0x21)), opened(spec) as port:
 

@@ -33,7 +33,7 @@ def answering(hub: Hub, answer: Callable[[int], None]) -> threading.Event:
     return stop
 
 
-def test_flow_controls_that_nobody_waits_for_do_not_pile_up(hub: Hub) -> None:
+def test_unexpected_flow_controls_do_not_pile_up(hub: Hub) -> None:
     port = CanPort(hub.spec)
     try:
         with port.listen_frames(lambda frame: frame.identifier == ANNOUNCE) as ear:

@@ -252,7 +252,7 @@ def test_wait_frames_and_a_reserved_gap_are_borne() -> None:
 
 @given(st.lists(st.binary(max_size=64), max_size=30), st.booleans())
 @settings(max_examples=60, deadline=None)
-def test_any_frames_at_all_do_not_break_a_pair(datas: list[bytes], fd: bool) -> None:
+def test_no_frames_break_a_pair(datas: list[bytes], fd: bool) -> None:
     wire = Wire(fd=fd)
     wire.station.send(bytes(30))
     for data in datas:
@@ -306,7 +306,7 @@ def test_two_first_frames_or_a_broken_sequence_are_a_conflict(order: tuple[int, 
 
 
 @given(st.lists(st.tuples(st.integers(0x18DAF101, 0x18DAF104), st.binary(max_size=64)), max_size=40))
-def test_any_frames_at_all_do_not_break_a_gathering(frames: list[tuple[int, bytes]]) -> None:
+def test_no_frames_break_a_gathering(frames: list[tuple[int, bytes]]) -> None:
     gathering = BroadcastReplies(STATION, 7)
     for identifier, data in frames:
         flow = gathering.add_frame(Frame(identifier, data))

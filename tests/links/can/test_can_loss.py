@@ -42,7 +42,7 @@ def tally(port: CanPort, octets: int, count: int) -> int:
     return good
 
 
-def test_doubled_frames_harm_nobody(group: str, nodes: Start) -> None:
+def test_doubled_frames_do_no_harm(group: str, nodes: Start) -> None:
     nodes(group, 0x21)
     port = CanPort(over(group, seed=1, double=0.05))
 
@@ -55,7 +55,7 @@ def test_doubled_frames_harm_nobody(group: str, nodes: Start) -> None:
     port.close()
 
 
-def test_small_pieces_come_through_where_frames_are_lost(group: str, nodes: Start) -> None:
+def test_small_pieces_come_through_if_frames_are_lost(group: str, nodes: Start) -> None:
     nodes(group, 0x21)
     port = CanPort(over(group, seed=2, loss=0.03))
     best_of(3, 4, lambda: 10 - tally(port, 40, 10))  # of ten, three may be lost

@@ -114,7 +114,7 @@ def test_a_question_is_given_up_when_the_node_announces_itself(hub: Hub, nodes: 
         assert port.identify(0x21, seconds=PATIENCE) is not None
 
 
-def test_an_exchange_is_given_up_when_nobody_hopes_for_its_reply(hub: Hub) -> None:
+def test_an_exchange_is_given_up_when_its_reply_is_not_expected(hub: Hub) -> None:
     with closing(CanPort(hub.spec)) as port:
         link, over = port.link(0x21), threading.Event()
         link.hopeless = over.is_set
@@ -160,7 +160,7 @@ def test_a_listener_that_does_not_read_loses_what_does_not_fit_and_knows_it(hub:
     port.close()
 
 
-def test_a_bus_that_goes_away_wakes_whoever_waits() -> None:
+def test_a_bus_that_goes_away_wakes_every_waiting_thread() -> None:
     hub = Hub()
     port = CanPort(hub.spec)
     ear = port.listen_frames(lambda frame: True)

@@ -300,7 +300,7 @@ def test_no_serial_reader_says_so() -> None:
     assert caught.value.hint
 
 
-def test_a_port_with_a_name_of_its_own_is_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_with_another_name_is_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
     """10000 stands as webmin in /etc/services; nfcpy took the name for the number."""
     import socket as sockets
 
@@ -310,7 +310,7 @@ def test_a_port_with_a_name_of_its_own_is_a_port(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize("level", [logging.DEBUG, logging.CRITICAL])
-def test_frames_are_written_out_where_somebody_reads_them(
+def test_frames_are_formatted_for_the_log_only_with_debug(
     start_node: StartNode,
     port: Port,
     notices: list[Notice],

@@ -72,7 +72,7 @@ def test_a_node_that_is_not_ready_is_asked_for_the_length_alone_from_then_on() -
     assert tag.reads == [(0, 80), (0, 2), (0, 2), (0, 2), (2, 78)]
 
 
-def test_a_tag_that_lets_nobody_read_beyond_its_message_is_read_in_two_steps() -> None:
+def test_a_tag_that_cannot_be_read_beyond_its_message_is_read_in_two_steps() -> None:
     tag = Tag()
     ndef = written(tag, answer=b"short")
     tag.strict = True

@@ -168,7 +168,7 @@ def test_a_measurement_that_ended_before_a_value_came_leaves_a_file_that_says_wh
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".txt", ".jsonl", ".mcap"])
-def test_each_part_tells_of_its_own_losses_and_so_does_what_is_made_of_it(tmp_path: Path, suffix: str) -> None:
+def test_each_part_reports_its_own_losses_and_so_does_what_is_made_of_it(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"run{suffix}"
     first = NodeReport(ARM, "running", samples=30, lost=5, late=1, bad=2, invalid=3)
     last = NodeReport(ARM, "ended", samples=33, lost=7, late=1, bad=2, invalid=4)

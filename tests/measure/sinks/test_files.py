@@ -446,7 +446,7 @@ def test_a_file_whose_recorder_writes_is_refused(tmp_path: Path, name: str) -> N
         sink.close()
 
 
-def test_a_folder_that_is_not_there_is_told_before_anything_is_measured(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_there_is_reported_before_anything_is_measured(tmp_path: Path) -> None:
     with pytest.raises(TedsProvisionError, match="folder"):
         open_sink(str(tmp_path / "no" / "run.csv")).open([ANGLE], STATION)
     with pytest.raises(UsageError, match="Unsupported format"):

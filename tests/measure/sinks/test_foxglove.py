@@ -109,7 +109,7 @@ def test_only_this_machine_is_served_unless_a_name_is_allowed_and_tls_is_there(t
     assert open_.url("ws", "0.0.0.0", 8765) == "wss://bench:8765"
 
 
-def test_a_taken_port_is_said() -> None:
+def test_a_taken_port_is_reported() -> None:
     first = FoxgloveServer("127.0.0.1:0")
     first.start("bench")
     try:

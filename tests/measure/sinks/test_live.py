@@ -161,7 +161,7 @@ def test_words_become_plain_letters() -> None:
         ("count", "steps", "", "std_msgs/Float64"),
     ],
 )
-def test_a_typed_message_only_where_unit_and_meaning_fit(unit: str, name: str, quantity: str, type_: str) -> None:
+def test_a_typed_message_only_if_unit_and_meaning_fit(unit: str, name: str, quantity: str, type_: str) -> None:
     facts = ChannelFacts(ARM, "arm", 1, name, units=parse_units(unit), quantity=quantity)
     assert meaning_of(facts).type == type_
     assert meaning_of(replace(facts, kind="actuator")).type == "std_msgs/Float64"
@@ -183,7 +183,7 @@ def axes(unit: str, first: int, **more: Any) -> list[ChannelFacts]:
     ]
 
 
-def test_a_vector_group_is_one_message_where_its_unit_says_what_it_is() -> None:
+def test_a_vector_group_is_one_message_if_its_unit_tells_what_it_is() -> None:
     def kinds(*facts: ChannelFacts) -> list[tuple[str, str]]:
         return [(compound.type, compound.name) for compound in compounds_of(facts)]
 
@@ -350,7 +350,7 @@ def test_a_gripper_is_a_joint_whose_state_goes_out_and_whose_set_points_come_in(
     assert sink.refused_commands == 3
 
 
-def test_sensors_alone_are_no_joint_and_nobody_guesses_whose_they_are() -> None:
+def test_sensors_alone_are_no_joint_and_their_owner_is_not_guessed() -> None:
     topics = Topics(STATION)
     assert joints_of([ANGLE, FORCE], topics) == []
     second = replace(gripper()[0], number=4, name="thumb")
@@ -385,7 +385,7 @@ def test_a_node_under_another_name_leaves_no_datasheet_under_the_old_one() -> No
     assert list(sink.words) == ["/bench/left_arm/teds"]
 
 
-def test_an_unsigned_datasheet_is_told_in_diagnostics_and_metadata() -> None:
+def test_an_unsigned_datasheet_is_reported_in_diagnostics_and_metadata() -> None:
     bare = ChannelFacts(ARM, "arm", 1, "angle", unsigned=True)
     sink = carried([block([[1]], [[np.nan]], [[False]])], facts=[bare, FORCE])
     assert sink.scalars == []
@@ -420,7 +420,7 @@ def test_metadata_and_parameters_say_what_the_datasheet_says() -> None:
     assert sink.parameters["/bench/arm/angle"] == {k: v for k, v in words["channels"][0].items() if k != "topic"}
 
 
-def test_only_actuators_listen_and_only_where_somebody_takes_commands() -> None:
+def test_only_actuators_listen_and_only_if_commands_are_accepted() -> None:
     grip = replace(FORCE, kind="actuator")
     assert carried([], [ANGLE, grip], commands=[]).listens == [("/bench/hand/force/cmd", HAND, 2)]
     assert carried([], [ANGLE, grip]).listens == []
@@ -446,7 +446,7 @@ def test_a_command_that_is_no_number_moves_nothing() -> None:
         (NodeReport(ARM, "refused", "another key"), ERROR),
     ],
 )
-def test_diagnostics_tell_what_is_wrong(report: NodeReport, level: int) -> None:
+def test_diagnostics_report_what_is_wrong(report: NodeReport, level: int) -> None:
     sink = carried([report], [replace(ANGLE, overdue=True, due="2026-01-01")])
     status, overdue, own = sink.statuses
     assert status.level == level

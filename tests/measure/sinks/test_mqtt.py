@@ -201,7 +201,7 @@ class TestWithMosquitto:
         finally:
             sink.close()
 
-    def test_a_connection_that_was_cut_puts_nobody_offline_afterwards(self, broker: Broker) -> None:
+    def test_a_connection_that_was_cut_puts_no_node_offline_afterwards(self, broker: Broker) -> None:
         # The broker noticed the cut only after 22 s, and its will then said offline over the new connection's online.
         broker.start()
         client, heard = until(lambda: _tried(lambda: broker.heard_of("bench/status")))
@@ -271,7 +271,7 @@ class TestWithMosquitto:
             client.loop_stop()
         assert sink.stats.state == "ended"
 
-    def test_a_newcomer_is_announced_and_nobody_else_again(self, broker: Broker) -> None:
+    def test_a_newcomer_is_announced_and_no_other_node_again(self, broker: Broker) -> None:
         broker.start()
         client, heard = until(lambda: _tried(lambda: broker.heard_of("homeassistant/#")))
         sink = open_sink(f"mqtt://127.0.0.1:{broker.port}")
@@ -309,7 +309,7 @@ class TestWithMosquitto:
             client.disconnect()
             client.loop_stop()
 
-    def test_a_broker_that_stands_still_holds_no_measurement_up(self, broker: Broker) -> None:
+    def test_a_broker_that_hangs_delays_no_measurement(self, broker: Broker) -> None:
         broker.start()
         sink = open_sink(f"mqtt://127.0.0.1:{broker.port}")
         sink.open([ANGLE], STATION)
@@ -337,7 +337,7 @@ def _tried(make: Any) -> Any:
         return None
 
 
-def test_who_accepts_and_says_nothing_is_told_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_that_accepts_and_sends_nothing_is_reported_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mqtt, "KEEP_ALIVE", 1)
     with socket.create_server(("127.0.0.1", 0)) as mute:
         port = mute.getsockname()[1]
@@ -362,7 +362,7 @@ def test_what_is_no_url_or_holds_a_password_is_refused(spec: str) -> None:
     assert "secret" not in str(caught.value)
 
 
-def test_a_password_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_a_password_file_that_is_not_there_is_reported(tmp_path: Path) -> None:
     sink = open_sink(f"mqtt://user@127.0.0.1:1?password-file={tmp_path}/none")
     with pytest.raises(TedsProvisionError, match="password-file="):
         sink.open([ANGLE], STATION)

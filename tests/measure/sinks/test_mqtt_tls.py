@@ -153,7 +153,7 @@ def test_a_client_shows_its_own_certificate(ports: dict[str, int], authority: Au
 
 
 @pytest.mark.system
-def test_each_failure_is_told_in_words(ports: dict[str, int], authority: Authority, tmp_path: Path) -> None:
+def test_each_failure_is_reported_in_words(ports: dict[str, int], authority: Authority, tmp_path: Path) -> None:
     refused(f"mqtts://127.0.0.1:{ports['tls']}", "certificate of 127.0.0.1 does not verify", "ca=")
     elsewhere = f"mqtts://127.0.0.1:{ports['elsewhere']}?ca={authority.file}"
     refused(elsewhere, "certificate of 127.0.0.1 does not verify", "mismatch")

@@ -148,7 +148,7 @@ class TestSeenByRclpy:
         until(lambda: "2026-09-01" in peer.heard("/bench/arm/teds")[-1]["data"])
 
     @pytest.mark.skipif(not Path("/usr/bin/ss").exists(), reason="iproute2 is not installed")
-    def test_nobody_from_outside_reaches_its_ports(self, domain: Domain, sink: Any) -> None:
+    def test_its_ports_are_unreachable_from_outside(self, domain: Domain, sink: Any) -> None:
         sink.open([ANGLE], STATION)
         until(lambda: sink.stats.state == "running")
         child = getattr(sink, "_child", None)
@@ -158,7 +158,7 @@ class TestSeenByRclpy:
         assert mine
         assert all("%lo:" in name for name in mine), here
 
-    def test_facts_are_parameters_which_nobody_sets(self, domain: Domain) -> None:
+    def test_facts_are_read_only_parameters(self, domain: Domain) -> None:
         sink = open_sink(f"ros2:{domain.number}")
         sink.open([ANGLE, *AXES], STATION)
         until(lambda: sink.stats.state == "running")
@@ -179,7 +179,7 @@ class TestSeenByRclpy:
         assert peer.of("set")[0]["results"][0]["successful"] is False
         sink.close()
 
-    def test_a_child_that_dies_is_started_anew_and_says_all_again(self, domain: Domain) -> None:
+    def test_a_child_that_dies_is_restarted_and_repeats_everything(self, domain: Domain) -> None:
         sink = open_sink(f"ros2:{domain.number}")
         assert isinstance(sink, RclpySink)
         sink.open([ANGLE], STATION)

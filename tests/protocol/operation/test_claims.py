@@ -139,7 +139,7 @@ def test_the_dead_man_runs_out_at_its_time_and_not_before() -> None:
     assert not bench.operation().channels[4][0] & ChannelState.STOPPED
 
 
-def test_a_late_value_is_refused_even_where_nobody_polled() -> None:
+def test_a_late_value_is_refused_even_without_a_poll() -> None:
     bench = acting(dead_man=200)
     bench.hardware.tick += 200 * MS
     assert bench.reason(write_data_set(4, VALUE)) == Reason.WRONG_STATE
@@ -240,7 +240,7 @@ def test_writing_is_refused_while_a_session_claims() -> None:
     assert bench.plain(ADDRESS, "nfc").ok
 
 
-def test_who_stands_there_ends_the_claims_of_others_on_sensors() -> None:
+def test_a_tap_ends_the_claims_of_others_on_sensors() -> None:
     bench = Bench().open("can:f1").operate(1, 2).open("nfc")
     assert bench.reason(UPDATE, "nfc") == Reason.BUSY, "not by 1.4"
     assert bench.reason(write_teds(1, 12, 9, b"x"), "nfc") == Reason.BAD_FORM, "a refused 1.3 changes nothing"
@@ -249,7 +249,7 @@ def test_who_stands_there_ends_the_claims_of_others_on_sensors() -> None:
     assert not bench.operation("can:f1").measuring
 
 
-def test_but_not_where_an_actuator_is_claimed() -> None:
+def test_but_not_if_an_actuator_is_claimed() -> None:
     bench = Bench().open("can:f1").operate(1, 4).open("nfc")
     assert bench.reason(WRITE, "nfc") == Reason.BUSY
     assert bench.operation("can:f1").channels[1][0] & ChannelState.CLAIMED_HERE

@@ -63,7 +63,7 @@ def test_drive_messages_are_sets_and_feed_the_dead_men(wheel: Wheel) -> None:
     assert wheel.points == (100, 100)
 
 
-def test_a_fresh_drive_message_after_the_dead_man_moves_nothing_even_where_nobody_polled(wheel: Wheel) -> None:
+def test_a_fresh_drive_message_after_the_dead_man_moves_nothing_even_without_a_poll(wheel: Wheel) -> None:
     """A node whose processor hung wakes up with a fresh message in its controller: its timer ran out before that."""
     wheel.hear(wheel.message(1000, 1000))
     wheel.bench.hardware.tick += 500 * MS

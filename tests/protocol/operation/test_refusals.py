@@ -93,7 +93,7 @@ def test_operate_in_the_order_of_section_1() -> None:
     assert claimed == {3, 5}
 
 
-def test_operate_0_where_no_sensor_is_left_gets_6_and_with_no_power_23() -> None:
+def test_operate_0_gets_6_if_no_sensor_is_left_and_23_with_no_power() -> None:
     bench = Bench().open()
     bench.hardware.faults = {1, 2, 3, 5}
     assert bench.reason(operate(0)) == Reason.DIGEST_MISMATCH

@@ -23,7 +23,7 @@ def closed(uri, home, store_id):
     return vault
 
 
-def test_a_wrong_pin_is_said_once_with_what_is_known_of_the_tries(closed, home, store_id, uri):
+def test_a_wrong_pin_is_reported_once_with_what_is_known_of_the_tries(closed, home, store_id, uri):
     person = Person("000000")
     with pytest.raises(WrongPassphraseError, match=r"PIN of the token 'bench' is wrong\. .*attempt") as refused:
         Pkcs11Vault.open(home, store_id, uri, person)
@@ -39,7 +39,7 @@ def test_odd_pins_are_wrong_pins(closed, home, store_id, uri, pin):
         Pkcs11Vault.open(home, store_id, uri, Person(pin))
 
 
-def test_what_a_token_tells_of_the_tries_left():
+def test_what_a_token_reports_of_the_tries_left():
     """SoftHSM never locks, so the flags are given here."""
     from pkcs11 import TokenFlag
 
