@@ -28,7 +28,7 @@ PASSPHRASE = "correct horse battery"
 
 
 def make_station(home: Path, name: str = "bench") -> Station:
-    """A station with a passphrase vault at the lowest cost."""
+    """Return a station with a passphrase vault at the lowest cost."""
     costs = passphrase.THROWAWAY
     return initialise(home, name=name, keystore="file", ask=lambda prompt, confirm: PASSPHRASE, costs=costs)[0]
 
@@ -51,7 +51,7 @@ def copy_home(home: Path) -> None:
 
 
 def copied_station(home: Path) -> Station:
-    """A station with a passphrase vault at the lowest cost, by :func:`copy_home`."""
+    """Return a station with a passphrase vault at the lowest cost, by :func:`copy_home`."""
     copy_home(home)
     return Station.open(home, ask=lambda prompt, confirm: PASSPHRASE)
 
@@ -145,12 +145,12 @@ class VirtualLink:
 
 
 def on_reader(node: VirtualNode) -> Contact:
-    """The virtual node as a reader would find it."""
+    """Return the virtual node as a reader would find it."""
     return Contact(Identity.decode(node.identify()), VirtualLink(node), tag_uid=b"\x04" + bytes(6))
 
 
 def contact(board: Board, link: MemoryLink | None = None) -> Contact:
-    """The node as a port would find it."""
+    """Return the node as a port would find it."""
     link = link or MemoryLink(board)
     reply = board.tim.identity().encode()
     address = board.tim.flash.can_address if link.via == "can" else None
@@ -158,5 +158,5 @@ def contact(board: Board, link: MemoryLink | None = None) -> Contact:
 
 
 def talk(board: Board, link: MemoryLink | None = None) -> Conversation:
-    """A conversation with the node."""
+    """Return a conversation with the node."""
     return Conversation(contact(board, link), notice=lambda notice: None)

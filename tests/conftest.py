@@ -104,7 +104,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture
 def node_kind() -> str:
-    """Which node a desk has: ``python``, or ``c`` (``make test-c``)."""
+    """Return which node a desk has: ``python``, or ``c`` (``make test-c``)."""
     return "c" if ALL_IN_C else "python"
 
 
@@ -181,7 +181,7 @@ def nothing_left(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture
 def station(tmp_path: Path) -> Iterator[Station]:
-    """A new station with a passphrase vault at the lowest cost."""
+    """Yield a new station with a passphrase vault at the lowest cost."""
     made = copied_station(tmp_path / "home")
     yield made
     made.close()
@@ -189,5 +189,5 @@ def station(tmp_path: Path) -> Iterator[Station]:
 
 @pytest.fixture
 def board() -> Board:
-    """A new node in factory state."""
+    """Return a new node in factory state."""
     return Board()

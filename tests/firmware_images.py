@@ -13,7 +13,7 @@ BOARD = "virtual/finger"
 
 
 def make_key(path: Path) -> Path:
-    """A key pair of an owner."""
+    """Return a key pair of an owner."""
     _run("keygen", "-k", path, "-t", "ecdsa-p256")
     return path
 
@@ -46,7 +46,7 @@ def sign(
 
 
 def public(key: Path, encoding: str) -> Path:
-    """The public half of a key: ``pem``, or ``raw`` as the node in C reads it."""
+    """Return the public half of a key: ``pem``, or ``raw`` as the node in C reads it."""
     path = key.with_suffix(f".public.{encoding}")
     _run("getpub", "-k", key, "-e", encoding, "-o", path)
     return path

@@ -25,7 +25,7 @@ class FailedTryWarning(UserWarning):
 
 @contextmanager
 def costs_at_most(seconds: float) -> Iterator[None]:
-    """What is done under it takes no more of this process's CPU than that; what others take is not counted."""
+    """Yield what is done under it takes no more of this process's CPU than that; what others take is not counted."""
     began = time.process_time()
     yield
     elapsed = time.process_time() - began

@@ -28,12 +28,12 @@ def _free(kind: socket.SocketKind) -> int:
 
 
 def free_udp_port() -> int:
-    """A UDP port of 127.0.0.1 that nobody has."""
+    """Return a UDP port of 127.0.0.1 that nobody has."""
     return _free(socket.SOCK_DGRAM)
 
 
 def free_tcp_port() -> int:
-    """A TCP port of 127.0.0.1 that nobody has."""
+    """Return a TCP port of 127.0.0.1 that nobody has."""
     return _free(socket.SOCK_STREAM)
 
 
@@ -46,12 +46,12 @@ def free_group() -> str:
 
 
 def free_bus() -> str:
-    """A CAN bus over multicast that nobody else is on."""
+    """Return a CAN bus over multicast that nobody else is on."""
     return f"udp_multicast:{free_group()}?port={free_udp_port()}"
 
 
 def new_uuid(taken: set[int]) -> bytes:
-    """A random UUID whose default CAN address lies in ``OF_NODES`` and is not ``taken``; it is from now on.
+    """Return a random UUID whose default CAN address lies in ``OF_NODES`` and is not ``taken``; it is from now on.
 
     A node's default address follows from its UUID, so two random ones in 239 share it, or meet a stranger of the test.
     """
@@ -64,7 +64,7 @@ def new_uuid(taken: set[int]) -> bytes:
 
 
 def free_reader() -> str:
-    """A simulated NFC reader that nobody else uses."""
+    """Return a simulated NFC reader that nobody else uses."""
     return f"udp:localhost:{free_udp_port()}"
 
 
@@ -86,7 +86,7 @@ def ros_domain() -> Iterator[int]:
 
 
 def self_signed(folder: Path) -> tuple[str, Path, str, Path]:
-    """The options for TLS: a new certificate for localhost and 127.0.0.1, and its key."""
+    """Return the options for TLS: a new certificate for localhost and 127.0.0.1, and its key."""
     certificate, key = folder / "cert.pem", folder / "key.pem"
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2",

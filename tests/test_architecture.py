@@ -90,7 +90,7 @@ def room_of(path: Path) -> str:
 
 
 def imports(tree: ast.AST) -> Iterator[tuple[str, int]]:
-    """Every module that is imported anywhere in a tree, with its line; `from x import y` counts as x.y too."""
+    """Yield every module that is imported anywhere in a tree, with its line; `from x import y` counts as x.y too."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((alias.name, node.lineno) for alias in node.names)
@@ -198,7 +198,7 @@ def room_of_name(dotted: str) -> str:
 
 
 def named(tree: ast.Module) -> Iterator[tuple[str, str]]:
-    """What is named of our modules, as (module, name): imported by name, or reached through its room."""
+    """Yield what is named of our modules, as (module, name): imported by name, or reached through its room."""
     rooms: dict[str, str] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("teds_provision"):
@@ -287,7 +287,7 @@ _LINK_FOLDERS = tuple(sorted(path.name for path in (PACKAGE / "links").iterdir()
 
 @cache
 def classes_of_links() -> frozenset[str]:
-    """Names of the classes in the folder of each link: CanPort, BleLink …."""
+    """Return names of the classes in the folder of each link: CanPort, BleLink …."""
     trees = [parsed(path) for name in _LINK_FOLDERS for path in (PACKAGE / "links" / name).rglob("*.py")]
     named = (node.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
     return frozenset(name for name in named if name.lower().startswith(_LINK_FOLDERS))

@@ -127,7 +127,7 @@ def test_the_demo_shows_the_whole_story(core: Path) -> None:
 
 
 def _rows(home: Path) -> dict[str, list[tuple[object, ...]]]:
-    """Every row of every table that a plant fills, as it is in the file."""
+    """Return every row of every table that a plant fills, as it is in the file."""
     with closing(sqlite3.connect(f"file:{home / 'store.sqlite3'}?mode=ro", uri=True)) as file:
         found = {table: file.execute(f"SELECT * FROM {table}").fetchall() for table in _TABLES}
         found["plant"] = file.execute("SELECT registry, joined, synced, acknowledged, mac FROM plant").fetchall()

@@ -26,7 +26,7 @@ def prose(text: str) -> str:
 
 
 def anchor(heading: str) -> str:
-    """The anchor that a forge makes of a heading."""
+    """Return the anchor that a forge makes of a heading."""
     return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
 
 
@@ -48,7 +48,7 @@ def broken_links(page: Path) -> Iterator[str]:
 
 
 def shown(page: Path) -> Iterator[str]:
-    """Every command of ours in a code block, continued lines joined, without what a shell does around it."""
+    """Yield every command of ours in a code block, continued lines joined, without what a shell does around it."""
     for block in re.findall(r"^```[a-z]*\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL):
         for line in block.replace("\\\n", " ").splitlines():
             command = PROMPT.sub("", line.strip())

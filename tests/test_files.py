@@ -120,7 +120,7 @@ def test_nothing_is_left_when_writing_fails(tmp_path: Path) -> None:
 
 
 def left_over(path: Path) -> Path:
-    """What a killed writer leaves: begun in another process, which is killed before it is done."""
+    """Return what a killed writer leaves: begun in another process, which is killed before it is done."""
     code = (
         "import sys, time; from pathlib import Path; from teds_provision.files import whole_file\n"
         "with whole_file(Path(sys.argv[1]), replace=True) as file:\n"

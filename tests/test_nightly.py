@@ -14,7 +14,7 @@ class FakeItem(pytest.Item):
 
 @pytest.fixture
 def suite(request: pytest.FixtureRequest) -> list[pytest.Item]:
-    """Two tests, and one with two cases, of which the second is out of the gate."""
+    """Return two tests, and one with two cases, of which the second is out of the gate."""
     items: list[pytest.Item] = [
         FakeItem.from_parent(request.node.parent, name=name, nodeid=f"tests/{name}")
         for name in ("x.py::test_holder", "x.py::test_moved", "y.py::test_case[a]", "y.py::test_case[b]")

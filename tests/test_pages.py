@@ -81,7 +81,7 @@ def defined(path: Path) -> set[str]:
 
 
 def missing_on_the_way(text: str) -> list[str]:
-    """Files and functions of "file `name`, `name` -> file ..." that are not there."""
+    """Return files and functions of "file `name`, `name` -> file ..." that are not there."""
     wrong, here, path = [], set[str](), ""
     for match in re.finditer(r"`([a-z_0-9/]+\.py)`|`([A-Za-z_]+)`", text):
         if match[1] is not None:
@@ -169,7 +169,7 @@ GUIDES = sorted(page for page in (ROOT / "docs").glob("*.md") if page.name != "R
 
 
 def texts(*folders: str) -> str:
-    """All literal texts of the code, with a mark where a value comes in, and the page's scripts."""
+    """Return all literal texts of the code, with a mark where a value comes in, and the page's scripts."""
     found: list[str] = []
     for folder in folders:
         for path in (ROOT / folder).rglob("*.py"):

@@ -12,7 +12,7 @@ RULE = re.compile(r"\b(M\d|[A-Z]{4,}(?:_[A-Z]+)*)\b")
 
 
 def promises() -> list[str]:
-    """The cells of the page's table that name tests."""
+    """Return the cells of the page's table that name tests."""
     page = (ROOT / "docs" / "security.md").read_text(encoding="utf-8")
     table = page.partition("## Which test holds which promise")[2].partition("\n## ")[0]
     return [line.split("|")[2] for line in table.splitlines() if line.startswith("| ")][1:]

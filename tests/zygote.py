@@ -71,7 +71,7 @@ class ForkedProcess:
         return self._ended(0)
 
     def wait(self, timeout: float) -> int:
-        """The exit code; raises TimeoutExpired."""
+        """Return the exit code; raises TimeoutExpired."""
         code = self._ended(timeout)
         if code is None:
             raise subprocess.TimeoutExpired(str(self.pid), timeout)
@@ -102,7 +102,7 @@ class Child(ForkedProcess):
     err: int
 
     def wait(self, timeout: float) -> int:
-        """The exit code; kills it and raises TimeoutExpired where it has not ended after ``timeout``."""
+        """Return the exit code; kills it and raises TimeoutExpired where it has not ended after ``timeout``."""
         try:
             return super().wait(timeout)
         except subprocess.TimeoutExpired:
@@ -115,11 +115,11 @@ class Child(ForkedProcess):
         self._ended(30)
 
     def stdout(self) -> str:
-        """What it wrote to a file in memory."""
+        """Return what it wrote to a file in memory."""
         return _whole(self.out)
 
     def stderr(self) -> str:
-        """What it wrote to stderr."""
+        """Return what it wrote to stderr."""
         return _whole(self.err)
 
     def wait_for(self, text: str, seconds: float) -> None:
@@ -224,7 +224,7 @@ class Zygote:
         *,
         piped: bool = False,
     ) -> Child:
-        """The same with output that is kept in memory; ``piped``: stdout is a pipe."""
+        """Return the same with output that is kept in memory; ``piped``: stdout is a pipe."""
         err = os.memfd_create("stderr", os.MFD_CLOEXEC)
         out, written = os.pipe() if piped else (os.memfd_create("stdout", os.MFD_CLOEXEC),) * 2
         try:

@@ -52,7 +52,7 @@ def opened_octets(folder: Path, octets: bytes, passphrase: str = SEALED) -> Cont
 
 
 def copy_of(station: Station, folder: Path) -> Content:
-    """The station as it is now, as a backup that was opened."""
+    """Return the station as it is now, as a backup that was opened."""
     back_up(station, folder / "copy.backup")
     return opened(folder / "copy.backup")
 

@@ -18,7 +18,7 @@ from ..bench import copied_station
 
 @pytest.fixture
 def station(tmp_path: Path) -> Iterator[Station]:
-    """A station with two nodes in use, one of them in the middle of a rotation, and one trusted CA."""
+    """Yield a station with two nodes in use, one of them in the middle of a rotation, and one trusted CA."""
     forget_vaults()
     made = copied_station(tmp_path / "home")
     for uuid in (ONE, TWO):

@@ -72,7 +72,7 @@ def agreeing_so(
     ),
     reply: Callable[[bytes], bytes] = lambda octets: octets,
 ) -> Bend:
-    """A node that answers Request with one or more things made otherwise."""
+    """Return a node that answers Request with one or more things made otherwise."""
 
     def answer(
         cls: type[NodeAgreement], key: PrivateKey, uuid: bytes, payload: bytes, *, teds: bytes, **more: Any
@@ -92,7 +92,7 @@ def agreeing_so(
 
 
 def only_confirm(tag: Callable[[bytes, bytes], bytes]) -> Bend:
-    """A node that waits for another tagS."""
+    """Return a node that waits for another tagS."""
 
     def bend(patch: Patch) -> None:
         original = NodeAgreement.answer.__func__  # type: ignore[attr-defined]
@@ -121,12 +121,12 @@ def only_confirm(tag: Callable[[bytes, bytes], bytes]) -> Bend:
 
 
 def high(signature: bytes) -> bytes:
-    """The other s of the same signature."""
+    """Return the other s of the same signature."""
     return signature[:32] + (GROUP_ORDER - int.from_bytes(signature[32:], "big")).to_bytes(32, "big")
 
 
 def of_new_epoch(teds: bytes) -> bytes:
-    """The digest of the initial Security TEDS with the epoch that is only offered."""
+    """Return the digest of the initial Security TEDS with the epoch that is only offered."""
     shown = security.decode(teds)
     return sha(
         security.initial(
@@ -244,7 +244,7 @@ def any_s_in_a_request(patch: Patch) -> None:
 
 
 def station_signed_as(message: Callable[[bytes], bytes]) -> Bend:
-    """A node that looks for SIG104 over another message."""
+    """Return a node that looks for SIG104 over another message."""
     return lambda patch: patch.setattr(node_agreement, "station_key_message", message)
 
 
@@ -287,7 +287,7 @@ def opening_so(
     with_key_id: bool = True,
     swapped: bool = False,
 ) -> Bend:
-    """A node that makes session keys or the tag of Open with one thing made otherwise."""
+    """Return a node that makes session keys or the tag of Open with one thing made otherwise."""
 
     def init(self: NodeSession, key: bytes, uuid: bytes, station: bytes, one_time: PrivateKey) -> None:
         own = one_time.point
@@ -309,7 +309,7 @@ def sealing_so(
     head: Callable[[int], bytes] = lambda counter: counter.to_bytes(4, "big"),
     aad: bool = False,
 ) -> Bend:
-    """A node that seals its replies with one thing made otherwise."""
+    """Return a node that seals its replies with one thing made otherwise."""
 
     def seal(self: NodeSession, counter: int, frame: bytes) -> bytes:
         number = counter.to_bytes(4, "big")
@@ -322,7 +322,7 @@ def sealing_so(
 
 
 def unsealing_so(*, nonce: Callable[[bytes], bytes] = lambda c: bytes(9) + c, aad: bool = False) -> Bend:
-    """A node that opens Sealed frames with one thing made otherwise."""
+    """Return a node that opens Sealed frames with one thing made otherwise."""
 
     def unseal(self: NodeSession, payload: bytes) -> bytes | None:
         counter = payload[:4]
@@ -360,12 +360,12 @@ def any_padding(patch: Patch) -> None:
 
 
 def keys_known_as(identifier: Callable[[bytes], bytes]) -> Bend:
-    """A node that makes keyId otherwise where it looks for it."""
+    """Return a node that makes keyId otherwise where it looks for it."""
     return lambda patch: patch.setattr(node_sessions, "key_id", identifier)
 
 
 def opened_by(made: Callable[[bytes, bytes, bytes, bytes], bytes]) -> Bend:
-    """A node that waits for another mac of Open."""
+    """Return a node that waits for another mac of Open."""
     return lambda patch: patch.setattr(node_sessions, "open_mac", made)
 
 
@@ -631,7 +631,7 @@ def _decoded(text: Callable[[bytes], bytes]) -> Bend:
 
 
 def place(block: bytes, field: int) -> int:
-    """Where the value of a field begins, 1 for none."""
+    """Return where the value of a field begins, 1 for none."""
     at = 6
     while at < len(block):
         if block[at] == field:
@@ -689,7 +689,7 @@ def signs_without_111(patch: Patch) -> None:
 
 
 def datasheet_signed_as(message: Callable[[bytes, bytes], bytes]) -> Bend:
-    """A node that makes TBS otherwise; given UUID and the data block without field 100."""
+    """Return a node that makes TBS otherwise; given UUID and the data block without field 100."""
 
     def bend(patch: Patch) -> None:
         def good(teds: Any, octets: bytes, uuid: bytes, check: Any = None) -> bool:
@@ -716,7 +716,7 @@ def any_challenge_of_reset(patch: Patch) -> None:
 
 
 def signs_for(function: Function, message: Callable[[bytes, bytes, int], bytes]) -> Bend:
-    """A node that signs another message for Prove or Reset; given UUID, challenge, epoch."""
+    """Return a node that signs another message for Prove or Reset; given UUID, challenge, epoch."""
 
     def bend(patch: Patch) -> None:
         name = "_prove" if function == Function.PROVE else "_reset"

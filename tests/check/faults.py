@@ -42,7 +42,7 @@ _MEASURING: Final = "measuring can"
 def _slip(
     what: str, slip: str, bend: Bend, *also: str, rule: str = "agreement-tags", words: str = "", over: str = "nfc"
 ) -> FaultyNode:
-    """A slip of the key agreement, of a session or of a stream."""
+    """Return a slip of the key agreement, of a session or of a stream."""
     return FaultyNode(what, rule, words or "A known slip fits", bend, slip=slip, also=also, over=over)
 
 

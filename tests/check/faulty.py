@@ -52,7 +52,7 @@ class FaultyLink(MemoryLink):
         return self.via
 
     def reference(self, octets: bytes) -> bytes:
-        """What the reference node answers here."""
+        """Return what the reference node answers here."""
         factory = self.board.tim.identity().state == NodeState.FACTORY
         tapped = self.via == "nfc" or factory or self.tapped_when_keyed
         return self.board.tim.handle(octets, link=self.name, tapped=tapped)

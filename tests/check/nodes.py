@@ -67,7 +67,7 @@ class MeasuringBoard(Board):
 
 
 def made(over: str = "nfc", *, epoch: int = 4) -> Board:
-    """A node in factory state that was keyed before, with a Meta-TEDS and a name of its own."""
+    """Return a node in factory state that was keyed before, with a Meta-TEDS and a name of its own."""
     board = MeasuringBoard() if over.startswith("measuring") else Board()
     blocks = {(0, 1): META, (1, 12): NAME}
     if isinstance(board, MeasuringBoard) and not over.endswith("blank"):
@@ -96,10 +96,10 @@ def checked(
 
 
 def failed(report: CheckReport) -> dict[str, RuleResult]:
-    """The rules that the node breaks."""
+    """Return the rules that the node breaks."""
     return {check.rule: check for check in report.checks if check.result == "failed"}
 
 
 def names(report: CheckReport, result: str) -> set[str]:
-    """The rules that ended so."""
+    """Return the rules that ended so."""
     return {check.rule for check in report.checks if check.result == result}

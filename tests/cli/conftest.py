@@ -11,7 +11,7 @@ from tests.bench import copy_home
 
 @pytest.fixture
 def home(tmp_path: Path) -> Iterator[Path]:
-    """The home of a station with a passphrase vault at the lowest cost; every command unlocks it anew."""
+    """Yield the home of a station with a passphrase vault at the lowest cost; every command unlocks it anew."""
     folder = tmp_path / "home"
     copy_home(folder)
     forget_vaults()

@@ -61,14 +61,14 @@ def call(home: Path, *words: object, passphrase: str | None = PASSPHRASE) -> Out
 
 
 def clean_environment(**more: str) -> dict[str, str]:
-    """The environment without what would change the program's mind, and without a keyring."""
+    """Return the environment without what would change the program's mind, and without a keyring."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("TEDS_PROVISION", "PYTHON"))}
     kept |= {"DBUS_SESSION_BUS_ADDRESS": "unix:path=/nonexistent/bus"}
     return kept | more
 
 
 def unmeasured_environment() -> dict[str, str]:
-    """A clean environment in which coverage, which loads modules of its own, does not start."""
+    """Return a clean environment in which coverage, which loads modules of its own, does not start."""
     return {name: value for name, value in clean_environment().items() if not name.startswith("COVERAGE_")}
 
 
@@ -88,7 +88,7 @@ def python(code: str, *words: str, **variables: str) -> Outcome:
 
 @functools.cache
 def zygote() -> Zygote:
-    """The zygote of this test process: made at the first need, ended with it."""
+    """Return the zygote of this test process: made at the first need, ended with it."""
     made = Zygote(clean_environment())
     atexit.register(made.close)
     return made

@@ -24,7 +24,7 @@ ONE = bytes.fromhex("8d4d9da65281f7000000")
 
 @pytest.fixture
 def sealed(home: Path, tmp_path: Path) -> Path:
-    """A backup of the station of ``home``, under the same passphrase as its keys."""
+    """Return a backup of the station of ``home``, under the same passphrase as its keys."""
     call(home, "whitelist", "add", ONE.hex())
     path = tmp_path / "station.backup"
     done = spawn("--home", home, "--json", "backup", path, passphrase=PASSPHRASE)

@@ -39,7 +39,7 @@ function teds-provision; printf '%s\\n' $argv > got; exit; end
 
 
 def offered(home: Path, line: str) -> list[str]:
-    """The words that bash is offered for the end of a line."""
+    """Return the words that bash is offered for the end of a line."""
     asked = {
         "_TEDS_PROVISION_COMPLETE": "bash_complete",
         "COMP_WORDS": line,

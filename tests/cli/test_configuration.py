@@ -71,7 +71,7 @@ def test_a_bad_value_is_named_before_it_hurts(home: Path) -> None:
 
 
 def options(command: click.Command = cli, *path: str) -> Iterator[tuple[tuple[str, ...], click.Option, str]]:
-    """Every option of every command but flags, with its name on the command line."""
+    """Yield every option of every command but flags, with its name on the command line."""
     for option in command.params:
         long = next((name[2:] for name in option.opts if name.startswith("--")), "")
         if isinstance(option, click.Option) and path and long and not option.is_flag:

@@ -18,7 +18,7 @@ UUID = bytes.fromhex("8d4d9da65281f7000000")
 
 @pytest.fixture
 def folder(tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """One file of each kind that a person has at hand."""
+    """Return one file of each kind that a person has at hand."""
     there = tmp_path / "files"
     there.mkdir()
     (there / "angle.csv").write_text("# date: 2026-11-26\nraw,value [degree]\n0,0\n65535,360\n")

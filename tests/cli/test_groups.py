@@ -17,7 +17,7 @@ ONE = bytes.fromhex("8d4d9da65281f7000000")
 
 @pytest.fixture
 def measured(home: Path) -> Path:
-    """A group with a measurement that the page began, and another one without."""
+    """Return a group with a measurement that the page began, and another one without."""
     with Station.inspect(home) as store:
         store.groups.put(Group("crane", (ONE,)))
         store.groups.put(Group("spare", (ONE,)))

@@ -51,7 +51,7 @@ class Homes:
         return self.folder / name
 
     def refused(self, code: int, *words: object, home: Path | None = None) -> dict[str, Any]:
-        """A command that fails with one clear cause and changes nothing."""
+        """Return a command that fails with one clear cause and changes nothing."""
         home = home or self.south
         before = self.state(home)
         done = self.run(home, *words)
@@ -309,7 +309,7 @@ class Forger:
         return seal_bundle(replace(self.good, **changes), self.sender, [self.receiver])
 
     def members(self, **changes: Any) -> bytes:
-        """A payload with members that the sender's own code would not write."""
+        """Return a payload with members that the sender's own code would not write."""
         payload = json.loads(payload_of(self.good)) | changes
         return self.signed(dump(payload))
 

@@ -21,7 +21,7 @@ WIDTH, TERMINAL = 100, 80
 
 
 def walk(group: click.Group, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], click.Command]]:
-    """Every command under a group, with the words that call it."""
+    """Yield every command under a group, with the words that call it."""
     with click.Context(group) as context:
         for name in group.list_commands(context):
             command = group.get_command(context, name)
@@ -36,7 +36,7 @@ every_command = pytest.mark.parametrize(("words", "command"), ALL.items(), ids=[
 
 
 def examples(command: click.Command) -> list[str]:
-    """The lines under "Examples:" in a command's help."""
+    """Return the lines under "Examples:" in a command's help."""
     lines = (command.epilog or "").splitlines()
     return [line.strip() for line in lines[lines.index("Examples:") + 1 :]] if "Examples:" in lines else []
 

@@ -63,7 +63,7 @@ def bench(desk: Path, tmp_path: Path) -> Path:  # noqa: F811
 
 
 def arranged(home: Path, command: str, path: Path) -> list[object]:
-    """The words of a command that reads the file, after it was put where only its name counts."""
+    """Return the words of a command that reads the file, after it was put where only its name counts."""
     if command.startswith("CONFIG"):
         (home / "config.toml").unlink(missing_ok=True)
         (home / "config.toml").symlink_to(path)
@@ -80,7 +80,7 @@ def arranged(home: Path, command: str, path: Path) -> list[object]:
 
 @pytest.fixture
 def fifo(tmp_path: Path) -> Iterator[Path]:
-    """A pipe; whoever opens it to read gets its end at last, so that a test that fails ends."""
+    """Yield a pipe; whoever opens it to read gets its end at last, so that a test that fails ends."""
     path = tmp_path / "pipe"
     os.mkfifo(path)
     over = threading.Event()

@@ -104,7 +104,7 @@ def acts(home: Path, *words: object) -> list[str]:
 
 
 def made_today(home: Path) -> int:
-    """How many entries have the date that it is now where this machine is."""
+    """Return how many entries have the date that it is now where this machine is."""
     moments = [entry["at"] for entry in call(home, "--json", "log").json["entries"]]
     today = datetime.now().astimezone().date()
     return sum(datetime.fromisoformat(at).astimezone().date() == today for at in moments)
@@ -147,7 +147,7 @@ def test_an_entry_of_an_earlier_clock_hides_no_other_entry(home: Path, monkeypat
 
 
 def errors() -> set[str]:
-    """The code of every error of the tree, those that rooms add to it too, whichever of them are imported."""
+    """Return the code of every error of the tree, those that rooms add to it too, whichever of them are imported."""
     code = re.compile(r'^    code(?:: [\w\[\], ]+)? = "([a-z-]+)"', re.MULTILINE)
     texts = (path.read_text() for path in (ROOT / "teds_provision").rglob("*.py"))
     classes = (part for text in texts for part in re.findall(r"^class \w+Error\(.*?(?=^\S|\Z)", text, re.M | re.S))

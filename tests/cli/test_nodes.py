@@ -30,7 +30,7 @@ STATION = "cd" * 32
 
 @pytest.fixture
 def known(home: Path) -> Path:
-    """Two nodes: one in daily use, one that was moved away and revoked."""
+    """Return two nodes: one in daily use, one that was moved away and revoked."""
     with Station.inspect(home) as store:
         store.nodes.restore(
             NodeRecord(

@@ -38,7 +38,7 @@ def show(capfdbinary, tmp_path):
 
 @pytest.fixture
 def show_json(show):
-    """The one JSON object, and the exit code."""
+    """Return the one JSON object, and the exit code."""
 
     def call(*arguments):
         code, out, _ = show(*arguments, before=("--json",))

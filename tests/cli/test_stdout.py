@@ -22,7 +22,7 @@ UUID = bytes.fromhex("8d4d9da65281f7000000")
 
 @pytest.fixture
 def run(home: Path, tmp_path: Path) -> str:
-    """The start of a command line in a shell, with the passphrase on descriptor 9."""
+    """Return the start of a command line in a shell, with the passphrase on descriptor 9."""
     (tmp_path / "words").write_text(PASSPHRASE + "\n")
     return f"9<{tmp_path / 'words'} {sys.executable} -m teds_provision --passphrase-fd 9 --home {home}"
 

@@ -40,7 +40,7 @@ def given(kept: dict[str, Any], *typed: str, read: Callable[[LinkSettings], Link
 
 
 def taken(kept: dict[str, str], *typed: str, streams: bool) -> str:
-    """The link of a measuring command."""
+    """Return the link of a measuring command."""
     return str(given(kept, *typed, read=lambda links: over_the_bus(links, streams=streams)).via)
 
 

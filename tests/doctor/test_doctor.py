@@ -40,7 +40,7 @@ from tests.places import free_bus, free_reader
 
 @pytest.fixture
 def system(tmp_path: Path) -> System:
-    """A machine without any hardware, and no station."""
+    """Return a machine without any hardware, and no station."""
     (tmp_path / "system").mkdir()
     (tmp_path / "work").mkdir()
     return System(tmp_path / "home", workspace=tmp_path / "work", root=tmp_path / "system", environment={})
@@ -55,7 +55,7 @@ def stationed(system: System) -> Iterator[System]:
 
 
 def look(system: System, name: str) -> list[Finding]:
-    """What one check finds."""
+    """Return what one check finds."""
     if name not in CHECKS:  # each of its modules has its own; who examines loads them all
         list(examine(System(system.home / "nowhere")))
     return list(CHECKS[name][1](system))
@@ -506,7 +506,7 @@ def test_seals_are_checked_if_the_passphrase_is_given(stationed: System) -> None
 
 @pytest.fixture
 def crowded(stationed: System, monkeypatch: pytest.MonkeyPatch) -> System:
-    """A station with more nodes and entries of its log than a check reads of each table by default."""
+    """Return a station with more nodes and entries of its log than a check reads of each table by default."""
     monkeypatch.setattr(row_sample, "SAMPLED", 20)
     monkeypatch.setattr(row_sample, "_NEWEST", 3)
     monkeypatch.setattr(row_sample, "_RUN", 5)

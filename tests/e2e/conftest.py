@@ -33,5 +33,5 @@ def station(desk: Desk) -> Station:
 
 @pytest.fixture
 def node(desk: Desk) -> Node:
-    """A new node that is not powered yet."""
+    """Return a new node that is not powered yet."""
     return desk.node()

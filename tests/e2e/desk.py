@@ -46,12 +46,12 @@ class Links:
     can: str = field(default_factory=free_bus)
 
     def over(self, via: str) -> list[str]:
-        """The user's options for one of them."""
+        """Return the user's options for one of them."""
         return ["--via", "nfc", "--nfc", self.nfc] if via == "nfc" else ["--via", "can", "--can", self.can]
 
 
 def limited(octets: int) -> tuple[str, ...]:
-    """The program on a disk on which no file may grow beyond so many octets.
+    """Return the program on a disk on which no file may grow beyond so many octets.
 
     It compiles nothing: Python 3.11 keeps a module's octets as far as they went, and nothing imports that module again.
     """
@@ -176,13 +176,13 @@ class Desk:
         self.running[:] = [process for process in self.running if process in but]
 
     def station(self, name: str = "bench") -> Station:
-        """A station with keys of its own, prepared once and copied for each test."""
+        """Return a station with keys of its own, prepared once and copied for each test."""
         home = self.folder / name
         subprocess.run(["cp", "-a", str(self.prepared / name), str(home)], check=True)
         return Station(self, home)
 
     def new_uuid(self) -> bytes:
-        """A random UUID of a node that keeps its default address beside the others of this desk."""
+        """Return a random UUID of a node that keeps its default address beside the others of this desk."""
         return new_uuid(self.addresses)
 
     def node(
@@ -194,7 +194,7 @@ class Desk:
         type_: str | None = None,
         firmware: tuple[Path, Path] | None = None,
     ) -> Node:
-        """A new node in factory state, made in this process: what the command does is in tests/node.
+        """Return a new node in factory state, made in this process: what the command does is in tests/node.
 
         ``firmware``: the image that it runs, and the owner's key pair.
         """
@@ -300,11 +300,11 @@ class Station:
         return dict(reply["error"])
 
     def provision(self, via: str = "nfc", *more: object, code: int = 0) -> Any:
-        """All of it in one, over one of the desk's links."""
+        """Return all of it in one, over one of the desk's links."""
         return self.ask("provision", *more, "--yes", *self.desk.links.over(via), code=code)
 
     def tables(self, *, without: tuple[str, ...] = ()) -> dict[str, list[Any]]:
-        """Every row of the store by table; moments (which differ between runs) are blanked out."""
+        """Return every row of the store by table; moments (which differ between runs) are blanked out."""
         with closing(sqlite3.connect(f"file:{self.home}/store.sqlite3?mode=ro", uri=True)) as database:
             names = [name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
             wanted = [name for name in names if not name.startswith("sqlite_") and name not in without]
@@ -319,7 +319,7 @@ class Station:
             return [(record.state, record.epoch) for record in store.keys.keys_of(bytes.fromhex(uuid))]
 
     def log_is_whole(self) -> bool:
-        """Whether the hash chain of the audit log holds."""
+        """Return True if the hash chain of the audit log holds."""
         with base_station.Station.inspect(self.home) as store:
             return store.audit_log.check().intact
 
@@ -335,7 +335,7 @@ def results(done: Any) -> dict[str, str]:
 
 @contextmanager
 def nothing_lost(node: Node, report: Callable[[], Mapping[str, Any]]) -> Iterator[None]:
-    """The block costs the station none of a node's values; ``report`` counts ``lost``, ``late`` and ``bad``.
+    """Yield the block costs the station none of a node's values; ``report`` counts ``lost``, ``late`` and ``bad``.
 
     What the node says that it could not send in time is no loss: that its process had no processor is no matter of the
     station's. It says so every ten seconds, and sends late what it still sends then.

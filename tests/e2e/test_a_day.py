@@ -24,7 +24,7 @@ CALIBRATION = "raw,value [degree]\n0,0\n32768,{middle}\n65535,359.9\n"
 
 
 def sheet(path: Path, *rows: dict[str, str]) -> Path:
-    """A sheet of boards."""
+    """Return a sheet of boards."""
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, ["uuid", "name", "profile", "calibration", "fingerprint"])
         writer.writeheader()

@@ -34,7 +34,7 @@ def unchanged(station: Station, *nodes: Node, without: tuple[str, ...] = ()) -> 
 
 @pytest.fixture
 def finished(station: Station, node: Node) -> Node:
-    """A node that lies there, provisioned."""
+    """Return a node that lies there, provisioned."""
     node.start(can=True)
     station.provision("nfc", "--profile", ANGLE)
     return node

@@ -13,7 +13,7 @@ from .test_a_day import on_a_terminal
 
 
 def made(desk: Desk, name: str) -> tuple[Node, str]:
-    """A factory node that no station has met, and the fingerprint of its key."""
+    """Return a factory node that no station has met, and the fingerprint of its key."""
     done = desk.start("--json", "node", "create", desk.folder / name).end()
     assert done.code == 0, done
     return Node(desk, desk.folder / name, done.json["uuid"]), str(done.json["fingerprint"])

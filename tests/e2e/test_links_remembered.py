@@ -21,7 +21,7 @@ ARM = "slew's $(arm)"
 
 
 def alone(station: Station) -> Any:
-    """What ``teds-provision`` without a command says."""
+    """Return what ``teds-provision`` without a command says."""
     return station.ask()
 
 

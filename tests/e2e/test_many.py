@@ -19,7 +19,7 @@ UUIDS = ("8d4d9da65281f7000000", "8d4d9da65281f7000001", "00112233445566778899")
 
 @pytest.fixture
 def bus(desk: Desk) -> list[Node]:
-    """Three nodes that have only a bus, in factory state."""
+    """Return three nodes that have only a bus, in factory state."""
     return [desk.node(f"node{at}", uuid=uuid).start(nfc=False, can=True) for at, uuid in enumerate(UUIDS)]
 
 

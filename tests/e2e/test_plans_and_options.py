@@ -18,7 +18,7 @@ pytestmark = pytest.mark.link
 
 @pytest.fixture
 def finished(station: Station, node: Node) -> Node:
-    """A node that lies there, provisioned."""
+    """Return a node that lies there, provisioned."""
     node.start(can=True)
     station.provision("nfc", "--profile", ANGLE)
     return node

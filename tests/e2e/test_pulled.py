@@ -50,7 +50,7 @@ def boards(tmp_path: Path) -> Iterator[list[tuple[str, str]]]:
 
 
 def pulled_at(watch: Running, field: Field, path: str, frames: int, lines: int) -> Any:
-    """What is said of a board that is lifted off after so many frames; of one not identified by then nothing is.
+    """Return what is said of a board that is lifted off after so many frames; of one not identified by then nothing is.
 
     Such a board is put down again, for a few frames more: how many polls come first is the reader's affair.
     """

@@ -33,7 +33,7 @@ runpy.run_module("teds_provision", run_name="__main__")
 
 
 def frames_of(file: Path) -> list[dict[str, Any]]:
-    """What ``trace show --json`` says."""
+    """Return what ``trace show --json`` says."""
     done = subprocess.run(
         [sys.executable, "-m", "teds_provision", "--json", "trace", "show", str(file)],
         capture_output=True,

@@ -147,7 +147,7 @@ def test_kill_9_of_either_end_in_an_upload_and_the_same_command_goes_on(desk: De
 
 
 def _octets_there(node: Node) -> int:
-    """Octets of the slot that is written now, as far as its file shows them."""
+    """Return octets of the slot that is written now, as far as its file shows them."""
     slots = [path for path in node.folder.glob("**/*") if path.is_file() and path.parent.name in ("firmware", "images")]
     newest = max(slots, key=lambda path: path.stat().st_mtime_ns, default=None)
     return 0 if newest is None else len(newest.read_bytes().rstrip(b"\xff"))

@@ -28,7 +28,7 @@ CALIBRATION = """raw,value [degree]
 
 
 def settled(node: Node) -> dict[str, Any]:
-    """What of a node's flash does not depend on chance: no key, no signature."""
+    """Return what of a node's flash does not depend on chance: no key, no signature."""
     flash = node.flash
     blocks = {(channel, code): teds for channel, code, teds in flash["blocks"] if code != SECURITY}
     return {name: flash[name] for name in ("provisioned", "epoch", "sequence", "read_only")} | {"blocks": blocks}

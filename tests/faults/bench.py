@@ -35,19 +35,19 @@ WAITING = 24  # trials of a cut node that wait for a time-out beside those that 
 
 
 def cuts_of(count: int) -> Iterator[Fault]:
-    """A cut at each of ``count`` changes: as it is, with the power lost, and in the middle of the write."""
+    """Yield a cut at each of ``count`` changes: as it is, with the power lost, and in the middle of the write."""
     for at in range(1, count + 1):
         yield from (Fault(at), Fault(at, power=True), Fault(at, "torn"))
 
 
 def errors_of(count: int, share: random.Random, *, full: bool) -> list[Fault]:
-    """Every way in which each of ``count`` changes may fail, once or from then on: all, or a share of them."""
+    """Return every way in which each of ``count`` changes may fail, once or from then on: all, or a share of them."""
     errors = [Fault(at, how, stays) for at in range(1, count + 1) for how in ERRORS for stays in (False, True)]
     return errors if full else share.sample(errors, min(len(errors), max(4, len(errors) // SHARE)))
 
 
 def trials_of(bench: Bench, act: Act, share: random.Random, *, full: bool) -> list[Trial]:
-    """All trials of one command."""
+    """Return all trials of one command."""
     station = [*cuts_of(bench.count(act)), *errors_of(bench.count(act, "EIO"), share, full=full)]
     node: list[Fault] = []
     if act.node and act.cuts_node:
@@ -56,7 +56,7 @@ def trials_of(bench: Bench, act: Act, share: random.Random, *, full: bool) -> li
 
 
 def quick_trials_of(bench: Bench, act: Act, share: random.Random) -> list[Trial]:
-    """A handful, for the test suite: spread over the whole command."""
+    """Return a handful, for the test suite: spread over the whole command."""
     cuts = bench.count(act)
     first, last = share.sample(range(1, cuts + 1), 2)
     station = [Fault(first), Fault(last, power=True), Fault(max(1, first // 2), share.choice(ERRORS), stays=True)]
@@ -75,7 +75,7 @@ def few_trials_of(bench: Bench, act: Act, share: random.Random) -> list[Trial]:
 
 
 def control(bench: Bench) -> int:
-    """How many losses of power after ``whitelist add`` and ``agree`` lose something where fsync does nothing."""
+    """Return how many losses of power after ``whitelist add`` and ``agree`` lose something where fsync does nothing."""
     lost = 0
     for act in (ACTS[0], ACTS[2]):
         cuts = bench.count(act)

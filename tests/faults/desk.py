@@ -128,7 +128,7 @@ class Desk:
 
     @contextmanager
     def node(self, fault: dict[str, str] | None = None, *, nfc: bool = True) -> Iterator[Child]:
-        """The virtual node of this desk, on its bus and (unless told otherwise) on its reader."""
+        """Yield the virtual node of this desk, on its bus and (unless told otherwise) on its reader."""
         links = [*(["--nfc", self.links.nfc] if nfc else []), "--can", self.links.can]
         still = self.folder / "files" / "still.csv"
         source = ["--source", f"file:{still}"] if still.exists() else []
@@ -166,7 +166,7 @@ class States:
         self._lock = threading.RLock()
 
     def of(self, name: str) -> Path:
-        """The folder of a state, made at first need."""
+        """Return the folder of a state, made at first need."""
         with self._lock:
             place = self.folder / name.replace(" ", "-")
             if not place.is_dir():

@@ -49,7 +49,7 @@ class Fault:
         return f"{self.how} at {self.at}{extra}"
 
     def environment(self, library: Path, desk: Desk, *places: str) -> dict[str, str]:
-        """What cut.c reads; ``places`` are the folders of the desk whose changes count."""
+        """Return what cut.c reads; ``places`` are the folders of the desk whose changes count."""
         chosen = {
             "LD_PRELOAD": str(library),
             "FAULT_ROOTS": ":".join(str(desk.folder / place) for place in places),
@@ -93,7 +93,7 @@ class Bench:
     @classmethod
     @contextmanager
     def open(cls, jobs: int = 1) -> Iterator[Bench]:
-        """A bench in a folder of its own, in memory where that can be."""
+        """Yield a bench in a folder of its own, in memory where that can be."""
         where = MEMORY if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) else None
         with tempfile.TemporaryDirectory(prefix="faults-", dir=where) as folder:
             bench = cls(Path(folder).resolve(), jobs)
@@ -113,14 +113,14 @@ class Bench:
             shutil.rmtree(place.parent, ignore_errors=True)
 
     def count(self, act: Act, how: str = "kill") -> int:
-        """How many changes and messages the whole command makes."""
+        """Return how many changes and messages the whole command makes."""
         with self.desk(act) as desk, desk.node() if act.node else nullcontext():
             fault = Fault(0, how).environment(self.library, desk, act.home, "files")
             _must_end(act, desk.run(*act.words, home=act.home, fault=fault, until=act.until, seconds=act.seconds))
             return _counted(desk)
 
     def node_count(self, act: Act, how: str = "kill") -> int:
-        """How many changes of its flash, and datagrams, the node makes while the whole command runs."""
+        """Return how many changes of its flash, and datagrams, the node makes while the whole command runs."""
         with self.desk(act) as desk:
             with desk.node(Fault(0, how).environment(self.library, desk, "flash")):
                 _must_end(act, desk.run(*act.words, home=act.home, until=act.until))

@@ -160,7 +160,7 @@ class MeasuringMemoryNode(MemoryNode):
         self.ble_hears(link_number(link)[0] - 2, False)
 
     def actuator_claimed(self) -> bool:
-        """Whether a session claims an actuator."""
+        """Return True if a session claims an actuator."""
         return bool(self._library.memory_acts(self._board))
 
     @property

@@ -23,7 +23,7 @@ _FRAME, _START, _STACK = 0, 1, 3
 
 
 def packed(kind: int, octets: bytes) -> bytes:
-    """One packet, framed as SLIP does (RFC 1055)."""
+    """Return one packet, framed as SLIP does (RFC 1055)."""
     body = bytes([kind]) + octets
     return b"\xc0" + body.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
 

@@ -104,7 +104,7 @@ SMALL_BOUND: Final = 8704
 
 
 def row(step: str) -> str:
-    """The README's table row of a step: million instructions, stack, and time at the clock of :data:`CLOCKS`."""
+    """Return the README's table row of a step: million instructions, stack, and time at the clock of :data:`CLOCKS`."""
     cells = [step]
     for cpu, steps in STEPS.items():
         cost = steps[step]

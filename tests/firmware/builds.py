@@ -20,7 +20,7 @@ AT_THE_GATE = os.environ.get("CI", "").lower() not in ("", "0", "false")
 
 
 def missing(*programs: str, headers: tuple[str, ...] = ("bearssl.h",)) -> str:
-    """What of these is not on this machine, as a sentence; "" where all is there."""
+    """Return what of these is not on this machine, as a sentence; "" if all is there."""
     lacks = [name for name in programs if shutil.which(name) is None]
     lacks += [name for name in headers if not Path("/usr/include", name).exists()]
     return f"{', '.join(lacks)} missing: scripts/install-test-packages installs it" if lacks else ""
@@ -46,7 +46,7 @@ def make(*words: str) -> str:
 
 
 def host() -> Path:
-    """The host port, built."""
+    """Return the host port, built."""
     need("make", "gcc")
     make("host")
     return BUILD / "host" / "teds-node"
@@ -67,21 +67,21 @@ def compile_host(program: Path, source: Path | None = None, *options: str) -> No
 
 
 def host_psa() -> Path:
-    """The host port over the PSA Crypto API, built."""
+    """Return the host port over the PSA Crypto API, built."""
     need("make", "gcc", headers=("psa/crypto.h",))
     make("psa")
     return BUILD / "host" / "teds-node-psa"
 
 
 def board(name: str) -> Path:
-    """An example board over the stand-in for Zephyr, built."""
+    """Return an example board over the stand-in for Zephyr, built."""
     need("make", "gcc", headers=("psa/crypto.h",))
     make("boards")
     return BUILD / "boards" / name
 
 
 def library(max_message: int = 1024, staging: int = 4096, *, sessions: int = 2, streams: int = 2) -> Path:
-    """The node over flash in memory, built for these sizes."""
+    """Return the node over flash in memory, built for these sizes."""
     need("make", "gcc")
     room = f"-{sessions}-{streams}" if (sessions, streams) != (2, 2) else ""
     path = BUILD / "host" / f"memory-{max_message}-{staging}{room}.so"
@@ -90,7 +90,7 @@ def library(max_message: int = 1024, staging: int = 4096, *, sessions: int = 2, 
 
 
 def objects(max_message: int, staging: int) -> tuple[list[Path], list[str]]:
-    """The objects of that library, and the words by which the compiler made them."""
+    """Return the objects of that library, and the words by which the compiler made them."""
     folder = library(max_message, staging).with_suffix("")
     words = make("-s", "--no-print-directory", f"words-of-{folder.name}").split()
     return sorted(folder.glob("*.o")), words

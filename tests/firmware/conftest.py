@@ -76,7 +76,7 @@ def station(desk: Desk) -> Station:
 
 @pytest.fixture
 def node(desk: Desk) -> Iterator[CNode]:
-    """A new node in C that is not powered yet; ended politely, so that make firmware-coverage has its counts."""
+    """Yield a new node in C that is not powered yet; ended politely, so that make firmware-coverage has its counts."""
     made = CNode(desk, builds.host(), desk.folder / "flash.bin", desk.new_uuid().hex())
     yield made
     if made.process is not None and made.process.runs:

@@ -53,7 +53,7 @@ def take(covered: dict[str, list[dict[str, object]]], found: dict[str, Counts]) 
 
 
 def reached(counts: list[Counts], branches: bool) -> tuple[int, int]:
-    """How many were reached, of how many."""
+    """Return how many were reached, of how many."""
     every = [seen for count in counts for (_, place), seen in count.items() if (place >= 0) is branches]
     return sum(every), len(every)
 

@@ -117,6 +117,6 @@ class CDesk(Desk):
         )
 
     def shown(self) -> tuple[object, ...]:
-        """All that tells one state from another: Identify, and a digest of every TEDS."""
+        """Return all that tells one state from another: Identify, and a digest of every TEDS."""
         blocks = {block: hashlib.sha256(teds).hexdigest() for block, teds in self.node.blocks().items()}
         return self.node.identity(), blocks

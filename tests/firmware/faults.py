@@ -21,7 +21,7 @@ class Change(NamedTuple):
     more: tuple[tuple[str, str], ...] = ()
 
     def made(self, text: str) -> str:
-        """The changed text; raises AssertionError where a place is not there once."""
+        """Return the changed text; raises AssertionError where a place is not there once."""
         for old, new in ((self.old, self.new), *self.more):
             assert text.count(old) == 1, f"{self.file} holds {old!r} {text.count(old)} times"
             text = text.replace(old, new)

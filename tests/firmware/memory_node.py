@@ -273,7 +273,7 @@ class MemoryNode:
     def handle(
         self, frame: bytes, *, link: str, tapped: bool, port: SessionPort | None = None, received: int | None = None
     ) -> bytes:
-        """One command frame to one reply frame."""
+        """Answer one command frame with one reply frame."""
         self._now()
         number, kind = link_number(link)
         reply = ctypes.create_string_buffer(self.room)
@@ -285,7 +285,7 @@ class MemoryNode:
         return reply.raw[:length]
 
     def identity(self) -> Identity:
-        """What Identify says."""
+        """Return what Identify says."""
         return Identity.decode(self.handle(bytes.fromhex("000080070000"), link="can:f7", tapped=False)[3:])
 
     @property
@@ -362,7 +362,7 @@ class MemoryNode:
         return self.nfc_message()
 
     def nfc_message(self) -> bytes:
-        """What the tag shows now."""
+        """Return what the tag shows now."""
         out = ctypes.create_string_buffer(4162)
         length = self._library.memory_nfc_message(self._board, out)
         return out.raw[:length]
@@ -406,7 +406,7 @@ class MemoryNode:
         self._library.memory_ble_hears(self._board, ctypes.c_uint8(connection), ctypes.c_bool(hears))
 
     def ble_data(self) -> tuple[int, bytes] | None:
-        """The next data message that may leave now: its connection and the notification."""
+        """Return the next data message that may leave now: its connection and the notification."""
         self._now()
         connection, out = ctypes.c_uint8(), ctypes.create_string_buffer(241)
         length = self._library.memory_ble_data(self._board, ctypes.byref(connection), out)
@@ -418,17 +418,17 @@ class MemoryNode:
         self._library.memory_ble_driven(self._board, ctypes.c_uint8(connection), value, ctypes.c_size_t(len(value)))
 
     def ble_advertises(self) -> bool:
-        """Whether it is to be found now."""
+        """Return True if it is to be found now."""
         self._now()
         return bool(self._library.memory_ble_advertises(self._board))
 
     def ble_drops(self, connection: int) -> bool:
-        """Whether it wants to be rid of a connection."""
+        """Return True if it wants to be rid of a connection."""
         self._now()
         return bool(self._library.memory_ble_drops(self._board, ctypes.c_uint8(connection)))
 
     def in_session(self, link: int) -> bool:
-        """Whether a session is open on this link."""
+        """Return True if a session is open on this link."""
         return bool(self._library.memory_in_session(self._board, ctypes.c_uint8(link)))
 
     # -- CAN ---------------------------------------------------------------------------------------------------------
@@ -441,7 +441,7 @@ class MemoryNode:
         )
 
     def next_frame(self) -> tuple[int, bytes, bool] | None:
-        """The next CAN frame that may leave now: identifier, data, whether it is FD."""
+        """Return the next CAN frame that may leave now: identifier, data, whether it is FD."""
         self._now()
         identifier, fd, data = ctypes.c_uint32(), ctypes.c_bool(), ctypes.create_string_buffer(64)
         length = self._library.memory_can_tx(self._board, ctypes.byref(identifier), data, ctypes.byref(fd))
@@ -459,7 +459,7 @@ class MemoryNode:
         )
 
     def set_point(self, channel: int, octets: int) -> bytes:
-        """What an actuator does."""
+        """Return what an actuator does."""
         out = ctypes.create_string_buffer(octets)
         self._library.memory_set_point(self._board, ctypes.c_uint8(channel), out)
         return out.raw
@@ -476,7 +476,7 @@ class MemoryNode:
         self._library.memory_halt(self._board, ctypes.c_uint8(number), ctypes.c_uint8(halt))
 
     def blocks(self) -> dict[tuple[int, int], bytes]:
-        """Every TEDS that it lists, the initial Security TEDS too; read as a station does."""
+        """Return every TEDS that it lists, the initial Security TEDS too; read as a station does."""
         listed = self.handle(bytes.fromhex("0000800b0000"), link="can:f7", tapped=False)[3:]
         return {
             (int.from_bytes(listed[at : at + 2], "big"), listed[at + 2]): self._read(listed[at : at + 3])

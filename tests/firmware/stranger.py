@@ -367,7 +367,7 @@ class Owner:
         self.epoch, self.sequence = (int.from_bytes(self.payload[at : at + 4], "big") for at in (12, 16))
 
     def read(self, channel: int, code: int, ask: Ask | None = None) -> Iterator[None]:
-        """The octets of a TEDS: ``self.teds``. One that another station replaced meanwhile is read again."""
+        """Yield the octets of a TEDS: ``self.teds``. One that another station replaced meanwhile is read again."""
         self.teds = b""
         while True:
             payload = bytes((code,)) + len(self.teds).to_bytes(4, "big")
@@ -401,7 +401,7 @@ class Owner:
         yield from ask(2, mac(okm[16:], b"station" + script))
 
     def open(self) -> Iterator[None]:
-        """A session under the newest key that the node knows; the others go."""
+        """Yield a session under the newest key that the node knows; the others go."""
         for key in list(self.keys):
             yield from self.plain(3)
             c, one_time = self.payload, Key(self.dice)
@@ -439,7 +439,7 @@ class Owner:
         self._judge(inner[: -inner[-1]])
 
     def datasheet(self, blocks: dict[tuple[int, int], bytes]) -> Iterator[None]:
-        """The signed Security TEDS over these blocks, for the state as it is: ``self.teds``."""
+        """Yield the signed Security TEDS over these blocks, for the state as it is: ``self.teds``."""
         yield from self.sealed(7)
         epoch, sequence = (int.from_bytes(self.payload[at : at + 4], "big") for at in (12, 16))
         yield from self.read(0, 128, self.sealed)
@@ -470,7 +470,7 @@ class Owner:
         self.wrote = security
 
     def check(self, blocks: dict[tuple[int, int], bytes]) -> Iterator[None]:
-        """What it holds is what was written."""
+        """Yield what it holds is what was written."""
         yield from self.sealed(11)
         listed = {
             (int.from_bytes(self.payload[at : at + 2], "big"), self.payload[at + 2])

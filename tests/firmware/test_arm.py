@@ -37,7 +37,7 @@ def arm() -> Path:
 
 
 def sizes(archive: Path) -> tuple[int, int, int]:
-    """Octets of text, data and bss."""
+    """Return octets of text, data and bss."""
     outcome = subprocess.run(
         ["arm-none-eabi-size", "-t", str(archive)], capture_output=True, text=True, check=True
     ).stdout.splitlines()[-1]
@@ -64,7 +64,7 @@ def test_a_small_node_is_as_small_as_promised(tmp_path: Path) -> None:
 
 
 def counted(arm: Path, cpu: str, image: str) -> dict[tuple[str, str], int]:
-    """What an image says of each step under qemu: instructions and stack."""
+    """Return what an image says of each step under qemu: instructions and stack."""
     words = ["qemu-system-arm", "-M", MACHINES[cpu, image], "-display", "none", "-monitor", "none", "-serial", "none"]
     words += ["-semihosting-config", "enable=on,target=native", "-icount", "shift=0"]
     done = subprocess.run(

@@ -152,11 +152,11 @@ class Twins:
         return mine
 
     def port(self, link: str) -> SessionPort:
-        """What the reference is told of a link."""
+        """Return what the reference is told of a link."""
         return port_of(link)
 
     def peek(self, link: str, reply: bytes) -> str:
-        """What a sealed reply says, for whoever looks for a difference."""
+        """Return what a sealed reply says, for whoever looks for a difference."""
         session = self.py._sessions.on(link)
         if session is None:
             return reply.hex()
@@ -487,7 +487,7 @@ class HalfSentStream:
                 self.counters.append(int.from_bytes(frame[1][:4], "big"))
 
     def lost_after(self, turns: int = 2000) -> int:
-        """Messages that never left."""
+        """Return messages that never left."""
         for _ in range(turns):
             self.turn()
         self.twins.c.close()

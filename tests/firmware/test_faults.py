@@ -36,14 +36,14 @@ MAX_MESSAGE, STAGING = 2048, 16388
 
 @pytest.fixture
 def station(tmp_path: Path) -> Iterator[Station]:
-    """A station in this process."""
+    """Yield a station in this process."""
     made = copied_station(tmp_path / "station")
     yield made
     made.close()
 
 
 def faulty_source(folder: Path, change: Change) -> Path:
-    """The changed file."""
+    """Return the changed file."""
     source = folder / change.file
     source.write_text(
         change.made((builds.FIRMWARE / "src" / change.file).read_text(encoding="utf-8")), encoding="utf-8"

@@ -21,7 +21,7 @@ Act = Callable[[CDesk], Reply]
 
 @pytest.fixture
 def desk() -> Iterator[CDesk]:
-    """A provisioned node whose old slot is blank."""
+    """Yield a provisioned node whose old slot is blank."""
     made = CDesk()
     provisioned(made)
     made.node.poll()

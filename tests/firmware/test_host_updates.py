@@ -115,7 +115,7 @@ class Bench:
         assert self.node.process.wait_for_lines(self.starts)[-1]["ready"] is True
 
     def stored(self) -> bytes:
-        """Every octet of identity and slots: what no update may change."""
+        """Return every octet of identity and slots: what no update may change."""
         return self.node.flash.read_bytes()
 
 

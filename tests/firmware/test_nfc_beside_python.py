@@ -89,7 +89,7 @@ def taps() -> Iterator[Callable[[int, int], Taps]]:
 
 
 def command(dice: random.Random) -> bytes:
-    """A command of a station, mostly sense."""
+    """Return a command of a station, mostly sense."""
     return dice.choice(
         (
             lambda: IDENTIFY,
@@ -105,7 +105,7 @@ def command(dice: random.Random) -> bytes:
 
 
 def chunked(octets: bytes, dice: random.Random) -> bytes:
-    """One record in chunks, as NDEF allows."""
+    """Return one record in chunks, as NDEF allows."""
     out, at, first = b"", 0, True
     while first or at < len(octets):
         part = octets[at : at + dice.randrange(1, 200)]
@@ -207,7 +207,7 @@ def test_both_show_their_charge_and_where_they_are_in_the_air(
 
 
 def reader_frame(dice: random.Random, number: int, length: int) -> bytes:
-    """One ISO-DEP block of a reader: mostly in order."""
+    """Return one ISO-DEP block of a reader: mostly in order."""
     apdu = dice.choice(
         (
             bytes.fromhex("00A4040007D276000085010100"),

@@ -21,7 +21,7 @@ FIRST = 0x80
 
 
 def new_node(max_ndef: int = 499) -> MemoryNode:
-    """A node with a tag that is not started yet."""
+    """Return a node with a tag that is not started yet."""
     node = MemoryNode(lambda kind, size: NODE.secret() if kind == "i" else b"\x01" * size, lambda: 0.0, uuid=UUID)
     node.has_nfc(max_ndef=max_ndef)
     return node

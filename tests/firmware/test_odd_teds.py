@@ -34,7 +34,7 @@ def closed() -> Iterator[None]:
 
 
 def canonical(block: bytes) -> bool:
-    """Whether the reference takes this data block for that of a signed Security TEDS with its own values."""
+    """Return True if the reference takes this data block for that of a signed Security TEDS with its own values."""
     try:
         teds = security.decode_block(block)
     except BadDataError:
@@ -44,7 +44,7 @@ def canonical(block: bytes) -> bool:
 
 
 def canonical_in_c(block: bytes) -> bool:
-    """The same by ``teds_security_parse``."""
+    """Return the same by ``teds_security_parse``."""
     library = ctypes.CDLL(str(builds.library()))
     library.teds_security_parse.restype = ctypes.c_bool
     nobody, found = ctypes.create_string_buffer(65536), ctypes.create_string_buffer(1024)  # whose key is asked later
@@ -52,13 +52,13 @@ def canonical_in_c(block: bytes) -> bool:
 
 
 def good_block(**changes: object) -> bytes:
-    """The data block of a good one over two TEDS."""
+    """Return the data block of a good one over two TEDS."""
     desk = Desk(blocks={(0, 1): META, (1, 12): NAME})
     return bytes(unframe(desk.signed({(0, 1): META, (1, 12): NAME}, **changes)))
 
 
 def with_ca(block: bytes, text: bytes) -> bytes:
-    """The same with this field 5."""
+    """Return the same with this field 5."""
     at = block.index(b"\x05\x15peer:")
     return block[:at] + bytes((5, len(text))) + text + block[at + 2 + 0x15 :]
 

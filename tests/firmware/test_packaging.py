@@ -28,7 +28,7 @@ def run(*words: str, given: str = "", folder: Path | None = None, code: int = 0)
 
 
 def version() -> str:
-    """The version of the C library, from its header."""
+    """Return the version of the C library, from its header."""
     return ".".join(NUMBERS.findall((builds.FIRMWARE / "include/teds/version.h").read_text(encoding="utf-8")))
 
 

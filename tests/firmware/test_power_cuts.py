@@ -33,7 +33,7 @@ def confirm(desk: CDesk) -> Reply:
 
 
 def commit(desk: CDesk) -> Reply:
-    """Everything from Open to Update, as far as the node answers."""
+    """Do everything from Open to Update, as far as the node answers."""
     desk.open()
     blocks = {(0, 1): META, (1, 12): NAME}
     security = desk.signed(blocks)

@@ -180,7 +180,7 @@ def test_the_last_counter_may_end_what_ends_anyway(what: str) -> None:
 
 
 def teds_of(octets: int, code: int) -> bytes:
-    """A TEDS of this class and so many octets."""
+    """Return a TEDS of this class and so many octets."""
     block = bytes((3, 4, 0, code, 1, 1))
     left = octets - 4 - 2 - len(block)
     while left > 0:

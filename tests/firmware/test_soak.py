@@ -36,7 +36,7 @@ def ahead(node: CNode) -> None:
 
 
 def dropped_while(running: Running, desk: Desk) -> str:
-    """What the kernel says of the sockets on this bus (``/proc/net/udp``) until the station's program ends.
+    """Return what the kernel says of the sockets on this bus (``/proc/net/udp``) until the station's program ends.
 
     What a socket's filter keeps out counts as dropped there: the station's own frames.
     """

@@ -389,7 +389,7 @@ class Reader:
         return int.from_bytes(payload[6:8], "big"), payload[12:]
 
     def exchange(self, frame: bytes) -> Iterator[None]:
-        """A command and its reply; Silent where the node was lifted in between."""
+        """Send a command and return its reply; raise NoReplyError if the node was lifted in between."""
         yield
         self.bus.now += 5 * MS
         if not self.here or self.dice.random() < 0.08:

@@ -108,7 +108,7 @@ class UpdateDesk:
         return done
 
     def stored(self) -> bytes:
-        """Every octet of identity and slots: what no update may change."""
+        """Return every octet of identity and slots: what no update may change."""
         return (self.folder / "flash.bin").read_bytes()
 
     def resumes(self) -> None:

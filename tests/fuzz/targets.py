@@ -334,7 +334,7 @@ class _NotingManager:
 
 
 def smp_seeds() -> list[bytes]:
-    """A packet of each listed command."""
+    """Return a packet of each listed command."""
     bodies = ("a0", "a16764", "a167636f6e6669726df5", "a4636f66660063646174614178636c656e0963736861410a")
     heads = ("0800000100000706", "0a00000100000700", "0a00000b00010700", "0a00001800010701")
     upload = bytes.fromhex(bodies[-1])
@@ -435,7 +435,7 @@ def check_about(data: bytes) -> None:
 
 
 def about_seeds() -> list[bytes]:
-    """Two reports: with an image and without."""
+    """Return two reports: with an image and without."""
     from teds_provision.protocol.messages.firmware import FirmwareFlag, FirmwareReport
 
     full = FirmwareReport("nrf52840dk/nrf52840/loadcell", (3, 2, 1), 7, bytes(range(32)), FirmwareFlag.LOCATE)
@@ -450,7 +450,7 @@ def check_firmware(data: bytes) -> None:
 
 
 def firmware_seeds() -> list[bytes]:
-    """An image without signature: header, payload, digest."""
+    """Return an image without signature: header, payload, digest."""
     import hashlib
 
     head = struct.pack("<IIHHIIBBHII", 0x96F3B83D, 0, 32, 0, 8, 0, 1, 2, 3, 4, 0) + bytes(8)
@@ -794,7 +794,7 @@ def plant_seeds() -> Iterable[bytes]:
 
 
 def _signed(kind: int) -> int:
-    """The first octet that asks for this kind, signed."""
+    """Return the first octet that asks for this kind, signed."""
     return next(first for first in range(0x80, 0x84) if first % 3 == kind)
 
 

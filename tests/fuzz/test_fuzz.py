@@ -13,7 +13,7 @@ INTERESTING = (0, 1, 0x7F, 0x80, 0xFF, ord("["), ord("{"), ord('"'), ord("9"), o
 
 
 def mutated(seed: bytes, rng: random.Random) -> bytes:
-    """The input with a few octets changed, dropped, doubled or cut off."""
+    """Return the input with a few octets changed, dropped, doubled or cut off."""
     octets = bytearray(seed)
     for _ in range(rng.randint(1, 4)):
         at = rng.randrange(len(octets) + 1)

@@ -40,7 +40,7 @@ def key_up(station: Station, board: Board, *, name: str | None = None) -> None:
 
 
 def provisioned(station: Station, board: Board, profile: str = "temperature-sensor") -> ProvisionResult:
-    """All steps on one board."""
+    """Return all steps on one board."""
     with talk(board) as node:
         return provision(station, node, BuildOrder(profile), operator=AcceptingOperator(), reporter=SilentReporter())
 
@@ -106,7 +106,7 @@ def node_key_id(board: Board) -> str:
 
 
 def everything(station: Station) -> tuple[object, ...]:
-    """What the store holds but for the audit log and times: to see that nothing changed."""
+    """Return what the store holds but for the audit log and times: to see that nothing changed."""
     store = station
     return (
         [replace(entry, added="") for entry in store.pins.whitelist()],

@@ -55,7 +55,7 @@ def request(home: Path, name: str) -> bytes:
 
 
 def member(home: Path, name: str, owner: Station) -> Station:
-    """A station without a CA of its own, certified by ``owner``."""
+    """Return a station without a CA of its own, certified by ``owner``."""
     certificate = sign_request(owner, read_request(request(home, name)))
     return adopt_certificate(home, read_certificate(write_certificate(certificate)), ask=ask)
 

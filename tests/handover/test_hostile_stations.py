@@ -42,7 +42,7 @@ HIGHEST = 0xFFFFFFFF
 
 @pytest.fixture
 def west(pair: Pair, tmp_path: Path) -> Iterator[Station]:
-    """A third station; north and west trust each other."""
+    """Yield a third station; north and west trust each other."""
     made = make_station(tmp_path / "west", "west")
     trust(pair.north, made)
     trust(made, pair.north)
@@ -65,7 +65,7 @@ def forged(
     signatures: dict[str, bytes] | None = None,
     vouches: bool = True,
 ) -> bytes:
-    """A bundle that a trusted station may make by hand: its own key, and whatever content it likes."""
+    """Return a bundle that a trusted station may make by hand: its own key, and whatever content it likes."""
     now = datetime.now(UTC).replace(microsecond=0)
     ca = sender.vault.ca()
     assert ca is not None

@@ -92,7 +92,7 @@ def test_a_pending_key_that_came_back_and_opens_is_no_rotation(tmp_path: Path) -
 
 
 def back(station: Station, tmp_path: Path) -> Station:
-    """The station as it comes back from a backup of now."""
+    """Return the station as it comes back from a backup of now."""
     backup(station, tmp_path / "b", ask, costs=THROWAWAY)
     station.close()
     forget_vaults()

@@ -80,7 +80,7 @@ def test_export_and_import_take_less_than_twice_the_memory_of_more_bundle(
 
 
 def peak_of(work: object) -> int:
-    """Octets that Python has at most while it works, beyond what it had before."""
+    """Return octets that Python has at most while it works, beyond what it had before."""
     tracemalloc.start()
     try:
         work()  # type: ignore[operator]

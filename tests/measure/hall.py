@@ -129,7 +129,7 @@ class Hall:
                     node.start()  # on the bus that it was on
 
     def copy(self, name: str) -> Commands:
-        """A second home with the same keys, as they are now: another machine that holds a copy."""
+        """Return a second home with the same keys, as they are now: another machine that holds a copy."""
         shutil.copytree(self.station.home, self.folder / name, ignore=shutil.ignore_patterns("measuring", "*.sock"))
         return Commands(self.desk, self.folder / name)
 
@@ -144,7 +144,7 @@ class Hall:
         return events(outcome.out)
 
     def address(self, name: str) -> int:
-        """Where a node is on the bus now: a stranger may have moved it."""
+        """Return where a node is on the bus now: a stranger may have moved it."""
         reply = self.ask("identify", "--via", "can")
         return int(next(node["can_address"] for node in reply["nodes"] if node["uuid"] == self.nodes[name].uuid))
 
@@ -154,7 +154,7 @@ class Hall:
 
 
 def events(text: str) -> list[dict[str, Any]]:
-    """The whole lines of JSON."""
+    """Return the whole lines of JSON."""
     return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
 
 
@@ -165,7 +165,7 @@ def of(lines: list[dict[str, Any]], uuid: str = "", channel: int = 1) -> list[di
 
 
 def ran(lines: list[dict[str, Any]]) -> list[str]:
-    """The states without those of waiting, which nobody sees of a node that runs at once."""
+    """Return the states without those of waiting, which nobody sees of a node that runs at once."""
     return [state for state in states(lines) if state != "waiting"]
 
 

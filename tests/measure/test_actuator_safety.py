@@ -57,7 +57,7 @@ def hall(tmp_path: Path) -> Iterator[Hall]:
 
 @pytest.fixture
 def wire() -> Iterator[Hub]:
-    """A bus that can be cut."""
+    """Yield a bus that can be cut."""
     with closing(Hub()) as hub:
         yield hub
 
@@ -384,7 +384,7 @@ HELD = 1.0  # the daemon's dead-man, seconds
 
 @contextmanager
 def held(hall: Hall, *words: object) -> Iterator[Service]:
-    """A daemon that holds the gripper's opening for half a minute."""
+    """Yield a daemon that holds the gripper's opening for half a minute."""
     hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
     service = Service(hall.desk, hall.station).start(*words)
     uuid = hall.nodes["g"].uuid

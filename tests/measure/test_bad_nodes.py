@@ -53,7 +53,7 @@ class NodeEvents:
         return self.states == ["waiting", "running", "ended"] and missing <= 0.1 * self.count("messages")
 
     def count(self, what: str) -> int:
-        """A counter over all its streams."""
+        """Return a counter over all its streams."""
         return sum(stream[what] for stream in self.end["streams"])
 
 
@@ -72,7 +72,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, NodeEve
 
 
 def measured_together(hall: Hall, file: Path) -> dict[str, NodeEvents]:
-    """Every node under one measurement, until all that takes its time has happened."""
+    """Return every node under one measurement, until all that takes its time has happened."""
     process = hall.desk.start(hall.can, *(f"{fault}={hall.nodes[fault].folder}" for fault in FAULTS), program=FAULTY)
     process.wait_for('"ready": true')
     uuids = {hall.nodes[fault].uuid: fault for fault in FAULTS}
@@ -96,7 +96,7 @@ def measured_together(hall: Hall, file: Path) -> dict[str, NodeEvents]:
 
 
 def _all_told(text: str, forgetful: str) -> bool:
-    """Whether what takes its time has happened: one is lost, the lying clock told, the forgetful one is back."""
+    """Return True if what takes its time has happened: one is lost, the lying clock told, the forgetful one is back."""
     reported = all(
         words in text for words in ("No message from the node", "its clock is inconsistent", "not authentic")
     )
@@ -104,7 +104,7 @@ def _all_told(text: str, forgetful: str) -> bool:
 
 
 def of_node(text: str, uuid: str) -> list[dict[str, Any]]:
-    """The lines of states of one node."""
+    """Return the lines of states of one node."""
     return events("".join(line for line in text.splitlines(keepends=True) if uuid in line and '"status"' in line))
 
 

@@ -55,7 +55,7 @@ WHOLE = 0.1
 
 @pytest.fixture(autouse=True)
 def no_group_left(hall: Hall) -> Iterator[None]:
-    """A test that fails leaves no group to the next one."""
+    """Yield a test that fails leaves no group to the next one."""
     yield
     hall.desk.clear(but=[node.process for node in hall.nodes.values()])  # who measures a group holds it
     for group in hall.station.ask("group", "list")["groups"]:
@@ -204,7 +204,7 @@ def test_another_machine_under_our_source_address_is_heard_and_named(hall: Hall)
     g, other = hall.nodes["g"].uuid, hall.copy("twin")
 
     def disturbed() -> list[str] | None:
-        """The states of the first one, where they were more than a beginning and an end."""
+        """Return the states of the first one, where they were more than a beginning and an end."""
         first = hall.begin(g, "--rate", 50)
         first.wait_for('"event":"data"')
         refused = events(hall.begin(g, station=other).end().out)[-1]["error"]

@@ -71,7 +71,7 @@ def stamps(path: Path) -> list[float]:
 
 
 def notes(path: Path) -> list[str]:
-    """What a recording says of itself."""
+    """Return what a recording says of itself."""
     if path.suffix == ".mcap":
         with path.open("rb") as file:
             return [

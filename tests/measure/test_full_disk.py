@@ -46,7 +46,7 @@ class SmallDisk:
         self.program = (*enter, *PROGRAM)
 
     def seen_by(self, running: Running) -> Path:
-        """The folder as the program sees it."""
+        """Return the folder as the program sees it."""
         return Path(f"/proc/{running.process.pid}/root{self.folder}")
 
 

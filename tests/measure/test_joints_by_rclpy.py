@@ -51,14 +51,14 @@ class Control:
 
 
 def moves(control: Control, process: Running, opening: float) -> bool:
-    """One more cycle of the controller; whether the gripper is where it was sent by now."""
+    """Return one more cycle of the controller; whether the gripper is where it was sent by now."""
     control.cycle(opening)
     process.read(0.01)
     return any(abs(entry["value"] - opening) < 1e-4 for entry in acted(process))
 
 
 def acted(process: Running) -> list[dict[str, Any]]:
-    """What the virtual gripper says that it did."""
+    """Return what the virtual gripper says that it did."""
     return [json.loads(line) for line in process.out.splitlines() if '"actuator"' in line]
 
 

@@ -34,7 +34,7 @@ ADDRESSES = list(range(0x21, 0x21 + 20))
 
 
 def asked(bus: Hub) -> Counter[int]:
-    """How often each address was asked by itself; 0: everybody."""
+    """Return how often each address was asked by itself; 0: everybody."""
     found = Counter[int]()
     for identifier, data in list(bus.frames):
         if identifier >> 8 == 0x18DBFF:

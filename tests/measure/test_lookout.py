@@ -194,7 +194,7 @@ def test_an_announce_is_passed_on_by_address_or_by_uuid() -> None:
 
 
 def clock(offset: int) -> ClockMap:
-    """A node's clock that stands ``offset`` ns behind the host's, asked just now."""
+    """Return a node's clock that stands ``offset`` ns behind the host's, asked just now."""
     made, now = ClockMap(), time.monotonic_ns()
     made.exchange(Exchange(now - 2000, now, now - 1500 - offset, now - 500 - offset, 1, 50))
     return made

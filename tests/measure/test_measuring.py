@@ -122,7 +122,7 @@ def test_a_measurement_ends_with_its_counts_and_every_file_says_the_same(bench: 
 
 
 def counted(bench: Bench, folder: Path) -> float:
-    """The largest bound of a clock: a machine that stands still in each exchange knows it badly."""
+    """Return the largest bound of a clock: a machine that stands still in each exchange knows it badly."""
     folder.mkdir()
     files = [folder / f"run.{suffix}" for suffix in ("csv", "jsonl", "mcap")]
     targets = [word for file in files for word in ("--to", file)]

@@ -30,7 +30,7 @@ HIGH = 1e9
 
 @pytest.fixture(scope="module")
 def station(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Station, bytes, bytes]]:
-    """A station with an angle sensor of 10 kHz and a gripper with two sensors of 100 Hz."""
+    """Yield a station with an angle sensor of 10 kHz and a gripper with two sensors of 100 Hz."""
     folder = tmp_path_factory.mktemp("rates")
     with_keys = make_station(folder / "bench", "bench")
     try:

@@ -25,7 +25,7 @@ def pair(tmp_path: Path) -> Iterator[Pair]:
 
 @pytest.fixture
 def measuring(pair: Pair) -> Iterator[Station]:
-    """The process that measures, beside the command that changes the store."""
+    """Yield the process that measures, beside the command that changes the store."""
     other = Station.open(pair.north.home, ask=lambda prompt, confirm: PASSPHRASE)
     yield other
     other.close()

@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.realtime, pytest.mark.link]
 
 
 def south_of(hall: Hall) -> Station:
-    """A second station with its own key, to which the first one has copied the keys of all nodes."""
+    """Return a second station with its own key, to which the first one has copied the keys of all nodes."""
     make_station(hall.folder / "stations" / "south", "south").close()
     north, south, bundle = hall.station, hall.desk.station("south"), hall.folder / "keys.jwe"
     for station, other, name in ((north, south, "south"), (south, north, "bench")):
@@ -36,7 +36,7 @@ def south_of(hall: Hall) -> Station:
 
 
 def moved(asked: Client, uuid: str, value: float) -> Any:
-    """What a station answers that is to move the gripper, None where another one has it."""
+    """Return what a station answers that is to move the gripper, None if another one has it."""
     try:
         return asked.request("PUT", f"/nodes/{uuid}/channels/1", {"value": value, "hold": 30})
     except ApiError as error:

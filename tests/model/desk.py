@@ -265,7 +265,7 @@ class Desk:
         return True
 
     def _refuse_confirm(self, step: Step, state: State) -> bool:
-        """Every Confirm that ever left comes to the node once more."""
+        """Send every Confirm that ever left to the node once more."""
         for link, frame in self.confirms.values():
             assert not decode_reply(self.board.tim.handle(frame, link=link, tapped=True)).ok
         if self.pending() != state.ram:
@@ -547,11 +547,11 @@ class Desk:
             return False
 
     def held(self, station: int) -> frozenset[int]:
-        """The model's numbers of the keys that a station holds."""
+        """Return the model's numbers of the keys that a station holds."""
         return frozenset(self.numbers[key.key_id] for key in self.stations[station].keys.keys_of(self.board.uuid))
 
     def pending(self) -> int:
-        """The model's number of the key that the node has in RAM, 0 for none."""
+        """Return the model's number of the key that the node has in RAM, 0 for none."""
         pending = self.board.tim._agreeing._pending
         return 0 if pending is None else self._number_of(pending.agreement.key)
 
@@ -567,7 +567,7 @@ class Desk:
         return 0 if key is None else self.numbers[key_id(key).hex()]
 
     def talk(self, station: int, link: Link | None = None) -> Conversation:
-        """A conversation of a station with the node, at the reader."""
+        """Return a conversation of a station with the node, at the reader."""
         identity = Identity.decode(self.board.tim.identity().encode())
         contact = Contact(identity, link or Link(self.board, NAMES[station]), tag_uid=bytes(7))
         return Conversation(contact, notice=lambda notice: None)

@@ -22,7 +22,7 @@ pytestmark = [pytest.mark.system, pytest.mark.skipif(MISSING, reason="spin or a 
 
 @pytest.fixture
 def fresh(tmp_path: Path) -> Desk:
-    """The desk of which the others are copies."""
+    """Return the desk of which the others are copies."""
     made = Desk.make(tmp_path / "fresh")
     made.leave()
     return made

@@ -46,7 +46,7 @@ class Mutant:
         return f"{self.path}:{self.line} {self.function}: {self.description}"
 
     def applied(self, source: str) -> str:
-        """The module with the change in it."""
+        """Return the module with the change in it."""
         return source[: self.start] + self.text + source[self.end :]
 
 
@@ -87,7 +87,7 @@ class Module:
         self._lines = self.source.splitlines(keepends=True)
 
     def span(self, node: ast.expr | ast.stmt) -> tuple[int, int]:
-        """Where a node begins and ends, in characters."""
+        """Return where a node begins and ends, in characters."""
         assert node.end_lineno is not None
         assert node.end_col_offset is not None
         return self._at(node.lineno, node.col_offset), self._at(node.end_lineno, node.end_col_offset)
@@ -97,7 +97,7 @@ class Module:
         return self._begins[line - 1] + (octets if text.isascii() else len(text.encode()[:octets].decode()))
 
     def functions(self) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
-        """Every function with its name, that of its class before it."""
+        """Yield every function with its name, that of its class before it."""
         yield from _functions(self.tree, "")
 
     def mutant(
@@ -108,7 +108,7 @@ class Module:
         description: str = "",
         words: frozenset[str] = frozenset(),
     ) -> Mutant:
-        """A mutant that puts ``text`` in the place of a node; ``words`` are those of its function."""
+        """Return a mutant that puts ``text`` in the place of a node; ``words`` are those of its function."""
         start, end = self.span(node)
         was = " ".join(self.source[start:end].split())
         return Mutant(
@@ -128,14 +128,14 @@ def _functions(node: ast.AST, of: str) -> Iterator[tuple[str, ast.FunctionDef | 
 
 
 def modules(room: str = "") -> list[Module]:
-    """Every module of the package below ``room`` (``steps``, ``protocol/tim``, ``provisioning/agree.py``)."""
+    """Return every module of the package below ``room`` (``steps``, ``protocol/tim``, ``provisioning/agree.py``)."""
     place = PACKAGE / room
     paths = [place] if place.is_file() else sorted(place.rglob("*.py"))
     return [Module(path.relative_to(ROOT).as_posix(), path.read_text()) for path in paths]
 
 
 def words_of(text: str) -> frozenset[str]:
-    """The words of a text in lower case, names cut where they are joined."""
+    """Return the words of a text in lower case, names cut where they are joined."""
     return frozenset(
         word.lower() for name in _NAME.findall(text) for word in (name, *_JOINED.findall(name)) if len(word) > 2
     )
@@ -146,7 +146,7 @@ def _words(module: Module, tree: ast.stmt) -> frozenset[str]:
 
 
 def found(pattern: Pattern, where: list[Module]) -> list[Mutant]:
-    """The places of a pattern: an expression, or a statement that is one expression; one, where all is well."""
+    """Return the places of a pattern: an expression, or a statement that is one expression; one, where all is well."""
     parsed = ast.parse(pattern.was, mode="eval")
     kind, wanted = type(parsed.body), ast.unparse(parsed)
     description = f"{pattern.rule}: {pattern.was}  ->  {pattern.now}"
@@ -166,7 +166,7 @@ def found(pattern: Pattern, where: list[Module]) -> list[Mutant]:
 
 
 def found_in_c(pattern: CPattern) -> list[Mutant]:
-    """The places of a pattern in the C library; one, where all is well."""
+    """Return the places of a pattern in the C library; one, where all is well."""
     path = SOURCES_IN_C / pattern.file
     source, name = path.read_text(), path.relative_to(ROOT).as_posix()
     description = f"{pattern.rule}: {' '.join(pattern.was.split())[:90]}  ->  {pattern.now}"
@@ -180,7 +180,7 @@ def found_in_c(pattern: CPattern) -> list[Mutant]:
 
 
 def any_of(module: Module) -> list[Mutant]:
-    """Every mutant of a module that chance may draw."""
+    """Return every mutant of a module that chance may draw."""
     return [mutant for function, tree in module.functions() for mutant in _of_function(module, function, tree)]
 
 

@@ -109,11 +109,11 @@ class Service:
         return made
 
     def token(self, name: str, *words: object) -> str:
-        """A new token for a script, by command."""
+        """Return a new token for a script, by command."""
         return str(self.station.ask("ncap", "token", "add", name, *words)["token"])
 
     def raw(self, method: str, path: str, headers: dict[str, str | None] | None = None, body: Any = None) -> Answer:
-        """One request as it is said here; a header that is None is left out (Host too)."""
+        """Return one request as it is said here; a header that is None is left out (Host too)."""
         sent_headers: dict[str, str | None] = {"Host": f"127.0.0.1:{self.port}", **(headers or {})}
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE)
         try:
@@ -168,12 +168,12 @@ def unix(line: dict[str, Any]) -> float:
 
 
 def verdict(node: dict[str, Any]) -> str | None:
-    """The verdict on a node in a word, None where it has none yet."""
+    """Return the verdict on a node in a word, None if it has none yet."""
     return node["verdict"] and str(node["verdict"]["verdict"])
 
 
 def virtual(service: Service, profile: str = "gripper", name: str = "hand", source: str = "sine:2") -> str:
-    """A virtual transducer of the daemon, provisioned and there."""
+    """Return a virtual transducer of the daemon, provisioned and there."""
     with service.client() as asked:
         made = asked.request("POST", "/virtual", {"profile": profile, "name": name, "source": source})
     node = verified(service, made["uuid"])

@@ -30,7 +30,7 @@ def desk(tmp_path: Path, prepared: Path) -> Iterator[Desk]:
 
 
 def brings(desk: Desk, name: str = "joint", blocks: Mapping[BlockId, bytes] | None = None, *, can: str = "") -> Node:
-    """A factory sensor with a datasheet of its own, powered, on the desk's bus."""
+    """Return a factory sensor with a datasheet of its own, powered, on the desk's bus."""
     uuid = desk.new_uuid()
     folder = desk.folder / uuid.hex()
     FlashFile.create(folder, uuid=uuid, name="", max_message=2048, blocks=blocks or factory(uuid, name)).release()

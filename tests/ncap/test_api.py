@@ -37,7 +37,7 @@ def asked(service: Service) -> Client:
 
 @pytest.fixture(scope="module")
 def hand(service: Service) -> str:
-    """A virtual gripper of the daemon: channel 1 an actuator, 2 and 3 sensors."""
+    """Return a virtual gripper of the daemon: channel 1 an actuator, 2 and 3 sensors."""
     return virtual(service)
 
 
@@ -586,7 +586,7 @@ def test_more_than_a_thousand_nodes_come_in_pages(service: Service, asked: Clien
     service.station.ask("whitelist", "import", sheet)
 
     def settled() -> tuple[dict[str, Any], list[str]] | None:
-        """The first page, and all of them where no node of another test came between the two questions."""
+        """Return the first page, and all of them where no node of another test came between the two questions."""
         first = asked.request("GET", "/nodes")
         every = [node["uuid"] for node in asked.nodes()]
         return (first, every) if first["total"] > 2000 and first["total"] == len(every) else None

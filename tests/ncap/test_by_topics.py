@@ -45,7 +45,7 @@ def ros(request: pytest.FixtureRequest, master: Master) -> Iterator[Ros1 | Ros2]
 
 @pytest.fixture(params=[pytest.param("ros1", marks=pytest.mark.soak), "ros2"])
 def either_ros(request: pytest.FixtureRequest, master: Master) -> Iterator[Ros1 | Ros2]:  # noqa: F811
-    """One ROS for rules of the daemon, which are the same code with both; make test-all has the other."""
+    """Yield one ROS for rules of the daemon, which are the same code with both; make test-all has the other."""
     with ros_of(request.param, master) as made:
         yield made
 
@@ -62,7 +62,7 @@ def publishers() -> Iterator[Publishers]:
 
 @contextmanager
 def listening(hall: Hall, ros: Ros1 | Ros2, *words: object, measured: bool = True, **more: Any) -> Iterator[Service]:
-    """A daemon that publishes to this ROS, and measures the gripper with a dead-man of half a second."""
+    """Yield a daemon that publishes to this ROS, and measures the gripper with a dead-man of half a second."""
     hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
     service = Service(hall.desk, hall.station, (*ros.words, *words)).start(environment=ros.environment)
     uuid = hall.nodes["g"].uuid
@@ -77,7 +77,7 @@ def listening(hall: Hall, ros: Ros1 | Ros2, *words: object, measured: bool = Tru
 
 
 def set_points(ros: Ros1 | Ros2, value: float) -> subprocess.Popen[bytes]:
-    """A publisher of another value than the usual one, ten times a second."""
+    """Return a publisher of another value than the usual one, ten times a second."""
     if isinstance(ros, Ros2):
         module = [sys.executable, "-m", "tests.measure.sinks.ros2_publisher", str(ros.domain), TOPIC, str(value)]
         return subprocess.Popen(module, env=ros.environment, cwd=ROOT)

@@ -23,7 +23,7 @@ NEW = "four other random words"
 
 @pytest.fixture
 def running(desk: Desk) -> Iterator[Service]:
-    """A daemon of a home that each test may change."""
+    """Yield a daemon of a home that each test may change."""
     service = Service(desk, desk.station())
     yield service.start()
     service.end()
@@ -44,7 +44,7 @@ def measured_in_a_new_session(asked: Client, uuid: str) -> dict[str, Any]:
 
 
 def events_of(service: Service, event: str) -> list[dict[str, Any]]:
-    """Events of one kind that the daemon has printed."""
+    """Return events of one kind that the daemon has printed."""
     assert service.process is not None
     while service.process.read(0.3):
         pass

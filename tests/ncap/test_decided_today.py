@@ -49,7 +49,7 @@ DECISIONS = {
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
-    """A gripper that station `crane` signed and handed over as a copy to `bench`, which trusts it."""
+    """Yield a gripper that station `crane` signed and handed over as a copy to `bench`, which trusts it."""
     hall = Hall(tmp_path_factory.mktemp("today"), {})
     crane = make_station(hall.folder / "crane", "crane")
     bench = Station.open(hall.station.home, ask=lambda prompt, confirm: PASSPHRASE)
@@ -76,7 +76,7 @@ _HOMES = count()
 
 @pytest.fixture
 def hall(made: Hall) -> Iterator[Hall]:
-    """The hall with a home in which nothing was decided yet."""
+    """Yield the hall with a home in which nothing was decided yet."""
     before = made.station
     made.station = made.copy(f"home{next(_HOMES)}")
     with made.visited():

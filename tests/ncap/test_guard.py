@@ -40,7 +40,7 @@ def bearer(service: Service) -> dict[str, str | None]:
 
 
 def cookie_of(service: Service) -> str:
-    """A browser that was let in by `ncap open`."""
+    """Return a browser that was let in by `ncap open`."""
     path = service.station.ask("ncap", "open")["url"].removeprefix(service.url)
     answer = service.raw("GET", path)
     assert answer.status == 303, answer
@@ -48,7 +48,7 @@ def cookie_of(service: Service) -> str:
 
 
 def refusals(port: int) -> list[tuple[str, str, str, dict[str, str | None], Any, int, str]]:
-    """What is asked (with a good token unless it says otherwise), and how it is refused."""
+    """Return what is asked (with a good token unless it says otherwise), and how it is refused."""
     other = f"http://127.0.0.1:{port + 1}"
     put, status = "/api/v1/detection", "/api/v1/status"
     body = json.dumps({"mode": "whitelist"})

@@ -98,7 +98,7 @@ async def fed(live: Live, rate: float, seconds: float, channels: int = 1) -> Non
 
 
 async def heard(listener: LiveClient, feeding: asyncio.Task[None]) -> list[dict[str, Any]]:
-    """What comes until nothing is fed any more, and the last of that has come."""
+    """Return what comes until nothing is fed any more, and the last of that has come."""
     found: list[dict[str, Any]] = []
     while not feeding.done():
         with suppress(TimeoutError):

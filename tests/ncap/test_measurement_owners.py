@@ -46,7 +46,7 @@ def tidy(hall: Hall) -> Iterator[None]:
 
 
 def rows(hall: Hall) -> list[KeptMeasurement]:
-    """The rows as they are stored: this reader removes none."""
+    """Return the rows as they are stored: this reader removes none."""
     with closing(Station.inspect(hall.station.home)) as store:
         return store.measurements._rows()
 

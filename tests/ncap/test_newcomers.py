@@ -62,11 +62,11 @@ class Lab:
         return self.service.start("--measure", "all", "--rate", 50, *words)
 
     def lines(self) -> list[dict[str, Any]]:
-        """Every line of the daemon until now."""
+        """Return every line of the daemon until now."""
         return lines_of(self.service)
 
     def events_of(self, uuid: str | None = None) -> list[dict[str, Any]]:
-        """Events of measurements that name a node."""
+        """Return events of measurements that name a node."""
         every = [line for line in self.lines() if line.get("event") == "measurement" and "uuid" in line]
         return [entry for entry in every if uuid in (None, entry["uuid"])]
 

@@ -168,6 +168,6 @@ def test_no_bin_holds_values_of_two_calibrations() -> None:
 
 
 def line(zero: float = 0.0, by: str = "") -> Calibration:
-    """A calibration of channel 1."""
+    """Return a calibration of channel 1."""
     part = CalibrationInput(1, 1, (0.0, 65536.0), (0.0,))
     return Calibration(1, "linear", (part,), (0.0, 1e-4), zero_offset=zero, by=by)

@@ -65,7 +65,7 @@ def test_a_token_that_is_over_is_good_no_more(tmp_path: Path, monkeypatch: pytes
 
 @contextmanager
 def listening(service: Service, token: str) -> Iterator[ClientConnection]:
-    """A client of /live that was greeted."""
+    """Yield a client of /live that was greeted."""
     address, headers = service.url.replace("http", "ws", 1) + "/api/v1/live", {"Authorization": f"Bearer {token}"}
     with connect(address, additional_headers=headers, open_timeout=PATIENCE) as client:
         assert json.loads(client.recv(PATIENCE))["type"] == "hello"

@@ -48,7 +48,7 @@ def token(service: Service) -> str:
 
 @pytest.fixture(scope="module")
 def hand(service: Service) -> str:
-    """A gripper that waits for its simulation, and is measured."""
+    """Return a gripper that waits for its simulation, and is measured."""
     with service.client() as asked:
         made = asked.request("POST", "/virtual", {"profile": "gripper", "name": "hand", "source": "simulation"})
         assert made["simulation"] is None
@@ -64,7 +64,7 @@ def address(service: Service, name: str = "hand") -> str:
 
 @contextmanager
 def simulation(service: Service, token: str, name: str = "hand", **headers: str) -> Iterator[ClientConnection]:
-    """A client that has the place; `ready` is taken."""
+    """Yield a client that has the place; `ready` is taken."""
     until(lambda: fed(service, name) is None, "the place is free")
     with connect(address(service, name), additional_headers={"Authorization": f"Bearer {token}", **headers}) as socket:
         ready = json.loads(socket.recv(PATIENCE))
@@ -84,7 +84,7 @@ def fed(service: Service, name: str) -> dict[str, Any] | None:
 
 
 def last(service: Service, uuid: str, channel: int = OPENING) -> float | None:
-    """The newest value of a channel, SI; None if it is not valid."""
+    """Return the newest value of a channel, SI; None if it is not valid."""
     with service.client() as asked:
         found = asked.request("GET", f"/nodes/{uuid}/channels/{channel}")["last"]
     return found and found["value"]
@@ -107,7 +107,7 @@ def answers(socket: ClientConnection, what: str) -> dict[str, Any]:
 
 
 def closed(socket: ClientConnection) -> int | None:
-    """The code with which the station closes it; None where the connection just broke."""
+    """Return the code with which the station closes it; None if the connection just broke."""
     try:
         while True:
             socket.recv(PATIENCE)

@@ -169,7 +169,7 @@ def test_kill_loses_a_fifth_of_a_second_at_most_and_a_start_carries_on(lab: Lab)
     parts = lab.service.station.home / "recordings"
 
     def cut() -> float:
-        """Seconds from the last row that was kept to the death of the daemon; then it is started again."""
+        """Return seconds from the last row that was kept to the death of the daemon; then it is started again."""
         time.sleep(1.0)
         file = max(parts.glob("cut*.csv"), key=lambda part: part.stat().st_mtime_ns)
         killed = time.time()
@@ -241,7 +241,7 @@ def test_the_command_line_works_beside_it_at_the_same_node(lab: Lab) -> None:
     process = lab.service.process
 
     def lost() -> int:
-        """How often its session was ended under three commands; a machine that stands still may end it, once."""
+        """Return how often its session was ended under three commands; a machine that stands still may end it, once."""
         process.read(0.1)
         position = process.out.rfind("\n") + 1
         before = lab.flows()["measuring"]
@@ -355,7 +355,7 @@ def test_with_record_every_measurement_has_a_file(lab: Lab) -> None:
 
 
 def another_home(folder: Path, first: Path) -> Path:
-    """A station whose daemon has another address on a bus; one of six has the same."""
+    """Return a station whose daemon has another address on a bus; one of six has the same."""
     with Store.open(first) as store:
         taken = own_source(store.id)
     for number in range(20):

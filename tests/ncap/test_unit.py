@@ -24,13 +24,13 @@ pytestmark = pytest.mark.skipif(not UNIT.exists(), reason="the unit is not part 
 
 
 def settings(name: str) -> list[str]:
-    """The values of a setting, in the unit's order."""
+    """Return the values of a setting, in the unit's order."""
     lines = UNIT.read_text(encoding="utf-8").splitlines()
     return [line.partition("=")[2] for line in lines if line.startswith(f"{name}=")]
 
 
 def sets() -> dict[str, list[str]]:
-    """The sets of system calls, as `systemd-analyze syscall-filter` printed them."""
+    """Return the sets of system calls, as `systemd-analyze syscall-filter` printed them."""
     found: dict[str, list[str]] = {}
     for line in SETS.read_text(encoding="utf-8").splitlines():
         if line.startswith("@"):
@@ -41,7 +41,7 @@ def sets() -> dict[str, list[str]]:
 
 
 def calls_of(name: str) -> set[str]:
-    """The calls of a set, or the one call."""
+    """Return the calls of a set, or the one call."""
     known = sets()
     return set().union(*map(calls_of, known[name])) if name in known else {name}
 

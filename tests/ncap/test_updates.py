@@ -63,7 +63,7 @@ class Bench:
             return dict(asked.update(image.read_bytes(), *(node.uuid for node in nodes), **more))
 
     def runs(self, node: Node) -> str:
-        """The version that a board runs."""
+        """Return the version that a board runs."""
         return str(verified(self.service, node.uuid)["firmware"]["version"])
 
     def ended(self, action: dict[str, Any]) -> dict[str, Any]:
@@ -94,7 +94,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory, prepared: Path) -> Iterator[
 
 @contextmanager
 def paused(node: Node) -> Iterator[None]:
-    """A board that answers nothing for the time of the block: its update stands still."""
+    """Yield a board that answers nothing for the time of the block: its update stands still."""
     assert node.process is not None
     node.process.signal(signal.SIGSTOP)
     try:
@@ -278,7 +278,7 @@ def test_no_further_board_is_begun_after_a_cancel(bench: Bench) -> None:
 
 
 def events_of(bench: Bench, node: Node) -> list[str]:
-    """What the service said of the measurement of a node, in order."""
+    """Return what the service said of the measurement of a node, in order."""
     process = bench.service.process
     assert process is not None
     while process.read(0.1):

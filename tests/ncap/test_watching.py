@@ -57,7 +57,7 @@ def test_the_firmware_of_a_board_without_a_key_here_is_shown_as_unverified_and_n
 
 
 def sighting(number: int) -> Any:
-    """A node that answered just now."""
+    """Return a node that answered just now."""
     identity = SimpleNamespace(uuid=number.to_bytes(10, "big"), state=SimpleNamespace(name="FACTORY"))
     link = SimpleNamespace(capabilities=SimpleNamespace(tapped=False))
     contact = SimpleNamespace(identity=identity, link=link, address=number % 200)
@@ -78,7 +78,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> LinkWatch:
 
 @pytest.fixture
 def reader(watch: LinkWatch, monkeypatch: pytest.MonkeyPatch) -> Iterator[LinkWatch]:
-    """A watch on a reader that runs; ``open_place`` is to be given before it starts."""
+    """Yield a watch on a reader that runs; ``open_place`` is to be given before it starts."""
     watch.place = "nfc:x"
     monkeypatch.setattr(watch._directory, "forget_place", lambda _place: None)
     yield watch

@@ -47,7 +47,7 @@ def lab(one_lab: Lab) -> Iterator[Lab]:
 
 
 def events_of(lab: Lab) -> list[dict[str, Any]]:
-    """What the daemon said of the node being measured, in order."""
+    """Return what the daemon said of the node being measured, in order."""
     process = lab.service.process
     assert process is not None
     while process.read(0.1):
@@ -61,7 +61,7 @@ def states(lab: Lab) -> list[str]:
 
 
 def calibrated(lab: Lab, most: float) -> Path:
-    """A calibration whose values end elsewhere."""
+    """Return a calibration whose values end elsewhere."""
     file = lab.desk.folder / f"to-{most}.csv"
     file.write_text(f"# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,{most}\n")
     return file

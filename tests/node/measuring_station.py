@@ -27,7 +27,7 @@ KEY = bytes(range(16))
 
 
 def keyed_node(folder: Path, **order: object) -> FlashFile:
-    """A node made from a datasheet that has a link key already; nothing is signed."""
+    """Return a node made from a datasheet that has a link key already; nothing is signed."""
     made = node_template.create(folder, **order)  # type: ignore[arg-type]
     flash = made.load()
     made.commit(replace(flash, key=KEY, epoch=1))
@@ -55,7 +55,7 @@ class SealedLine:
         return reply.payload
 
     def teds(self) -> bytes:
-        """The Security TEDS, which is short enough for one Read."""
+        """Return the Security TEDS, which is short enough for one Read."""
         return self._plain(Command(0, 1, 2, b"\x80" + bytes(4))).payload[4:]
 
     def operate(self, channel: int = 0, *, lease: int = 10, dead_man: int | None = None) -> None:
@@ -92,7 +92,7 @@ class MeasuringStation(SealedLine):
         return Receiver(plan, reply, self.session.message_key), reply
 
     def hear(self, receiver: Receiver, messages: int, seconds: float = PATIENCE) -> list[StreamMessage]:
-        """The next messages of one stream."""
+        """Return the next messages of one stream."""
         assembly, heard = StreamAssembly(receiver.plan.length, fd=self.fd), []
         until = time.monotonic() + seconds
         while len(heard) < messages:

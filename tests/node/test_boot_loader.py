@@ -45,7 +45,7 @@ def folder(owner: Owner, tmp_path: Path) -> Path:
 
 
 def started(folder: Path) -> ImageSlots:
-    """The slots after power off and on."""
+    """Return the slots after power off and on."""
     slots = ImageSlots(folder)
     slots.start()
     return slots

@@ -26,7 +26,7 @@ def image() -> Image:
 
 
 def files(folder: Path, image: Image) -> dict[str, Path]:
-    """The same TEDS in each format that says their channels."""
+    """Return the same TEDS in each format that says their channels."""
     blocks = [TedsBlock(channel, code, teds) for (channel, code), teds in image.blocks.items()]
     paths = {"image": folder / "node.json"}
     paths["image"].write_text(image.to_json())

@@ -26,7 +26,7 @@ def board(profile: str) -> Board:
 
 
 def names_in(example: str) -> set[str]:
-    """Every text constant of an example."""
+    """Return every text constant of an example."""
     tree = ast.parse((EXAMPLES / example).read_text())
     return {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
 

@@ -74,7 +74,7 @@ class Scene:
         self._stack = ExitStack()
 
     def run(self, name: str, *words: object, profile: str = ANGLE, can: str = "") -> Running:
-        """A node that is keyed and up."""
+        """Return a node that is keyed and up."""
         keyed_node(self.folder / name, profile=profile, uuid=new_uuid(self.addresses))
         process = Running("--json", "node", "run", self.folder / name, "--can", can or self.can, *words)
         self._stack.callback(process.close)

@@ -63,7 +63,7 @@ def sheet_of(sensor: object) -> Sheet:
 
 @st.composite
 def signals(draw: st.DrawFn) -> str:
-    """One signal somewhere in eight octets; little-endian, any width, factor and offset."""
+    """Return one signal somewhere in eight octets; little-endian, any width, factor and offset."""
     bits = draw(st.integers(1, 64))
     start = draw(st.integers(0, 64 - bits))
     scale = draw(st.sampled_from(["1", "0.01", "0.0625", "-0.5", "0.001", "3.7e-05", "250"]))

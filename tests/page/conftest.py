@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # Of this package, not of the session: while playwright runs, its thread has an event loop, and other tests want theirs.
 @pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
-    """One chromium for all tests of the page."""
+    """Yield one chromium for all tests of the page."""
     found = chromium()
     if found is None:
         pytest.skip("no chromium here: scripts/install-test-packages installs it")
@@ -45,7 +45,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[
 
 @pytest.fixture
 def fresh(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Lab]:
-    """A station of its own for one test, empty and not started."""
+    """Yield a station of its own for one test, empty and not started."""
     lab = Lab.make(tmp_path_factory.mktemp("fresh"))
     try:
         yield lab

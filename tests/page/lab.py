@@ -41,7 +41,7 @@ PATIENCE = 60_000  # ms that a test waits for something to be seen
 
 
 def chromium() -> str | None:
-    """The browser of this system; without windows, if it has that one: a page costs it a quarter of the CPU."""
+    """Return the browser of this system; without windows, if it has that one: a page costs it a quarter of the CPU."""
     names = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
     return next((found for name in names if (found := shutil.which(name))), None)
 
@@ -109,7 +109,7 @@ class Lab:
         self.daemon.close()
 
     def create(self, name: str, type_: str) -> Node:
-        """A virtual node in factory state, from a transducer type; not powered."""
+        """Return a virtual node in factory state, from a transducer type; not powered."""
         node = self.nodes[name] = self.desk.node(name, called=name, type_=type_)
         return node
 
@@ -123,7 +123,7 @@ class Lab:
         return running
 
     def moved(self, name: str) -> list[dict[str, Any]]:
-        """What the actuators of a node of the first process did, as that process told."""
+        """Return what the actuators of a node of the first process did, as that process told."""
         assert self.board is not None
         while self.board.read(0.05):
             pass
@@ -144,11 +144,11 @@ class Lab:
         assert done["verdict"] == "authentic"
 
     def ask(self, *words: object) -> Any:
-        """A command of the same home."""
+        """Return a command of the same home."""
         return self.station.ask(*words)
 
     def measurements(self) -> list[dict[str, Any]]:
-        """What the daemon measures."""
+        """Return what the daemon measures."""
         with client.connect(home=self.station.home) as station:
             found: list[dict[str, Any]] = station.request("GET", "/measurements")["measurements"]
         return found
@@ -159,7 +159,7 @@ class Lab:
             station.request("POST", "/measurements", {"uuids": [self.nodes[name].uuid for name in names], "rate": rate})
 
     def login(self, *, read_only: bool = False) -> str:
-        """An address of the page with a token that works once."""
+        """Return an address of the page with a token that works once."""
         with client.connect(home=self.station.home) as station:
             return station.login_url(read_only=read_only)
 
@@ -175,7 +175,7 @@ def opened(
     read_only: bool = False,
     **more: Any,
 ) -> Iterator[Page]:
-    """A browser of its own, signed in. An error, a breach of its policy or a foreign address fails the test."""
+    """Yield a browser of its own, signed in. An error, a breach of its policy or a foreign address fails the test."""
     context = browser.new_context(viewport={"width": width, "height": height}, **more)
     page = context.new_page()
     page.set_default_timeout(PATIENCE)

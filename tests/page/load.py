@@ -56,7 +56,7 @@ class Load:
 
 
 def run(browser: Browser, lab: Lab, seconds: float) -> Load:
-    """Two tactile fingers of 12 channels each, measured at RATE, twenty of them drawn."""
+    """Return two tactile fingers of 12 channels each, measured at RATE, twenty of them drawn."""
     with client.connect(home=lab.station.home) as station:
         asked = [{"profile": "tactile-finger-sensor", "name": name, "source": "sine:3"} for name in ("index", "thumb")]
         uuids = [station.request("POST", "/virtual", entry)["uuid"] for entry in asked]
@@ -84,13 +84,13 @@ def run(browser: Browser, lab: Lab, seconds: float) -> Load:
 
 
 def counts_of(page: Page) -> dict[str, int]:
-    """What the plot says of itself, once a second."""
+    """Return what the plot says of itself, once a second."""
     dataset = page.locator(".plot-foot").evaluate("foot => ({...foot.dataset})")
     return {name: int(dataset.get(name, 0)) for name in ("received", "dropped", "drawn", "skipped")}
 
 
 def heap(devtools: CDPSession) -> int:
-    """Octets of the page's JavaScript after a collection."""
+    """Return octets of the page's JavaScript after a collection."""
     devtools.send("HeapProfiler.collectGarbage")
     return int(devtools.send("Runtime.getHeapUsage")["usedSize"])
 
@@ -104,7 +104,7 @@ def samples(station: client.Client) -> tuple[int, int]:
 
 
 def main() -> int:
-    """The command."""
+    """Return the command."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     seconds = parser.parse_args().seconds

@@ -21,7 +21,7 @@ RULES = (
 
 
 def violations(page: Page) -> list[str]:
-    """What axe says, one line each."""
+    """Return what axe says, one line each."""
     if not page.evaluate("window.axe !== undefined"):
         page.evaluate(AXE)
     found = page.evaluate(f"axe.run(document, {RULES})")["violations"]

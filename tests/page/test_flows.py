@@ -32,7 +32,7 @@ def received(page: Page) -> int:
 
 
 def in_group(page: Page, name: str) -> Locator:
-    """The card of a group."""
+    """Return the card of a group."""
     return page.locator("li.group").filter(has=page.get_by_role("heading", name=name))
 
 

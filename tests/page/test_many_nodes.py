@@ -24,7 +24,7 @@ MANY = 300
 
 @pytest.fixture(scope="module")
 def crowd(lab: Lab) -> Iterator[Lab]:
-    """The lab, and nodes that are on the whitelist and not there."""
+    """Yield the lab, and nodes that are on the whitelist and not there."""
     listed = [{"uuid": f"{0xBEEF:04x}{number:016x}", "name": f"joint {number}"} for number in range(1, MANY + 1)]
     file = lab.folder / "crowd.json"
     file.write_text(json.dumps({"whitelist": listed}))
@@ -36,13 +36,13 @@ def crowd(lab: Lab) -> Iterator[Lab]:
 
 
 def called(lab: Lab, *nodes: str) -> list[str]:
-    """What nodes of the lab are called by now: the tests before these rename one."""
+    """Return what nodes of the lab are called by now: the tests before these rename one."""
     with client.connect(home=lab.station.home) as station:
         return sorted(station.node(lab.nodes[node].uuid)["name"] for node in nodes)
 
 
 def others(lab: Lab) -> list[str]:
-    """What nodes are called that tests before these provisioned, and left there."""
+    """Return what nodes are called that tests before these provisioned, and left there."""
     mine = {lab.nodes[node].uuid for node in ("hand", "slew")}
     with client.connect(home=lab.station.home) as station:
         known = [node for node in station.nodes() if (node["verdict"] or {}).get("verdict") == "authentic"]
@@ -50,7 +50,7 @@ def others(lab: Lab) -> list[str]:
 
 
 def names(page: Page) -> list[str]:
-    """What is listed, from top to bottom."""
+    """Return what is listed, from top to bottom."""
     return page.locator(".card .name").all_inner_texts()
 
 

@@ -25,7 +25,7 @@ OLDEST = """async (key) => {
 
 
 def age(page: Page, key: str) -> float:
-    """Seconds since the oldest point that the page draws of a channel."""
+    """Return seconds since the oldest point that the page draws of a channel."""
     return float(page.evaluate(OLDEST, key))
 
 

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.system
 
 
 def offered(page: Page, words: str) -> float:
-    """The rate on the button beside these words, Hz."""
+    """Return the rate on the button beside these words, Hz."""
     hint = page.locator(".rate-hint", has_text=words)
     hint.wait_for()
     found = re.search(r"([\d.]+) (k?Hz)$", hint.get_by_role("button").inner_text())

@@ -26,7 +26,7 @@ RAW, VALUE = re.compile(r"^\d+ raw$"), re.compile(r"^\d+\.\d+$")
 
 
 def drawn(page: Page, uuid: str) -> list[float]:
-    """What the plot has of the channel."""
+    """Return what the plot has of the channel."""
     return [float(value) for value in page.evaluate(DRAWN, f"{uuid}/1")]
 
 

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.system
 
 
 def opening(station: client.Client, uuid: str) -> Any:
-    """The last value of the gripper's opening in mm, None if it is not valid."""
+    """Return the last value of the gripper's opening in mm, None if it is not valid."""
     last = station.node(uuid)["channels"][1]["last"]
     return None if last is None or last["value"] is None else round(1000 * last["value"], 1)
 

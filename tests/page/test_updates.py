@@ -25,7 +25,7 @@ pytestmark = pytest.mark.system
 
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Lab]:
-    """A station that runs, two fingers of one owner, and a board that takes no firmware."""
+    """Yield a station that runs, two fingers of one owner, and a board that takes no firmware."""
     lab = Lab.make(tmp_path_factory.mktemp("hand"))
     try:
         key = make_key(lab.folder / "owner.pem")

@@ -112,11 +112,11 @@ class Scene:
         return self.folder / "files"
 
     def home(self, name: str = "bench") -> Path:
-        """The home of one of the stations."""
+        """Return the home of one of the stations."""
         return self.folder / name
 
     def words(self, words: tuple[str, ...]) -> list[str]:
-        """A command line with the places and names of this scene filled in."""
+        """Return a command line with the places and names of this scene filled in."""
         places = {name.upper(): uuid for name, uuid in NODES.items()}
         places |= {
             "FILES": str(self.files),
@@ -201,7 +201,7 @@ class Scene:
         node.close()
 
     def count(self, query: str, *values: object, home: str = "bench") -> int:
-        """The number that a query of the station's database returns."""
+        """Return the number that a query of the station's database returns."""
         with closing(sqlite3.connect(f"file:{self.home(home)}/store.sqlite3?mode=ro", uri=True)) as database:
             (number,) = database.execute(query, values).fetchone()
         return int(number)
@@ -241,7 +241,7 @@ class Scenes:
                 scenes.zygote.close()
 
     def prepared(self, name: str) -> Path:
-        """The folder of a prepared scene."""
+        """Return the folder of a prepared scene."""
         with self._lock:
             place = self.folder / name
             if not place.is_dir():

@@ -10,12 +10,12 @@ from tests.plant.postgres import Database, own_cluster
 
 @pytest.fixture(scope="session")
 def cluster() -> Iterator[Cluster]:
-    """One PostgreSQL server for all tests of this worker; each module makes databases of its own in it."""
+    """Yield one PostgreSQL server for all tests of this worker; each module makes databases of its own in it."""
     with own_cluster() as made:
         yield made
 
 
 @pytest.fixture(scope="module")
 def database(cluster: Cluster) -> Database:
-    """A registry for the tests of a module."""
+    """Return a registry for the tests of a module."""
     return Database.new(cluster)

@@ -165,7 +165,7 @@ class Plant:
                     trust.add(station, [trust.candidate(station, name, path, "station")])
 
     def views(self, name: str):  # type: ignore[no-untyped-def]
-        """What a station knows of nodes: every event that anybody told who is not ``deaf``."""
+        """Return what a station knows of nodes: every event that anybody told who is not ``deaf``."""
 
         def see(uuid: bytes) -> MergedClaims:
             claims: dict[str, Claim] = {}
@@ -199,7 +199,7 @@ def keyed(station: Station, board: Board) -> None:
 
 
 def board_of(station: Station, uuid: bytes) -> Board:
-    """A board that a station has keyed."""
+    """Return a board that a station has keyed."""
     board = Board(uuid)
     assert board.key.sign(node_key_message(uuid, board.key.point))
     keyed(station, board)

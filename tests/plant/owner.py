@@ -27,7 +27,7 @@ def member(station: Station, name: str, *roles: str) -> Member:
 
 
 def roster_of(owner: Station, *members: Member, **changes: Any) -> Roster:
-    """A roster that the owner's CA signed."""
+    """Return a roster that the owner's CA signed."""
     drafted = Roster(
         REGISTRY,
         "plant",
@@ -54,14 +54,14 @@ def join(station: Station, roster: Roster) -> None:
 
 
 def alone(home: Path) -> Station:
-    """An owner whose one station is everything."""
+    """Return an owner whose one station is everything."""
     station = make_station(home, "owner")
     join(station, roster_of(station, member(station, "owner", *ALL)))
     return station
 
 
 def job_of(keeper: Station, **changes: Any) -> bytes:
-    """A job for three boards, signed by the keeper."""
+    """Return a job for three boards, signed by the keeper."""
     drafted = Job(
         str(uuid.uuid4()),
         REGISTRY,

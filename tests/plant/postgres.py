@@ -22,7 +22,7 @@ from tests.places import free_tcp_port
 
 @contextmanager
 def own_cluster() -> Iterator[Cluster]:
-    """A running server of one's own; skips the test where Debian's `postgresql` is missing."""
+    """Yield a running server of one's own; skip the test if Debian's `postgresql` is missing."""
     found = programs()
     if found is None:
         pytest.skip("no PostgreSQL 15 here (scripts/install-test-packages)")
@@ -80,11 +80,11 @@ class Database:
         return self.cluster.url(self.name)
 
     def sql(self, text: str) -> list[list[str]]:
-        """What the keeper's `psql` gives for some SQL, as rows of columns."""
+        """Return what the keeper's `psql` gives for some SQL, as rows of columns."""
         return [line.split("|") for line in self.cluster.psql(text, self.name).splitlines()]
 
     def member(self) -> Login:
-        """A new station that is a member."""
+        """Return a new station that is a member."""
         made = Login(self)
         self.sql(member_sql(made.fingerprint, verifier(made.secret)))
         return made

@@ -53,7 +53,7 @@ def evidence_of(station: Station, board: Board, *, operator: str | None = None, 
 
 
 def signed_anew(document: bytes, key: PrivateKey, change: Callable[[dict[str, Any]], object]) -> bytes:
-    """What a station can make of its own evidence: the statement changed, and signed once more."""
+    """Return what a station can make of its own evidence: the statement changed, and signed once more."""
     statement = json.loads(base64.b64decode(json.loads(document)["payload"]))
     change(statement)
     payload = json.dumps(statement, separators=(",", ":"), ensure_ascii=False).encode()

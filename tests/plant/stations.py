@@ -23,12 +23,12 @@ def ask(prompt: str, confirm: bool) -> str:
 
 
 def owner(home: Path, name: str = "north") -> Station:
-    """A station with the owner's CA key."""
+    """Return a station with the owner's CA key."""
     return initialise(home, name=name, keystore="file", ask=ask, costs=passphrase.THROWAWAY)[0]
 
 
 def certified(home: Path, name: str, by: Station) -> Station:
-    """A station whose key that CA signed; it has no CA key of its own."""
+    """Return a station whose key that CA signed; it has no CA key of its own."""
     request = trust.read_request(trust.ask_for_certificate(home, name=name, keystore="file", ask=ask))
     certificate = trust.sign_request(by, request)
     return trust.adopt_certificate(home, certificate, ask=ask)
@@ -50,7 +50,7 @@ class Plant:
         self.stations = [self.north]
 
     def member(self, name: str, *roles: Role) -> Station:
-        """One more station, added by the owner and joined; the roster reaches others at their next sync."""
+        """Return one more station, added by the owner and joined; the roster reaches others at their next sync."""
         station = certified(self.folder / name, name, self.north)
         self.change(plant.owner.add(self.north, request_of(station), frozenset(roles)))
         assert self.north.plant.roster is not None

@@ -80,7 +80,7 @@ def killed_at(folder: Path, step: int, home: str, before: Callable[[Station], No
 
 
 def carried_on(folder: Path) -> list[object]:
-    """What everybody knows once each has synced again, twice."""
+    """Return what everybody knows once each has synced again, twice."""
     for home in ("west", "north") * 3:
         station = Station.open(folder / home, ask=ask)
         sync(station, FolderTransport(folder / "stick"))

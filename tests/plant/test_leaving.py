@@ -42,7 +42,7 @@ class Scene:
             self.plant.sync(station)
 
     def keyed_by(self, station: Station) -> bytes:
-        """A board that a station keyed and that south has a copy of."""
+        """Return a board that a station keyed and that south has a copy of."""
         uuid = board_of(station, os.urandom(10)).uuid
         self.sync(station, self.south, station, self.north)
         return uuid

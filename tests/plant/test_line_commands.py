@@ -222,7 +222,7 @@ def _ca(owner: Station) -> bytes:
 
 @pytest.fixture
 def west(desk: Desk, owner: Station) -> Station:
-    """A line that signs nothing itself, beside the owner's office."""
+    """Return a line that signs nothing itself, beside the owner's office."""
     folder = desk.folder / "west"
     with closing(_opened(owner)) as station:
         made = certified(folder, "west", station)

@@ -171,7 +171,7 @@ def test_an_office_that_is_killed_at_any_step_carries_on(tmp_path: Path, monkeyp
 
 
 def pages_of(station: Station, most: int | None = None) -> int:
-    """How many pages the store has; it may have ``most`` from now on."""
+    """Return how many pages the store has; it may have ``most`` from now on."""
     database = station._store
     if most is not None:
         database.execute(f"PRAGMA max_page_count = {most}")
@@ -292,14 +292,14 @@ def test_an_office_out_of_an_old_backup_counts_the_units_and_answers_that_it_gav
 
 
 def answered(office: Station, line: Station, request: SignRequest) -> Answer:
-    """What an office says to a request that a line station signs as it stands."""
+    """Return what an office says to a request that a line station signs as it stands."""
     octets = answer(office, seal_request(request, line.credentials().key))
     assert octets is not None
     return open_answer(octets, lambda kid: office.point)
 
 
 def a_request_for(other: Board, request: SignRequest, line: Station) -> SignRequest:
-    """The same for another board that lies there too."""
+    """Return the same for another board that lies there too."""
     signed = other.key.sign(node_key_message(other.uuid, other.key.point))
     image = Image(other.uuid, request.image.blocks)
     return proven(request, line, other, image=image, point=other.key.point, key_signature=signed)

@@ -178,7 +178,7 @@ def test_no_member_ends_a_session_of_the_administrator(thief: Login) -> None:
 
 @pytest.fixture
 def lasting(cluster: Cluster) -> Iterator[tuple[Database, Login]]:
-    """A database whose tables a member holds, in a transaction that it never ends."""
+    """Yield a database whose tables a member holds, in a transaction that it never ends."""
     database = Database.new(cluster)
     login = database.member()
     connection = login.connect()

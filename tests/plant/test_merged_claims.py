@@ -140,7 +140,7 @@ def test_a_gap_is_waited_for() -> None:
 
 
 def chatter(seed: int) -> list[Speaker]:
-    """Stations of every role that say things at random, now and then two things at one place."""
+    """Return stations of every role that say things at random, now and then two things at one place."""
     chance = random.Random(seed)
     speakers = [
         speaker("keep", "keeper", "sign", "line", "base"), speaker("keep2", "keeper"), speaker("line", "line", "sign"),

@@ -83,7 +83,7 @@ class Desk:
         return LineRun(self.line, take_job(self.line, document), calibrations=calibrations, office=self.at_hand)
 
     def request(self, run: LineRun, built_board: Board) -> SignRequest:
-        """A good request for a board, as its line makes it, which nobody answers."""
+        """Return a good request for a board, as its line makes it, which nobody answers."""
         self.at_hand.away = True
         with pytest.raises(OfficeSilentError):
             build(run, built_board)
@@ -110,7 +110,7 @@ def desk(tmp_path: Path) -> Iterator[Desk]:
 
 
 def proven(request: SignRequest, line: Station, built_board: Board, **changes: Any) -> SignRequest:
-    """The request changed, and the board asked again: what a station can do that has the board in its hands."""
+    """Return the request changed, and the board asked again: what a station can do that has the board in its hands."""
     new = replace(request, **changes)
     blocks = new.image.unsigned_blocks()
     asked = challenge(new.nonce, line.point, new.uuid, new.epoch, new.sequence, blocks)

@@ -57,7 +57,7 @@ class Desk:
 
 @pytest.fixture(scope="module")
 def as_made(tmp_path_factory: pytest.TempPathFactory) -> Desk:
-    """A desk as it is laid out, and beside it as it is when all have joined: what each test gets a copy of.
+    """Return a desk as it is laid out, and beside it as it is when all have joined: what each test gets a copy of.
 
     A station keeps the path of its stick, so that each copy is put into the same folder.
     """
@@ -195,7 +195,7 @@ def test_the_doctor_says_whose_clock_is_wrong_until_that_station_dates_a_page_we
     soon = f"{datetime.now(UTC) + timedelta(hours=1):%Y-%m-%dT%H:%M:%SZ}"
 
     def found(created: str) -> list[str]:
-        """What is said once west has made one page more, and dated it so."""
+        """Return what is said once west has made one page more, and dated it so."""
         with Station.inspect(desk.folder / "south") as south, south.transaction():
             pages = south.plant.pages
             chain = pages.chain(west)

@@ -42,7 +42,7 @@ def plants(tmp_path: Path) -> Iterator[Plant]:
 
 
 def board_with(station: Station, report: FirmwareReport | None) -> FirmwareBoard:
-    """A board with firmware that reports, or without; keyed by a station."""
+    """Return a board with firmware that reports, or without; keyed by a station."""
     board = FirmwareBoard(os.urandom(10), report=report)
     keyed(station, board)
     return board
@@ -65,14 +65,14 @@ def shared_with(plants: Plant, station: Station) -> None:
 
 
 def identify_reply(station: Station, board: FirmwareBoard) -> dict[str, Any]:
-    """What the plant says of a board, by a station."""
+    """Return what the plant says of a board, by a station."""
     (node,) = plant.status.nodes(station, plant.apply_pages.require_roster(station), board.uuid.hex())
     member: dict[str, Any] = node["says"]
     return member
 
 
 def version(station: Station, board: FirmwareBoard) -> tuple[str | None, str] | None:
-    """The firmware that is shown, and who saw it; None: no station reports any."""
+    """Return the firmware that is shown, and who saw it; None: no station reports any."""
     firmware = identify_reply(station, board)["firmware"]
     return None if firmware is None else (firmware["version"], firmware["by"])
 

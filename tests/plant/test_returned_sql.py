@@ -42,7 +42,7 @@ def rows_of(connection: Connection, author: str) -> list[tuple[int, bytes, str]]
 
 @pytest.fixture
 def author() -> str:
-    """A station of which the database has no row."""
+    """Return a station of which the database has no row."""
     return os.urandom(32).hex()
 
 

@@ -30,7 +30,7 @@ def plants(tmp_path: Path) -> Iterator[Plant]:
 
 
 def made_by(station: Station, board: Board) -> Image:
-    """The datasheet that a station provisions a board with."""
+    """Return the datasheet that a station provisions a board with."""
     with talk(board) as node:
         provision(
             station, node, BuildOrder("temperature-sensor"), operator=AcceptingOperator(), reporter=SilentReporter()
@@ -45,7 +45,7 @@ def judged(station: Station, image: Image) -> Verification:
 
 
 def verdict(station: Station, image: Image) -> str:
-    """The verdict of a station, and of what it remembered for many files, which must be the same."""
+    """Return the verdict of a station, and of what it remembered for many files, which must be the same."""
     alone = judged(station, image)
     (together,) = verify_images(snapshot_trust(station), [image])
     assert tuple(together) == alone.checks

@@ -41,7 +41,7 @@ class Stranger:
         self.keys: dict[str, bytes] = {}
 
     def opened(self, jws: str, point: bytes) -> dict[str, Any]:
-        """The payload of a compact JWS that this key signed; `jose` ends non-zero for any other."""
+        """Return the payload of a compact JWS that this key signed; `jose` ends non-zero for any other."""
         jwk = {"kty": "EC", "crv": "P-256", "x": base64url(point[1:33]), "y": base64url(point[33:])}
         (self.folder / "jws").write_text(jws)
         (self.folder / "jwk").write_text(json.dumps(jwk))
@@ -57,7 +57,7 @@ class Stranger:
         return found
 
     def events(self) -> dict[str, list[dict[str, Any]]]:
-        """What each station said, page after page, each the next one's `previous` by its H."""
+        """Return what each station said, page after page, each the next one's `previous` by its H."""
         statements: dict[str, list[dict[str, Any]]] = {}
         last = dict.fromkeys(self.keys, "")
         for station, number, jws in self.office.database.sql(

@@ -62,7 +62,7 @@ def fields_of(teds: bytes) -> tuple[dict[int, bytes], list[list[object]], bytes]
 
 
 def holds(document: bytes, ca: bytes) -> bool:
-    """What section 10 has a reader check, and nothing of the program."""
+    """Return what section 10 has a reader check, and nothing of the program."""
     envelope = json.loads(document)
     payload = base64.b64decode(envelope["payload"], validate=True)
     kind = envelope["payloadType"].encode()
@@ -118,7 +118,7 @@ def document(owner: Station) -> bytes:
 
 
 def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where in a document a text, a number or nothing stands."""
+    """Yield where in a document a text, a number or nothing stands."""
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     if not isinstance(value, dict | list):
         yield path
@@ -156,7 +156,7 @@ def test_no_member_that_its_own_station_changes_and_signs_again_holds(owner: Sta
 
 
 def judged(document: bytes, ca: bytes) -> bool:
-    """Whether the program finds nothing wrong; then the stranger must not, either."""
+    """Return True if the program finds nothing wrong; then the stranger must not, either."""
     try:
         good = not codec.faults(codec.read(document), ca)
     except TedsProvisionError:
@@ -181,7 +181,7 @@ def changed_octets(document: bytes, key: PrivateKey, ca: bytes, places: range) -
 
 
 def known(payload: bytes) -> dict[str, Any]:
-    """A statement without what the facts do not bind."""
+    """Return a statement without what the facts do not bind."""
     statement: dict[str, Any] = json.loads(payload)
     statement["predicate"] = {name: item for name, item in statement["predicate"].items() if name in BOUND}
     return statement

@@ -74,7 +74,7 @@ def own(hall: Hall) -> Iterator[Connection]:
 
 @pytest.fixture
 def thief(own: Connection) -> Iterator[Connection]:
-    """The thief's connection, in a transaction that is rolled back."""
+    """Yield the thief's connection, in a transaction that is rolled back."""
     with own.transaction(force_rollback=True):
         yield own
 

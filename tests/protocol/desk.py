@@ -104,7 +104,7 @@ class Desk:
     # -- datasheets ------------------------------------------------------------------------------------------------
 
     def signed(self, listed: dict[BlockId, bytes], **changes: object) -> bytes:
-        """A Security TEDS over these blocks, next sequence, present epoch; ``changes`` replace its values."""
+        """Return a Security TEDS over these blocks, next sequence, present epoch; ``changes`` replace its values."""
         values: dict[str, object] = {
             "ca": security.ca_hint("peer", fingerprint(CA.point)),
             "last_modified": bytes(8),

@@ -20,7 +20,7 @@ LIMIT = 1 << 20
 
 
 def trusts(*stations: SoftwareKey) -> Callable[[str], bytes | None]:
-    """A trust store that holds these stations."""
+    """Return a trust store that holds these stations."""
     points = {fingerprint(station.point): station.point for station in stations}
     return points.get
 
@@ -50,7 +50,7 @@ def bundle(count: int = 1, to: tuple[SoftwareKey, ...] = (RECEIVER,), **changes:
 
 
 def members_of(made: Bundle) -> dict[str, Any]:
-    """The payload as JSON members, to be bent."""
+    """Return the payload as JSON members, to be bent."""
     return json.loads(payload_of(made))
 
 

@@ -14,12 +14,12 @@ UUID = bytes.fromhex(KAT["uuid"])
 
 
 def key(name: str) -> SoftwareKey:
-    """One of the vectors' private keys: node, station, ca, one_time."""
+    """Return one of the vectors' private keys: node, station, ca, one_time."""
     return SoftwareKey(int(KAT[name]["d"], 16))
 
 
 def octets(*path: str | int) -> bytes:
-    """A hex value at a path of the vectors."""
+    """Return a hex value at a path of the vectors."""
     value: Any = KAT
     for step in path:
         value = value[step]

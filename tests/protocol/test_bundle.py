@@ -169,7 +169,7 @@ def test_a_receiver_that_is_certified_already_needs_no_signature():
 
 
 def bent(name, value):
-    """The members of a good bundle with one of them, by its path, changed or (Ellipsis) taken away."""
+    """Return the members of a good bundle with one of them, by its path, changed or (Ellipsis) taken away."""
     members = members_of(bundle(2))
     *path, last = name.split(".")
     place = members

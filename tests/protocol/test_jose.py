@@ -211,13 +211,13 @@ def opened(octets, key=RECEIVER):
 
 
 def jwe(**changes):
-    """The members of a good JWE, some of them changed or (Ellipsis) taken away."""
+    """Return the members of a good JWE, some of them changed or (Ellipsis) taken away."""
     members = json.loads(jose.encrypt(PAYLOAD, [RECEIVER.point], cty="JWS")) | changes
     return {name: value for name, value in members.items() if value is not ...}
 
 
 def protected(**changes):
-    """A JWE with other protected members. The tag no longer fits; what is refused must be so before."""
+    """Return a JWE with other protected members. The tag no longer fits; what is refused must be so before."""
     inside = {"alg": "ECDH-ES+A256KW", "enc": "A256GCM", "cty": "JWS"} | changes
     return dump(jwe(protected=encode_base64url(dump({k: v for k, v in inside.items() if v is not ...}))))
 

@@ -58,7 +58,7 @@ def test_the_default_can_address_follows_from_the_uuid() -> None:
 
 
 def new_node(**state: object) -> Tim:
-    """The vectors' node in factory state, with the vectors' nonces in their order of use."""
+    """Return the vectors' node in factory state, with the vectors' nonces in their order of use."""
     drawn = iter([octets("session", "c"), octets("agreement", "nonceN")])
     one_time = iter([key("one_time_node"), SoftwareKey(int(KAT["session"]["En"]["d"], 16))])
     flash = Flash(UUID, key("node").point, octets("sig102", "signature"), can_address=KAT["default_can_address"])

@@ -94,7 +94,7 @@ class ManagedDesk(Desk):
         return self.sealed(security_command(Function.MANAGE, octets), link="can:f1")
 
     def refuses(self, packet: bytes | SmpPacket) -> int | None:
-        """The reason of a refusal; nothing reached the manager then."""
+        """Return the reason of a refusal; nothing reached the manager then."""
         before = len(self.manager.got)
         reply = self.ask(packet)
         assert reply.ok or len(self.manager.got) == before

@@ -27,13 +27,13 @@ def unseal(octets, key=RECEIVER):
 
 
 def whole(octets, key=RECEIVER):
-    """What the reader of whole octets says."""
+    """Return what the reader of whole octets says."""
     signed = jose.decrypt(octets, key, cty="JWS", max_octets=LIMIT)
     return jose.verify_compact(signed, trusts(SENDER), typ="note", max_octets=LIMIT)
 
 
 def number_of(read, octets):
-    """What a reader gives: signer and payload, or the kind of its refusal."""
+    """Return what a reader gives: signer and payload, or the kind of its refusal."""
     try:
         found = read(octets)
     except TedsProvisionError as error:
@@ -163,7 +163,7 @@ JSON = st.recursive(
 
 
 def long_or_whole(octets, window=5):
-    """What both readers of JSON say: they agree, or this fails."""
+    """Return what both readers of JSON say: they agree, or this fails."""
     results = []
     for read in (
         lambda: strict_json.load_object(octets, "It"),

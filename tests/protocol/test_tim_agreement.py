@@ -221,7 +221,7 @@ class AgreementReply:
         self.teds = Desk().flash.security_teds()
 
     def reply(self, *, epoch: int = 1, one_time: SoftwareKey | None = None, signer: SoftwareKey = NODE) -> bytes:
-        """What a node with this key answers; ``signer`` makes sigN alone."""
+        """Return what a node with this key answers; ``signer`` makes sigN alone."""
         payload = self.agreement.request().payload
         pair = one_time or SoftwareKey(23)
         made = NodeAgreement.answer(NODE, UUID, payload, epoch=epoch, teds=self.teds, nonce=bytes(16), one_time=pair)

@@ -29,14 +29,14 @@ Entry = dict[str, Any]
 
 
 def load(name: str) -> Entry:
-    """One file."""
+    """Return one file."""
     document: Entry = json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
     assert document["format"] == "teds1-vectors/1"
     return document
 
 
 def entries(*names: str) -> Iterator[tuple[str, Entry, Entry]]:
-    """Every entry of these files: its id, its file, itself."""
+    """Yield every entry of these files: its id, its file, itself."""
     for name in names:
         document = load(name)
         for entry in document["entries"]:
@@ -44,13 +44,13 @@ def entries(*names: str) -> Iterator[tuple[str, Entry, Entry]]:
 
 
 def cases(*names: str) -> pytest.MarkDecorator:
-    """A test with every entry of these files, and its file."""
+    """Return a test with every entry of these files, and its file."""
     found = list(entries(*names))
     return pytest.mark.parametrize(("document", "entry"), [pytest.param(d, e, id=i) for i, d, e in found])
 
 
 def flash_of(document: Entry, state: Entry) -> Flash:
-    """The flash that a state of a file describes."""
+    """Return the flash that a state of a file describes."""
     node, uuid = SoftwareKey(int(document["keys"]["node"]["d"], 16)), bytes.fromhex(document["uuid"])
     blocks = {(block["channel"], block["access_code"]): block for block in state["blocks"]}
     return Flash(
@@ -120,7 +120,7 @@ class Replay:
 
 
 def point(octets: bytes) -> ec.EllipticCurvePublicKey:
-    """A public key."""
+    """Return a public key."""
     return ec.EllipticCurvePublicKey.from_encoded_point(ec.SECP256R1(), octets)
 
 
@@ -148,7 +148,7 @@ def mac(key: bytes, message: bytes) -> bytes:
 
 
 def unseal(key: bytes, payload: bytes) -> bytes:
-    """The padded inner frame of a Sealed payload."""
+    """Return the padded inner frame of a Sealed payload."""
     return AESCCM(key, tag_length=16).decrypt(bytes(9) + payload[:4], payload[4:], None)
 
 

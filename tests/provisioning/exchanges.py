@@ -58,7 +58,7 @@ _NAMES: Final = {
 
 
 def named(command: Command) -> str:
-    """The name of a command; Open, and Read of the Security TEDS, by their kind."""
+    """Return the name of a command; Open, and Read of the Security TEDS, by their kind."""
     key = command.command_class, command.function
     if key == (128, Function.OPEN):
         return "open" if command.payload else "open c"
@@ -69,7 +69,7 @@ def named(command: Command) -> str:
 
 @contextmanager
 def asked() -> Iterator[list[str]]:
-    """The commands of this process's conversations, in their order; those in a session stand in brackets."""
+    """Yield the commands of this process's conversations, in their order; those in a session stand in brackets."""
     plain = Conversation._exchange
     found: list[str] = []
 

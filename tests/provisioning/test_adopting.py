@@ -37,7 +37,7 @@ ADOPT = BuildOrder(adopt=True)
 
 
 def factory(uuid: bytes = UUID, name: str = "joint", slope: float = 359.9) -> dict[BlockId, bytes]:
-    """What a good maker puts on an angle sensor: its own calibrated datasheet, signed by nobody."""
+    """Return what a good maker puts on an angle sensor: its own calibrated datasheet, signed by nobody."""
     profile = load_profile(ANGLE)
     points = f"# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,{slope}\n"
     return dict(profile.build(uuid, calibration=read_calibrations(points, "x.csv", profile), name=name).blocks)

@@ -38,7 +38,7 @@ def provisioned(station: Station, board: Board, order: BuildOrder) -> ProvisionR
 
 @pytest.fixture
 def calibrated(station: Station, board: Board, tmp_path: Path) -> Path:
-    """A board that is a calibrated angle sensor."""
+    """Return a board that is a calibrated angle sensor."""
     path = tmp_path / "angle.csv"
     path.write_text(DEGREES)
     provisioned(station, board, BuildOrder(ANGLE, path))

@@ -75,7 +75,7 @@ def met(board: Board, link: MemoryLink) -> Conversation:
 
 
 def on_bus(board: Board) -> MemoryLink:
-    """The wired bus of a board that was built without NFC."""
+    """Return the wired bus of a board that was built without NFC."""
     return MemoryLink(board, via="can", tapped=board.tim.flash.state == NodeState.FACTORY)
 
 

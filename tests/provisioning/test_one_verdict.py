@@ -62,7 +62,7 @@ def changed_in_flash(board: Board, block: tuple[int, int] = NAME, *, restart: bo
 
 
 def looked(station: Station, board: Board) -> NodeVerification:
-    """What a measurement does before it claims anything."""
+    """Return what a measurement does before it claims anything."""
     with talk(board, over_the_bus(board)) as node:
         require_session(station, node)
         return verify_in_session(station, node, by="measure")
@@ -74,7 +74,7 @@ def verified(station: Station, board: Board) -> str:
 
 
 def shown(station: Station, board: Board) -> tuple[str | None, str | None]:
-    """The verdict as every screen has it: of the one node, and of it in a list."""
+    """Return the verdict as every screen has it: of the one node, and of it in a list."""
     judged = readings.verdict_of(station, board.uuid)
     (listed,) = inventory(station, [board.uuid])
     word = None if judged is None else judged.verified.verdict

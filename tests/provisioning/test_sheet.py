@@ -151,7 +151,7 @@ CERTIFICATE = "# date: 2026-11-20\nraw,value [N]\n4194304,-500\n12582912,{high}\
 
 
 def finished(station: Station, folder: Path, text: str) -> Progress:
-    """A sheet of one row that has passed, kept on the disk."""
+    """Return a sheet of one row that has passed, kept on the disk."""
     progress = Progress(station.home, read(station, folder, text))
     progress.assign_row(progress.sheet.rows[0], board_of(1))
     progress.rows[1].result = "passed"

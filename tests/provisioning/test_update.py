@@ -299,7 +299,7 @@ INTERRUPTIONS = (
 
 
 def exchanges_of(owner: Owner, folder: Path) -> int:
-    """How many exchanges an update without interruption takes."""
+    """Return how many exchanges an update without interruption takes."""
     bench = UpdateBench.copy_of(owner, folder)
     assert bench.update(owner.long).result == "updated"
     bench.close()

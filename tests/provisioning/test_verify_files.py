@@ -34,7 +34,7 @@ PASSPHRASE = "a passphrase of the tests"
 
 
 def signed(number: int, calibration: Calibration | None = None, *, ca: SoftwareKey = CA) -> Image:
-    """A signed datasheet of node ``number``, the station certified by ``ca``."""
+    """Return a signed datasheet of node ``number``, the station certified by ``ca``."""
     uuid, node = number.to_bytes(10, "big"), SoftwareKey.from_secret((1000 + number).to_bytes(32, "big"))
     profile = load_profile("magnetic-angular-position-sensor")
     blocks = dict(profile.build(uuid, calibration={1: calibration} if calibration else {}).blocks)

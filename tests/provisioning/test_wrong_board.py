@@ -40,7 +40,7 @@ GRIPPER, FORCE = "gripper", "load-cell"
 
 
 def virtual(folder: Path, profile: str) -> VirtualNode:
-    """A factory board with the hardware, and the unsigned datasheet, of a type."""
+    """Return a factory board with the hardware, and the unsigned datasheet, of a type."""
     create(folder, profile=profile)
 
     def board(file: FlashFile) -> Hardware:
@@ -51,7 +51,7 @@ def virtual(folder: Path, profile: str) -> VirtualNode:
 
 @pytest.fixture
 def angle(tmp_path: Path) -> VirtualNode:
-    """A factory angle sensor."""
+    """Return a factory angle sensor."""
     return virtual(tmp_path / "angle", ANGLE)
 
 

@@ -76,7 +76,7 @@ class UpdateBench:
 
     @classmethod
     def copy_of(cls, owner: Owner, folder: Path) -> UpdateBench:
-        """A bench with a copy of the node and of the station."""
+        """Return a bench with a copy of the node and of the station."""
         folder.mkdir(exist_ok=True)
         for name in ("node", "home"):
             shutil.copytree(owner.folder / name, folder / name)

@@ -173,7 +173,7 @@ class Soak:
         self.measured("begin")
 
     def sink(self) -> dict[str, Any]:
-        """The recording of the service."""
+        """Return the recording of the service."""
         with self.asked() as client:
             return dict(next(iter(client.status()["sinks"]), {}))
 

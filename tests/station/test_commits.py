@@ -69,7 +69,7 @@ def watched(tmp_path: Path) -> Iterator[StatementLog]:
 
 @pytest.fixture
 def synced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The files that this process waited for by itself, beside what SQLite does."""
+    """Return the files that this process waited for by itself, beside what SQLite does."""
     names: list[str] = []
     monkeypatch.setattr(
         "os.fdatasync", lambda descriptor: names.append(Path(os.readlink(f"/proc/self/fd/{descriptor}")).name)

@@ -40,7 +40,7 @@ except StoreError as failure:
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """A home that a process left by kill -9: one node in the file, one in its write-ahead log alone."""
+    """Return a home that a process left by kill -9: one node in the file, one in its write-ahead log alone."""
     home = tmp_path / "home"
     with Station.make(home) as store:
         store.nodes.restore(NodeRecord(ONE))

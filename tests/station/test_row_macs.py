@@ -85,7 +85,7 @@ def changed(value: Value) -> Iterator[Value]:
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Home]:
-    """A keeper of a plant with two rows of each kind, restored from a backup, and nothing broken."""
+    """Yield a keeper of a plant with two rows of each kind, restored from a backup, and nothing broken."""
     plant = Plant(tmp_path_factory.mktemp("macs"))
     north = plant.north
     plant.member("south", "base", "sign")

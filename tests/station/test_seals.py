@@ -40,7 +40,7 @@ Open = Callable[..., Station]
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """A station with one pinned node, one trusted station, one trusted CA, and a node of another CA."""
+    """Return a station with one pinned node, one trusted station, one trusted CA, and a node of another CA."""
     forget_vaults()
     made, _ = initialise(tmp_path / "home", name="n", keystore="file", ask=ask, costs=passphrase.THROWAWAY)
     made.pins.put(WhitelistEntry(NODE, fingerprint(POINT), assurance="tap"))

@@ -102,7 +102,7 @@ class Node:
     signed: bytes = b""
 
     def security(self) -> bytes:
-        """The initial Security TEDS."""
+        """Return the initial Security TEDS."""
         me = point(self.identity)
         if not self.signed or self.fault == "field 102 is signed anew for every Read":
             self.signed = signature(self.identity, b"TEDS1 node key\0" + self.uuid + me)
@@ -115,7 +115,7 @@ class Node:
         return framed(b"\x03\x04\0\x80\1\1" + b"".join(bytes([t, len(v)]) + v for t, v in tuples))
 
     def handle(self, frame: bytes, inside: bool = False) -> bytes:
-        """One command frame, one reply frame."""
+        """Return one command frame, one reply frame."""
         class_, function, payload = frame[2], frame[3], frame[6:]
         try:
             if (class_, function) == (1, 2):
@@ -273,12 +273,12 @@ class Station:
         return StationAgreement(key, int.from_bytes(epoch, "big"), mac(m, b"station", script))
 
     def open(self, key: bytes, uuid: bytes, c: bytes) -> tuple[bytes, ec.EllipticCurvePrivateKey]:
-        """The payload of Open."""
+        """Return the payload of Open."""
         own = ec.generate_private_key(CURVE)
         return key_id(key) + point(own) + mac(key, b"station open", uuid, c, point(own)), own
 
     def opened(self, key: bytes, uuid: bytes, opening: bytes, own: ec.EllipticCurvePrivateKey, answer: bytes) -> Keys:
-        """The keys of the session; raises AssertionError where the node's tag is wrong."""
+        """Return the keys of the session; raises AssertionError where the node's tag is wrong."""
         es, en, tag = opening[8:73], answer[:65], answer[65:]
         keys = Keys.of(key, uuid, own, en, es, en)
         assert tag == keys.tag(key, es, en)

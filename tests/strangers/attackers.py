@@ -22,7 +22,7 @@ IDENTIFY = bytes([0, 0, 128, 7, 0, 0])
 
 
 def identity(uuid: bytes, *, state: int = 2, epoch: int = 1, sequence: int = 1, most: int = 2048, can_at: int) -> bytes:
-    """The reply frame to Identify."""
+    """Return the reply frame to Identify."""
     octets = b"\1" + uuid + bytes([state]) + epoch.to_bytes(4, "big") + sequence.to_bytes(4, "big")
     octets += most.to_bytes(2, "big") + bytes([can_at])
     return b"\1" + len(octets).to_bytes(2, "big") + octets
@@ -51,7 +51,7 @@ class Air:
         self.put(0x18DA0000 | station << 8 | node, data, fd=fd)
 
     def hear(self, seconds: float) -> can.Message | None:
-        """The next frame."""
+        """Return the next frame."""
         return self.bus.recv(seconds)
 
     def every(self, seconds: float) -> bool:
@@ -103,7 +103,7 @@ def whole(air: Air, station: int, node: int, body: bytes, *, fd: bool, gap: floa
 
 
 def requests(air: Air, nodes: range) -> Iterator[tuple[int, int, bytes, bool]]:
-    """What stations ask of these nodes: node, station, the frame's data, whether it is FD."""
+    """Yield what stations ask of these nodes: node, station, the frame's data, whether it is FD."""
     while not air.stop.is_set():
         frame = air.hear(0.1)
         if frame is None:
@@ -119,7 +119,7 @@ def requests(air: Air, nodes: range) -> Iterator[tuple[int, int, bytes, bool]]:
 
 
 def body_of(data: bytes) -> bytes | None:
-    """A single frame's body."""
+    """Return a single frame's body."""
     if data[0] >> 4 or not data[0]:
         return data[2 : 2 + data[1]] if data[0] == 0 and len(data) > 8 else None
     return data[1 : 1 + data[0]]
@@ -220,7 +220,7 @@ def flows(node: int) -> Attack:
 
 
 def first_frames() -> Attack:
-    """Messages that begin and never go on."""
+    """Return messages that begin and never go on."""
     return flood(
         lambda n: (
             0x18DA0000 | (0xF1 + n % 7) << 8 | (1 + n % 239),

@@ -23,7 +23,7 @@ def point(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def mac(key: bytes, *parts: bytes) -> bytes:
-    """The first 16 octets."""
+    """Return the first 16 octets."""
     return hmac.new(key, b"".join(parts), hashlib.sha256).digest()[:16]
 
 
@@ -64,7 +64,7 @@ def nonce(counter: int) -> bytes:
 
 
 def seal(key: bytes, counter: int, inner: bytes) -> bytes:
-    """A sealed command or reply, padded as PKCS #7."""
+    """Return a sealed command or reply, padded as PKCS #7."""
     pad = 16 - len(inner) % 16
     return counter.to_bytes(4, "big") + AESCCM(key, 16).encrypt(nonce(counter), inner + bytes([pad]) * pad, None)
 
@@ -80,7 +80,7 @@ def unseal(key: bytes, sealed: bytes) -> tuple[int, bytes]:
 
 
 def message(key: bytes, counter: int, plain: bytes) -> bytes:
-    """A data or Drive message."""
+    """Return a data or Drive message."""
     return counter.to_bytes(4, "big") + AESCCM(key, 8).encrypt(nonce(counter), plain, None)
 
 

@@ -293,7 +293,7 @@ class Node:
         return b""
 
     def raw(self, channel: int, tick: int) -> bytes:
-        """A sensor's sample: the milliseconds of the tick."""
+        """Return a sensor's sample: the milliseconds of the tick."""
         octets = self.channels[channel]["octets"]
         return (tick // 10**6 % 2 ** (8 * octets)).to_bytes(octets, "big")
 

@@ -92,7 +92,7 @@ class Station:
     # -- commands ------------------------------------------------------------------------------------------------------
 
     def raw(self, frame: bytes, *, again: bool = False, seconds: float = 10.0) -> bytes:
-        """One command frame and its reply frame; ``again``: under the transaction of the one before."""
+        """Return one command frame and its reply frame; ``again``: under the transaction of the one before."""
         if not again:
             self.transaction = (self.transaction + 1) % 256
         for _ in range(3):
@@ -134,13 +134,13 @@ class Station:
         self.runs.clear()
 
     def sealed(self, inner: bytes, counter: int | None = None) -> bytes:
-        """The frame of a sealed command."""
+        """Return the frame of a sealed command."""
         assert self.keys is not None
         self.counter = self.counter + 1 if counter is None else counter
         return self.command(0, 128, 4, seal(self.keys.down, self.counter, inner))
 
     def do(self, channel: int, class_: int, function: int, payload: bytes = b"") -> bytes:
-        """An inner command; its payload, or Refused."""
+        """Return an inner command; its payload, or Refused."""
         assert self.keys is not None
         frame = self.sealed(self.command(channel, class_, function, payload))
         counter, inner = unseal(self.keys.up, self.payload(self.raw(frame), True))
@@ -220,7 +220,7 @@ class Station:
 
 
 def identify(group: str, port: int, *, fd: bool, own: int = 0xF7, seconds: float = 1.0) -> list[dict[str, Any]]:
-    """A functional Identify: who is there."""
+    """Return a functional Identify: who is there."""
     found: list[dict[str, Any]] = []
 
     def take(peer: int, body: bytes, _fd: bool) -> None:

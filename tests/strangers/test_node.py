@@ -46,7 +46,7 @@ class StrangerNode:
         return self.hall.nodes[self.name].uuid
 
     def plan(self, fault: str = "", **more: Any) -> Path:
-        """The file that says who it is and what is wrong with it."""
+        """Return the file that says who it is and what is wrong with it."""
         file = FlashFile(self.hall.folder / self.name)
         flash, document = file.load(), json.loads(file.path.read_text())
         file.release()
@@ -177,7 +177,7 @@ def test_a_stranger_among_our_own(fd_angle: StrangerNode, gripper: StrangerNode)
     other = fd_angle.hall.copy("twin")
 
     def disturbed() -> list[object]:
-        """What was lost or late; a machine that is busy costs that, once."""
+        """Return what was lost or late; a machine that is busy costs that, once."""
         first = fd_angle.hall.begin(fd_angle.uuid, gripper.uuid, "--rate", 40, "--trigger")
         first.wait_for('"event":"data"')
         second = fd_angle.hall.begin(fd_angle.uuid, "--rate", 25, can=f"{fd_angle.can}&source=0xF3", station=other)
@@ -200,7 +200,7 @@ def test_a_strangers_actuator_is_set_and_left_safe(gripper: StrangerNode) -> Non
     station = gripper.hall.station
 
     def let_go_too_soon() -> bool:
-        """Whether it was not fed for twice its dead-man: by a command that the machine did not run, once."""
+        """Return True if it was not fed for twice its dead-man: by a command that the machine did not run, once."""
         acting = station.start("--json", "set", gripper.uuid, 1, 0.05, "--dead-man", 500, "--can", gripper.can)
         acting.wait_for('"applied"')
         time.sleep(1.0)

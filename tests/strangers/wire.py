@@ -25,7 +25,7 @@ def padded(octets: bytes, fd: bool) -> bytes:
 
 
 def frames_of(body: bytes, fd: bool) -> list[bytes]:
-    """The frames of one message."""
+    """Return the frames of one message."""
     if len(body) <= 7:
         return [padded(bytes([len(body)]) + body, fd)]
     if fd and len(body) <= 62:
@@ -127,7 +127,7 @@ class Wire:
 
 
 def pieces(message: bytes, fd: bool, drive: bool = False) -> Iterator[tuple[int, bytes]]:
-    """A data message's frames: segment number and octets (operation.md section 6)."""
+    """Yield a data message's frames: segment number and octets (operation.md section 6)."""
     room = (64 if fd else 8) - drive
     for n, at in enumerate(range(0, len(message), room)):
         segment = 0 if n == 0 else (n - 1) % 7 + 1

@@ -57,7 +57,7 @@ def measure(bench: Bench, node: dict[str, Any], where: str, seconds: float) -> d
 
 
 def two_stations(bench: Bench, node: dict[str, Any]) -> dict[str, Any]:
-    """One measures while another, under its own source address, asks who is there."""
+    """Return one measures while another, under its own source address, asks who is there."""
     other = Bench("other")
     words = ["--home", other.home, "--json", "identify", "--via", "can", "--can", f"{CAN}?source=0xF2&node="]
     words[-1] = f"{words[-1]}{node['can_address']}"
@@ -69,7 +69,7 @@ def two_stations(bench: Bench, node: dict[str, Any]) -> dict[str, Any]:
 
 
 def candump(node: dict[str, Any]) -> dict[str, Any]:
-    """What candump sees of one Identify to everyone and one to the node."""
+    """Return what candump sees of one Identify to everyone and one to the node."""
     with process("candump", "-L", "vcan0") as dump:
         time.sleep(3)
         port = CanPort(CAN)
@@ -91,7 +91,7 @@ def quiet(_notice: Notice) -> None:
 
 
 def isotp_socket(rx: int, tx: int) -> socket.socket:
-    """The kernel's ISO-TP between two 29-bit addresses, padded as the contract says."""
+    """Return the kernel's ISO-TP between two 29-bit addresses, padded as the contract says."""
     made = socket.socket(socket.AF_CAN, socket.SOCK_DGRAM, socket.CAN_ISOTP)
     base, options, padding = 106, 1, 0x04  # SOL_CAN_BASE + CAN_ISOTP, CAN_ISOTP_OPTS, CAN_ISOTP_TX_PADDING
     made.setsockopt(base, options, struct.pack("=LLBBBB", padding, 0, 0, 0xCC, 0xCC, 0))
@@ -101,7 +101,7 @@ def isotp_socket(rx: int, tx: int) -> socket.socket:
 
 
 def kernel_asks_our_node(node: dict[str, Any]) -> dict[str, Any]:
-    """The kernel's ISO-TP as a station: a short command, and one whose reply has many frames."""
+    """Return the kernel's ISO-TP as a station: a short command, and one whose reply has many frames."""
     address = node["can_address"]
     with isotp_socket(0x18DA0000 | 0xF3 << 8 | address, 0x18DA0000 | address << 8 | 0xF3) as station:
         station.send(b"\x07" + IDENTIFY)
@@ -114,7 +114,7 @@ def kernel_asks_our_node(node: dict[str, Any]) -> dict[str, Any]:
 
 
 def our_station_asks_the_kernel() -> dict[str, Any]:
-    """The kernel's ISO-TP as a node at 0x55: what we send arrives octet for octet, and the reply comes back."""
+    """Talk to the kernel's ISO-TP as a node at 0x55: what we send arrives octet for octet, and the reply comes back."""
     command = bytes((0, 128, 0, 60)) + (1800).to_bytes(2, "big") + bytes(index % 251 for index in range(1800))
     reply = b"\x01" + (1500).to_bytes(2, "big") + bytes(index % 241 for index in range(1500))
     got: list[bytes] = []
@@ -145,7 +145,7 @@ def link_goes_down_and_comes_back(bench: Bench, node: dict[str, Any]) -> dict[st
 
 
 def bus_off_is_reported(bench: Bench, node: dict[str, Any]) -> dict[str, Any]:
-    """An error frame that says bus-off ends the sessions of the bus; the measurement comes back by itself."""
+    """Return an error frame that says bus-off ends the sessions of the bus; the measurement comes back by itself."""
     later(25, lambda: sh("cansend", "vcan0", "20000040#0000000000000000"))
     return measure(bench, node, CAN, 70)
 

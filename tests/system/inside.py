@@ -68,7 +68,7 @@ class Bench:
 
 @contextmanager
 def process(*words: object) -> Iterator[subprocess.Popen[str]]:
-    """A process that is ended by its id."""
+    """Yield a process that is ended by its id."""
     running = subprocess.Popen([str(word) for word in words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         yield running
@@ -81,7 +81,7 @@ def process(*words: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def program(*words: object) -> list[object]:
-    """The command line as a process of its own."""
+    """Return the command line as a process of its own."""
     return [sys.executable, "-m", "teds_provision", *words]
 
 

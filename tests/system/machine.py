@@ -113,7 +113,7 @@ def _in_order(names: tuple[str, ...]) -> list[str]:
 
 
 def _boot_image(scene: str, modules: tuple[str, ...], folder: Path) -> Path:
-    """The first file system of the kernel: busybox, the modules to reach the host's files, and the scene."""
+    """Return the first file system of the kernel: busybox, the modules to reach the host's files, and the scene."""
     tree = folder / "initrd"
     (tree / "bin").mkdir(parents=True)
     (tree / "lib").mkdir()

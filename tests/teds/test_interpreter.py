@@ -45,7 +45,7 @@ def sheet_of(profile: str, calibrations: dict[int, Calibration] | None = None) -
 
 
 def changed(sheet: Sheet, number: int = 1, **more: object) -> Sheet:
-    """The same sheet with another channel."""
+    """Return the same sheet with another channel."""
     channels = tuple(replace(c, **more) if c.number == number else c for c in sheet.channels)  # type: ignore[arg-type]
     return replace(sheet, channels=channels)
 
@@ -60,7 +60,7 @@ FORMS = st.one_of(
 
 
 def one_number(form: SampleForm, octets: bytes) -> float:
-    """What one sample means, written down as the contract has it."""
+    """Return what one sample means, written down as the contract has it."""
     whole = int.from_bytes(octets, "big")
     match form.model:
         case 1:
@@ -150,7 +150,7 @@ def calibrations(draw: st.DrawFn, inputs: int) -> Calibration:
 
 
 def by_hand(calibration: Calibration, *inputs: float) -> Fraction:
-    """The formula of teds.md ("5 CalTEDS") in exact arithmetic, written down once more."""
+    """Return the formula of teds.md ("5 CalTEDS") in exact arithmetic, written down once more."""
     cell, distances = 0, []
     for part, value in zip(calibration.inputs, inputs, strict=True):
         segment = sum(1 for edge in part.boundaries[1:-1] if value >= edge)
@@ -226,7 +226,7 @@ def test_a_value_beyond_the_limits_by_more_than_the_uncertainty_is_not_valid() -
 
 
 def turned(zero: float, low: float = 0.0, counts: int = 4096) -> Sheet:
-    """The second paper's angle sensor, ``counts`` to a turn, its scale turned by ``zero`` degrees."""
+    """Return the second paper's angle sensor, ``counts`` to a turn, its scale turned by ``zero`` degrees."""
     ends = [(0, 0.0), (counts, 360.0)]
     line = replace(fit(ends, "linear", channel=1), unit=parse_unit("degree"), uncertainty=0.5, zero_offset=zero)
     sheet = sheet_of("magnetic-angular-position-sensor", {1: line})

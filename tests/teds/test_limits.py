@@ -45,14 +45,14 @@ def of_units(exponent: str) -> str:
 
 
 def many_inputs() -> str:
-    """A calibration whose grid of inputs would have 9^40 places."""
+    """Return a calibration whose grid of inputs would have 9^40 places."""
     part = (("ChanNum", 1), ("Degree", 1), ("Boundaries", (0.0, 1.0)), ("Offsets", (0.0,)))
     octets = compose(AccessCode.CALIBRATION, [("CalInput", part)] * 40 + [("Coefs", (1.0, 1.0))])
     return image(json.dumps([{"access_code": 5, "channel": 1, "teds": octets.hex()}]))
 
 
 def steep() -> str:
-    """Two inputs of degree 89: 8,100 terms for each of 250,000 places."""
+    """Return two inputs of degree 89: 8,100 terms for each of 250,000 places."""
     inputs = [(("ChanNum", n), ("Degree", 89), ("Boundaries", (0.0, 65535.0)), ("Offsets", (0.0,))) for n in (1, 2)]
     octets = compose(5, [*(("CalInput", part) for part in inputs), ("Coefs", tuple([1e-9] * 8100))])
     return image(json.dumps([{"access_code": 5, "channel": 1, "teds": octets.hex()}]))
@@ -95,7 +95,7 @@ HOSTILE = {
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
-    """Every hostile file through ``show``, each in its own process with 10 s of processor and bounded memory."""
+    """Return every hostile file through ``show``, each in its own process with 10 s of processor and bounded memory."""
     folder = tmp_path_factory.mktemp("hostile")
     out = {}
     for name, make in HOSTILE.items():

@@ -45,7 +45,7 @@ def never(prompt: str, confirm: bool) -> str:
 
 @pytest.fixture(autouse=True)
 def _no_bus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
-    """Whatever keyring the person who runs the tests has, it is none of ours."""
+    """Yield whatever keyring the person who runs the tests has, it is none of ours."""
     forget_vaults()
     monkeypatch.setenv("DBUS_SESSION_BUS_ADDRESS", f"unix:path={tmp_path}/no-bus")
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -176,7 +176,7 @@ class Session:
 
     @classmethod
     def of_user(cls, home: Path) -> Session:
-        """A user of this machine who never logged in before; skips the test where no keyring is installed."""
+        """Return a user of this machine who never logged in before; skip the test if no keyring is installed."""
         for program in ("dbus-run-session", "gnome-keyring-daemon"):
             if shutil.which(program) is None:
                 pytest.skip(f"{program} is missing: scripts/install-test-packages installs it")

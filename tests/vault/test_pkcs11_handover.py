@@ -23,7 +23,7 @@ pytestmark = pytest.mark.system
 
 @pytest.fixture(scope="module")
 def stations(tmp_path_factory):
-    """Two stations, each with a token of its own."""
+    """Yield two stations, each with a token of its own."""
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("hsm")
         made = []

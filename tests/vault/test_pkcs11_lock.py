@@ -14,7 +14,7 @@ from teds_provision.vault import pkcs11
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The home's .cache, where there is no /run/user of this user."""
+    """Return the home's .cache, where there is no /run/user of this user."""
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     return tmp_path / ".cache"

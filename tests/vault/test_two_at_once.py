@@ -84,7 +84,7 @@ class World:
         self.ran: list[tuple[str, Outcome]] = []
 
     def run(self, name: str, **meanwhile: Callable[[], object]) -> Outcome:
-        """A command, as a process of its own would run it."""
+        """Return a command, as a process of its own would run it."""
         before, current = dict(selection._opened), App.current
         selection._opened.clear()
         running = Running(name, meanwhile)
@@ -104,7 +104,7 @@ class World:
         return done
 
     def answer(self, prompt: str) -> str:
-        """What the person types: what is right when the question comes, however long the answer takes."""
+        """Return what the person types: what is right when the question comes, however long the answer takes."""
         running = self.stack[-1]
         assert running.locks == 0, f"{running.name} asks {prompt!r} and holds the store"
         new = NEW if self.passphrase == PASSPHRASE else PASSPHRASE
@@ -117,7 +117,7 @@ class World:
 
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A station with keys under its second master key, and a backup with one more, under the first."""
+    """Return a station with keys under its second master key, and a backup with one more, under the first."""
     forget_vaults()
     folder = tmp_path_factory.mktemp("prepared")
     station = make_station(folder / "home")

@@ -62,7 +62,7 @@ def asking(*answers: str) -> Callable[[str, bool], str]:
 
 @pytest.fixture
 def home(tmp_path: Path) -> Iterator[Path]:
-    """A station with a key of each of four nodes, one of them with a pending key beside it."""
+    """Yield a station with a key of each of four nodes, one of them with a pending key beside it."""
     forget_vaults()
     station = make_station(tmp_path / "home")
     for uuid in NODES:
@@ -230,7 +230,7 @@ def test_the_vault_is_not_changed_while_another_command_holds_the_store(home: Pa
 
 
 def changed_passphrase(home: Path) -> Station:
-    """The station as a command opens it after the passphrase was changed."""
+    """Return the station as a command opens it after the passphrase was changed."""
     station = opened(home)
     set_it = station.vault.new_passphrase(asking(NEW))
     with station.lock("test"):

@@ -103,7 +103,7 @@ def _kind(value: Any) -> str:
 
 
 def _wider(first: str, other: str) -> str:
-    """The kind that holds both; numbers and objects in the place of one another are told as JSON text."""
+    """Return the kind that holds both; numbers and objects in the place of one another are told as JSON text."""
     if first == other:
         return first
     numbers = {frozenset(("int", "float")): "float", frozenset(("int", "big")): "big"}
@@ -111,13 +111,13 @@ def _wider(first: str, other: str) -> str:
 
 
 def c_name(text: str) -> str:
-    """A member's name in C."""
+    """Return a member's name in C."""
     name = re.sub(r"\W", "_", text)
     return f"n{name}" if name[:1].isdigit() else f"{name}_" if name in _KEYWORDS else name
 
 
 def declarations(name: str, shape: Shape) -> Iterator[str]:
-    """The types of a file, inner ones first."""
+    """Yield the types of a file, inner ones first."""
     if shape.item is not None:
         yield from declarations(name, shape.item)
     for member, inner in shape.members.items():
@@ -153,7 +153,7 @@ class Constants:
         self._number = 0
 
     def value(self, name: str, shape: Shape, value: Any) -> str:
-        """The initializer of a value; what it points to is added to ``rows``."""
+        """Return the initializer of a value; what it points to is added to ``rows``."""
         if value is None:
             return _NOTHING.get(shape.kind, "0")
         if shape.kind == "hex":
@@ -202,7 +202,7 @@ class Constants:
 
 
 def convert(names: list[Path]) -> dict[str, str]:
-    """Every C file by its name."""
+    """Return every C file by its name."""
     header = ["/* Made by python -m tests.vectors.c_arrays. See docs/vectors.md. */", "#ifndef TEDS_VECTORS_H"]
     header += ["#define TEDS_VECTORS_H", "#include <stdbool.h>", "#include <stddef.h>", "#include <stdint.h>", ""]
     header += ["typedef struct {\n    const uint8_t *octets;\n    size_t length;\n} teds_octets;\n"]
@@ -227,7 +227,7 @@ def _type_of(stem: str) -> str:
 
 
 def _content(path: Path) -> Any:
-    """A file, its keys as a list in the place of an object whose members differ from file to file."""
+    """Return a file, its keys as a list in the place of an object whose members differ from file to file."""
     content = json.loads(path.read_text(encoding="utf-8"))
     if isinstance(content.get("keys"), dict) and all(isinstance(key, dict) for key in content["keys"].values()):
         content["keys"] = [{"name": name, **key} for name, key in content["keys"].items()]

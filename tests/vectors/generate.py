@@ -40,7 +40,7 @@ FILES: dict[str, Recipe] = {name: recipe for module in _MODULES for name, recipe
 
 
 def document(name: str) -> str:
-    """The text of one file."""
+    """Return the text of one file."""
     recipe = FILES[name]
     entries = [made.entry() if isinstance(made, Scene) else made for made in recipe()]
     about = " ".join((recipe.__doc__ or "").split())
@@ -49,7 +49,7 @@ def document(name: str) -> str:
 
 
 def differing() -> list[str]:
-    """Names of files that are not what this program would write."""
+    """Return names of files that are not what this program would write."""
     changed = []
     for name in FILES:
         path = FOLDER / f"{name}.json"

@@ -171,7 +171,7 @@ def rotation() -> Iterator[Scene]:
 
 
 def changed_request(**changes: bytes) -> Command:
-    """A Request with parts replaced."""
+    """Return a Request with parts replaced."""
     shown = credentials()
     parts = RequestPayload(shown.key.point, shown.station_signature, shown.ca, key("one_time").point)
     return security_command(Function.REQUEST, replace(parts, **changes).encode())

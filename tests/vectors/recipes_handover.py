@@ -36,19 +36,19 @@ def dump(members: object) -> bytes:
 
 
 def jwk(point: bytes) -> dict[str, str]:
-    """A public key."""
+    """Return a public key."""
     return {"kty": "EC", "crv": "P-256", "x": b64(point[1:33]), "y": b64(point[33:])}
 
 
 def jws(payload: bytes, signer: SoftwareKey, typ: str, **header: Any) -> bytes:
-    """A compact JWS."""
+    """Return a compact JWS."""
     head = {"alg": "ES256", "kid": fingerprint(signer.point), "typ": typ} | header
     signed = f"{b64(dump(head))}.{b64(payload)}".encode()
     return signed + b"." + b64(signer.sign(signed)).encode()
 
 
 def jwe(content: bytes, recipients: Sequence[SoftwareKey], label: str) -> bytes:
-    """A JWE in the General JSON serialization with one-time values that follow from ``label``."""
+    """Return a JWE in the General JSON serialization with one-time values that follow from ``label``."""
     protected = b64(dump({"alg": "ECDH-ES+A256KW", "cty": "JWS", "enc": "A256GCM"}))
     content_key, iv = octets(label, "cek a") + octets(label, "cek b"), octets(label, "iv")[:12]
     info = b"".join(len(part).to_bytes(4, "big") + part for part in (b"ECDH-ES+A256KW", b"", b""))
@@ -72,7 +72,7 @@ def jwe(content: bytes, recipients: Sequence[SoftwareKey], label: str) -> bytes:
 
 
 def payload(to: Sequence[str] = ("second_station",), **changes: Any) -> dict[str, Any]:
-    """The members of a bundle from ``station`` about the node of kat.json."""
+    """Return the members of a bundle from ``station`` about the node of kat.json."""
     receivers = [fingerprint(key(name).point) for name in to]
     made = {
         "format": "teds-handover/1",

@@ -115,14 +115,14 @@ class Tap:
         return self
 
     def piece(self, piece: Piece, note: str, answer: str) -> Piece:
-        """One payload record there and back."""
+        """Return one payload record there and back."""
         reply = self.write(message.encode([tnep.payload_record(piece.encode())]), note, answer)
         payload = tnep.external(message.decode(reply), tnep.TIM_TYPE)
         assert payload is not None
         return Piece.decode(payload)
 
     def exchange(self, command: Command, transaction: int) -> Tap:
-        """One whole command and its reply, in as many pieces as it takes."""
+        """Return one whole command and its reply, in as many pieces as it takes."""
         frame = command.encode()
         requester = Requester(transaction, frame, room(self.mailbox.max_ndef))
         begin = len(self.entry["steps"])
@@ -227,7 +227,7 @@ class Wire:
         self.waiting: list[tuple[str, Frame]] = []
 
     def sender(self, who: str) -> Callable[[Frame], None]:
-        """What ``who`` sends with."""
+        """Return what ``who`` sends with."""
         return lambda frame: self.send(who, frame)
 
     def send(self, who: str, frame: Frame, note: str = "") -> None:
@@ -244,12 +244,12 @@ class Wire:
         self.waiting.append((who, frame))
 
     def next(self) -> tuple[str, Frame] | None:
-        """The oldest frame that was not given out yet."""
+        """Return the oldest frame that was not given out yet."""
         return self.waiting.pop(0) if self.waiting else None
 
 
 def named(data: bytes) -> str:
-    """What an ISO-TP frame is."""
+    """Return what an ISO-TP frame is."""
     names = {0: "single frame", 1: "first frame", 2: "consecutive frame", 3: "flow control"}
     kind = data[0] >> 4
     number = f" {data[0] & 0xF}" if kind == 2 else ""
@@ -257,7 +257,7 @@ def named(data: bytes) -> str:
 
 
 def _transfer(name: str, note: str, command: Command, *, state: str = "factory", fd: bool = False) -> dict[str, Any]:
-    """A whole command and its reply between one pair of addresses."""
+    """Return a whole command and its reply between one pair of addresses."""
     wire, tim = Wire(), node(name, state)
     ends = {
         "station": Pair(STATION_ADDRESS, CAN_ADDRESS, wire.sender("station"), fd=fd),

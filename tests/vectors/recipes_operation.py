@@ -83,7 +83,7 @@ class OperationScene:
         self.sessions.append({**record, "k_m": session.message_key.hex()})
 
     def exchange(self, command: Command, note: str, link: str = F1, *, plain: bool = False) -> OperationScene:
-        """A command and its reply: an inner one of this link's session, or a plain one."""
+        """Return a command and its reply: an inner one of this link's session, or a plain one."""
         reply = self.bench.plain(command, link) if plain else self.bench.send(command, link)
         step = {"at": self.bench.hardware.tick, "link": link, "note": note, "plain": plain}
         step |= {"command": command.encode().hex(), "reply": reply.encode().hex()}
@@ -114,7 +114,7 @@ class OperationScene:
         return self.until(self.bench.hardware.tick + ns, note)
 
     def event(self, channel: int, data_set: bytes, note: str) -> OperationScene:
-        """An event sensor sees something now."""
+        """Return an event sensor sees something now."""
         self.bench.tim.event(channel, self.bench.hardware.tick, data_set)
         self._add({"at": self.bench.hardware.tick, "note": note, "event": channel, "data_set": data_set.hex()})
         return self
@@ -126,7 +126,7 @@ class OperationScene:
         return self
 
     def message(self, message: bytes, note: str, link: str = F1) -> OperationScene:
-        """A Drive message, in classic frames."""
+        """Return a Drive message, in classic frames."""
         pieces = [piece.data for piece in cut(message, fd=False, drive=True)]
         for data in pieces:
             self.bench.tim.drive(link, data)
@@ -143,7 +143,7 @@ class OperationScene:
         self.steps.append(step | ({"hardware": done} if done else {}))
 
     def entry(self) -> dict[str, Any]:
-        """The JSON of it all."""
+        """Return the JSON of it all."""
         head = {"name": self.name, "note": self.note, "tick": self.start, **self.limits}
         return {**head, "sessions": self.sessions, "steps": self.steps}
 

@@ -23,7 +23,7 @@ class Line(Scene):
         self.kept = Repetition()
 
     def send(self, transaction: int, command: Command, note: str, *, functional: bool = False) -> bytes:
-        """A request under a transaction number; written down with whether the node ran it."""
+        """Return a request under a transaction number; written down with whether the node ran it."""
         frame, ran = command.encode(), []
 
         def run(octets: bytes) -> bytes:
@@ -47,7 +47,7 @@ class Line(Scene):
 
 
 def _session(name: str, note: str) -> tuple[Line, Command]:
-    """A line with a session open, and its first Sealed."""
+    """Return a line with a session open, and its first Sealed."""
     line = Line(name, note)
     session = StationSession(K, UUID, one_time=named_key(name, "Es"))
     counter = decode_reply(line.send(0, session.request_counter(), "Open without payload asks for c.")).payload

@@ -29,7 +29,7 @@ Parts = list[tuple[int, bytes]]
 
 
 def parts_of(teds: bytes) -> Parts:
-    """The tuples of a TEDS, TEDSID first."""
+    """Return the tuples of a TEDS, TEDSID first."""
     return [(part.type, part.value) for part in tuples(unframe(teds))]
 
 
@@ -39,7 +39,7 @@ def joined(parts: Parts) -> bytes:
 
 
 def resigned(parts: Parts) -> bytes:
-    """The same tuples with field 100 made anew over them as they are, so that only their form can be refused."""
+    """Return the same tuples with field 100 made anew over them as they are, so that only their form can be refused."""
     unsigned = joined([(kind, value) for kind, value in parts if kind != 100])
     made = base64.b64encode(key("station").sign(security.tbs(UUID, unsigned)))
     return joined([(kind, made if kind == 100 and len(value) == 88 else value) for kind, value in parts])
@@ -65,7 +65,7 @@ def added(number: int, value: bytes, after: int) -> bytes:
 
 
 def spare_bits(number: int) -> bytes:
-    """A base64 field of the good TEDS whose unused last bits are not zero; decodes to the same octets."""
+    """Return a base64 field of the good TEDS whose unused last bits are not zero; decodes to the same octets."""
     value = dict(parts_of(signed())[1:])[number].decode()
     body = value.rstrip("=")
     alphabet = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"

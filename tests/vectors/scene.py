@@ -44,14 +44,14 @@ MORE_NAMES = ("second_station", "foreign_ca", "foreign_station", "one_time_2", "
 
 
 def key(name: str) -> SoftwareKey:
-    """A key of the vectors by name: those of kat.json, and more that follow from their names."""
+    """Return a key of the vectors by name: those of kat.json, and more that follow from their names."""
     if name in NAMES:
         return SoftwareKey(int(KAT[name]["d"], 16))
     return named_key(name)
 
 
 def keys() -> dict[str, Any]:
-    """All of them, as they stand in every file."""
+    """Return all of them, as they stand in every file."""
     return {
         name: {"d": key(name).secret().hex(), "P": key(name).point.hex(), "fingerprint": fingerprint(key(name).point)}
         for name in NAMES + MORE_NAMES
@@ -59,7 +59,7 @@ def keys() -> dict[str, Any]:
 
 
 def named_key(*label: object) -> SoftwareKey:
-    """A one-time key in place of a random one: its scalar follows from a label."""
+    """Return a one-time key in place of a random one: its scalar follows from a label."""
     digest = hashlib.sha256(b"TEDS1 vector key\0" + "/".join(map(str, label)).encode()).digest()
     return SoftwareKey(int.from_bytes(digest, "big") % (GROUP_ORDER - 1) + 1)
 
@@ -70,12 +70,12 @@ def octets(*label: object) -> bytes:
 
 
 def credentials(station: str = "station", ca: str = "ca") -> Credentials:
-    """What a station of the vectors shows."""
+    """Return what a station of the vectors shows."""
     return Credentials(key(station), key(ca).sign(station_key_message(key(station).point)), key(ca).point)
 
 
 def flash(state: str, **changes: Any) -> Flash:
-    """The vectors' node in factory state, keyed (epoch 1, K of kat.json) or provisioned (sequence 1)."""
+    """Return the vectors' node in factory state, keyed (epoch 1, K of kat.json) or provisioned (sequence 1)."""
     node = key("node")
     made = Flash(UUID, node.point, node.sign(node_key_message(UUID, node.point)), can_address=CAN_ADDRESS)
     if state != "factory":
@@ -105,7 +105,7 @@ def signed(
 
 
 def high(signature: bytes) -> bytes:
-    """The same signature with s in the upper half of the group order."""
+    """Return the same signature with s in the upper half of the group order."""
     return signature[:32] + (GROUP_ORDER - int.from_bytes(signature[32:], "big")).to_bytes(32, "big")
 
 
@@ -240,7 +240,7 @@ class Scene:
         return reply
 
     def crafted_open(self, note: str, *, ahead: int = 0, point: bytes | None = None, held: bytes = K) -> Reply:
-        """An Open whose mac is right for the node's c plus ``ahead``, with any point as Es."""
+        """Return an Open whose mac is right for the node's c plus ``ahead``, with any point as Es."""
         counter = self.exchange(
             StationSession(held, UUID).request_counter(), "Open without payload asks for c."
         ).payload
@@ -250,7 +250,7 @@ class Scene:
         return self.exchange(security_command(Function.OPEN, payload), note, crafted=True)
 
     def sealed(self, label: str, command: Command, note: str, **more: Any) -> Reply:
-        """One inner command under the session's next counter."""
+        """Return one inner command under the session's next counter."""
         session, _, link = self.sessions[label]
         outer = self.exchange(session.seal(command), note, **{"link": link} | more)
         self.steps[-1]["inner"] = {"session": label, "command": command.encode().hex()}
@@ -263,7 +263,7 @@ class Scene:
         return reply
 
     def crafted(self, label: str, counter: int, command: Command, note: str) -> Reply:
-        """A sealed frame under any counter, which no good station would send."""
+        """Return a sealed frame under any counter, which no good station would send."""
         _, derived, link = self.sessions[label]
         payload = _seal(derived.to_node, counter, command.encode())
         return self.exchange(security_command(Function.SEALED, payload), note, link=link, crafted=True)
@@ -271,7 +271,7 @@ class Scene:
     # -- the entry -------------------------------------------------------------------------------------------------
 
     def entry(self) -> dict[str, Any]:
-        """The JSON of it all."""
+        """Return the JSON of it all."""
         return {
             "name": self.name,
             "note": self.note,
@@ -287,7 +287,7 @@ class Scene:
 
 
 def described(state: Flash) -> dict[str, Any]:
-    """A flash state in JSON."""
+    """Return a flash state in JSON."""
     return {
         "state": state.state.name.lower(),
         "epoch": state.epoch,

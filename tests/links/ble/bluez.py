@@ -360,7 +360,7 @@ class Bluez:
 
 
 def full(uuid: UUID) -> str:
-    """A UUID as BlueZ writes it."""
+    """Return a UUID as BlueZ writes it."""
     octets = uuid.to_bytes()
     if len(octets) == 16:
         return uuid.to_hex_str("-").lower()

@@ -14,7 +14,7 @@ from tests.places import free_bus
 
 @pytest.fixture
 def group() -> str:
-    """A multicast bus of this test's own, which no frame leaves."""
+    """Return a multicast bus of this test's own, which no frame leaves."""
     return free_bus()
 
 

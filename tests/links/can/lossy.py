@@ -36,7 +36,7 @@ class Faults:
         self.met = dict.fromkeys(KINDS, 0)
 
     def meet(self, message: can.Message) -> list[can.Message]:
-        """The frames that go on instead of this one, those before that were late included."""
+        """Return the frames that go on instead of this one, those before that were late included."""
         out = self.due()
         held, self._held = self._held, None
         kind = self._kind()

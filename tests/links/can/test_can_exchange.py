@@ -266,7 +266,7 @@ def test_a_node_pulled_in_the_middle_of_its_answer_delays_no_other() -> None:
         return sum(identifier == 0x18DBFFF1 for identifier, _ in list(hub.frames))
 
     def between() -> float:
-        """Seconds from one question to everybody to the next but one."""
+        """Return seconds from one question to everybody to the next but one."""
         before, began = asked(), time.monotonic()
         until(lambda: asked() >= before + 2)
         return time.monotonic() - began
@@ -288,7 +288,7 @@ def test_two_nodes_under_one_address_are_a_conflict(hub: Hub) -> None:
     with serving(hub.spec, first), serving(hub.spec, second), opened(hub.spec) as port:
 
         def refused(what: Callable[[], object]) -> bool:
-            """Whether it noticed that two are there; of two answers one may come too late on a busy machine."""
+            """Return True if it noticed that two are there; of two answers one may come too late on a busy machine."""
             try:
                 what()
             except AddressConflictError as conflict:
@@ -384,7 +384,7 @@ def test_another_node_than_the_wanted_is_reported_and_waited_past(hub: Hub) -> N
     with serving(hub.spec, EchoNode(0x21)), opened(spec) as port:
 
         def others() -> list[str]:
-            """What was told instead: a node that had no processor in time is told as none."""
+            """Return what was reported instead: a node without processor time is reported as missing."""
             notices: list[Notice] = []
             with pytest.raises(NoNodeError) as error:
                 port.find(lambda _: False, seconds=1.2, notice=notices.append)

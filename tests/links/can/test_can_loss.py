@@ -30,7 +30,7 @@ def over(group: str, **faults: object) -> str:
 
 
 def tally(port: CanPort, octets: int, count: int) -> int:
-    """How many of so many exchanges come through; a reply that is another is an error at once."""
+    """Return how many of so many exchanges come through; a reply that is another is an error at once."""
     good = 0
     for _ in range(count):
         body = os.urandom(octets)

@@ -47,7 +47,7 @@ def test_the_one_thread_that_waits_reads_and_the_loop_goes_on_after_it(group: st
     bus.listen(listener.heard)
 
     def by_others() -> int:
-        """How many of twenty the loop read: those that came before the one thread waited, on a busy machine."""
+        """Return how many of twenty the loop read: those that came before the one thread waited, on a busy machine."""
         del listener.readers[:]
         for number in range(20):
             threading.Timer(0.02, other.send, [frame(number)]).start()

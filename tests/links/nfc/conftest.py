@@ -77,7 +77,7 @@ StartNode = Callable[..., Process]
 
 @pytest.fixture
 def path() -> str:
-    """A simulated reader that nobody else uses."""
+    """Return a simulated reader that nobody else uses."""
     return free_reader()
 
 

@@ -14,7 +14,7 @@ KINDS = {"f": "float", "u": "uint64", "O": "integer"}
 
 
 def forms() -> list[tuple[DataModel, int]]:
-    """Each data model in the lengths that it may have."""
+    """Return each data model in the lengths that it may have."""
     every = itertools.product(DataModel, (1, 2, 4, 8, 9, 12))
     return [(model, octets) for model, octets in every if not SampleForm(model, octets, 0).problem]
 

@@ -61,7 +61,7 @@ class Peer:
         return [entry["message"] for entry in self.of("message") if entry["topic"] == topic]
 
     def graph(self, ready: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """The graph as this node sees it, as soon as it is so."""
+        """Return the graph as this node sees it, as soon as it is so."""
         found: dict[str, Any] = {}
 
         def look() -> bool:
@@ -94,7 +94,7 @@ class Domain:
 
 @pytest.fixture
 def domain(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A domain in which our own sinks take the rclpy of PyPI, too."""
+    """Yield a domain in which our own sinks take the rclpy of PyPI, too."""
     for name in ("AMENT_PREFIX_PATH", "CYCLONEDDS_URI", "ROS_DISTRO", *sourced._REACH):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv(sourced.CHOSEN, str(PYTHON))

@@ -175,7 +175,7 @@ def test_a_temperature_goes_out_in_degrees_celsius_with_its_variance() -> None:
 
 
 def axes(unit: str, first: int, **more: Any) -> list[ChannelFacts]:
-    """Three channels that the Meta-TEDS calls one vector."""
+    """Return three channels that the Meta-TEDS calls one vector."""
     members = (first, first + 1, first + 2)
     return [
         ChannelFacts(ARM, "arm", n, f"c{n}", units=parse_units(unit), uncertainty=0.3, vector=members, **more)
@@ -326,7 +326,7 @@ def test_each_channel_has_its_own_frame_and_the_deviation_of_its_profile() -> No
 
 
 def gripper() -> list[ChannelFacts]:
-    """An opening that is commanded and measured, and the force of the grip."""
+    """Return an opening that is commanded and measured, and the force of the grip."""
     opening = replace(FORCE, unit="m", units=parse_units("m"))
     return [
         replace(opening, number=1, name="opening set point", kind="actuator"),

@@ -61,7 +61,7 @@ class Broker:
             self.process = None
 
     def heard(self) -> tuple[Any, dict[str, Any]]:
-        """A late comer, and the newest of each topic that it hears."""
+        """Return a late comer, and the newest of each topic that it hears."""
         import paho.mqtt.client as paho
 
         topics: dict[str, Any] = {}
@@ -73,7 +73,7 @@ class Broker:
         return client, topics
 
     def heard_of(self, topic: str) -> tuple[Any, list[str]]:
-        """A client, and all that it hears of one topic."""
+        """Return a client, and all that it hears of one topic."""
         import paho.mqtt.client as paho
 
         heard: list[str] = []
@@ -330,7 +330,7 @@ class TestWithMosquitto:
 
 
 def _tried(make: Any) -> Any:
-    """What a broker gives that may not listen yet."""
+    """Return what a broker gives that may not listen yet."""
     try:
         return make()
     except OSError:

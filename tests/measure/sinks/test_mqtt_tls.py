@@ -54,7 +54,7 @@ class Authority:
         return made.sign(self.key, hashes.SHA256())
 
     def issue(self, name: str, *addresses: str, passphrase: bytes | None = None) -> tuple[Path, Path]:
-        """Files of a certificate and its key."""
+        """Return files of a certificate and its key."""
         key = ec.generate_private_key(ec.SECP256R1())
         names = [x509.IPAddress(ipaddress.ip_address(address)) for address in addresses]
         more = [x509.SubjectAlternativeName(names)] if names else []
@@ -105,7 +105,7 @@ def ports(authority: Authority) -> Iterator[dict[str, int]]:
 
 
 def taken(url: str) -> SinkStats:
-    """How a sink ends that was given values until the broker took one."""
+    """Return how a sink ends that was given values until the broker took one."""
     sink = opened(url)
     until(lambda: (sink.write(block([[7]], [[0.5]], uuid=HAND)), sink.stats.written)[1], sink.stats)
     sink.close()

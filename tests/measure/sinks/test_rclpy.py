@@ -56,7 +56,7 @@ def ports_of(process: int) -> list[str]:
 
 @pytest.fixture(params=["rclpy", "Cyclone DDS"])
 def sink(request: pytest.FixtureRequest, domain: Domain, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A sink of each way, open, running, with what takes its set points."""
+    """Yield a sink of each way, open, running, with what takes its set points."""
     if request.param != "rclpy":
         monkeypatch.delenv(sourced.CHOSEN)
     came: queue.Queue[SetPointCommand] = queue.Queue()

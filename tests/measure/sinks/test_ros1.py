@@ -69,7 +69,7 @@ class Master:
             self.process = None
 
     def echo(self, topic: str) -> subprocess.Popen[str]:
-        """The first message of a topic, as Debian's tool prints it; ended with the master."""
+        """Return the first message of a topic, as Debian's tool prints it; ended with the master."""
         command = ["/usr/bin/python3", "/usr/bin/rostopic", "echo", "-n", "1", topic]
         self.echoes.append(subprocess.Popen(command, env=self.environment, stdout=subprocess.PIPE, text=True))
         return self.echoes[-1]
@@ -94,7 +94,7 @@ class Master:
 
 @pytest.fixture
 def master(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Master]:
-    """A master of this test alone, not started yet."""
+    """Yield a master of this test alone, not started yet."""
     running = Master(tmp_path)
     with _visited(running, monkeypatch):
         yield running
@@ -111,7 +111,7 @@ def _standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Master]:
 
 @pytest.fixture
 def shared(_standing: Master, monkeypatch: pytest.MonkeyPatch) -> Iterator[Master]:
-    """A master that runs for all tests that end none: what a closed sink published is gone from it."""
+    """Yield a master that runs for all tests that end none: what a closed sink published is gone from it."""
     with _visited(_standing, monkeypatch):
         yield _standing
 
@@ -303,7 +303,7 @@ def test_two_stations_of_one_name_do_not_end_each_other(shared: Master) -> None:
 
 @pytest.fixture
 def subscriber(shared: Master) -> Iterator[subprocess.Popen[str]]:
-    """A node that subscribed the group's rows before anybody published them."""
+    """Yield a node that subscribed the group's rows before anybody published them."""
     command = ["/usr/bin/python3", "-s", str(Path(__file__).with_name("ros1_subscriber.py")), "/bench/crane"]
     reader = subprocess.Popen(command, env=shared.environment, stdout=subprocess.PIPE, text=True)
     yield reader

@@ -54,7 +54,7 @@ def test_a_domain_is_a_number(spec: str) -> None:
 
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The other maker's reader, compiled."""
+    """Return the other maker's reader, compiled."""
     program = tmp_path_factory.mktemp("fastdds") / "reader"
     command = ["g++", "-O0", "-o", str(program), str(SOURCE), "-lfastrtps", "-lfastcdr"]
     subprocess.run(command, check=True, timeout=300)
@@ -166,14 +166,14 @@ class TestSeenByFastDds:
 
 
 def in_the_group() -> int:
-    """How many sockets of this machine hear 239.255.0.1, the group of DDS discovery; other programs' too."""
+    """Return how many sockets of this machine hear 239.255.0.1, the group of DDS discovery; other programs' too."""
     rows = [line.split() for line in Path("/proc/net/igmp").read_text().splitlines()]
     return sum(int(row[1]) for row in rows if row[:1] == ["0100FFEF"])
 
 
 def test_nothing_leaves_this_machine_unless_asked(domain: int) -> None:
     def joined() -> int:
-        """How many more hear the group while the sink is open."""
+        """Return how many more hear the group while the sink is open."""
         before = in_the_group()
         sink = open_sink(f"ros2:{domain}")
         sink.open([ANGLE], STATION)

@@ -32,7 +32,7 @@ SAFE_VALUE = (100).to_bytes(2, "big")
 
 
 def channels() -> dict[int, ChannelHardware]:
-    """Those of the vectors: sensors 1, 2, 3, actuators 4 and 6, event sensor 5."""
+    """Return those of the vectors: sensors 1, 2, 3, actuators 4 and 6, event sensor 5."""
     return {
         int(number): ChannelHardware(KINDS[facts["kind"]], facts["octets"], halt=1 if "act" in facts["kind"] else None)
         for number, facts in KAT["channels"].items()
@@ -40,7 +40,7 @@ def channels() -> dict[int, ChannelHardware]:
 
 
 def channel_teds(facts: ChannelHardware, *, period: float | None = None, **changes: int | None) -> bytes:
-    """A TransducerChannel TEDS that says what the hardware is, or something else."""
+    """Return a TransducerChannel TEDS that says what the hardware is, or something else."""
     values = {"kind": int(facts.kind), "model": facts.model, "octets": facts.octets, "halt": facts.halt, **changes}
     block = bytes.fromhex("030400030101") + bytes([11, 1, values["kind"] or 0])
     block += bytes([18, 9, 40, 1, values["model"] or 0, 41, 1, values["octets"] or 0, 42, 1, 8])
@@ -159,14 +159,14 @@ class Bench:
         return self
 
     def send(self, command: Command, link: str = "can:f1", *, left: bool = True) -> Reply:
-        """An inner command."""
+        """Return an inner command."""
         session = self.sessions[link]
         outer = self.plain(session.seal(command), link, left=left)
         assert outer.ok, f"outer refusal {outer.reason}"
         return session.unseal(outer.payload)
 
     def reason(self, command: Command, link: str = "can:f1") -> int | None:
-        """The reason of an inner refusal, None where it is good."""
+        """Return the reason of an inner refusal, None if it is good."""
         reply = self.send(command, link)
         return None if reply.ok else reply.reason
 
@@ -180,7 +180,7 @@ class Bench:
         return self
 
     def operation(self, link: str = "can:f1") -> OperationReply:
-        """What Operation says."""
+        """Return what Operation says."""
         return OperationReply.decode(self.send(Command(0, 128, 19), link).payload)
 
     def idle(self, channel: int = 0, link: str = "can:f1") -> None:

@@ -32,7 +32,7 @@ class Consumer:
         self.taken = len(bench.frames)
 
     def messages(self) -> list[StreamMessage]:
-        """Messages that came whole since the last call."""
+        """Return messages that came whole since the last call."""
         found = []
         for tick, frame in self.bench.frames[self.taken :]:
             address = data_address(frame.identifier)

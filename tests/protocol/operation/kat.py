@@ -15,6 +15,6 @@ WIDTHS = {int(number): facts["octets"] for number, facts in KAT["channels"].item
 
 
 def can_frame(text: str) -> tuple[int, bytes]:
-    """A frame as candump writes it: identifier and data."""
+    """Return a frame as candump writes it: identifier and data."""
     identifier, _, data = text.partition("#")
     return int(identifier, 16), bytes.fromhex(data.lstrip("#"))

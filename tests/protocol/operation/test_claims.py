@@ -35,7 +35,7 @@ IDENTIFY = security_command(Function.IDENTIFY)
 
 
 def safe(bench: Bench, channel: int = 4) -> bool:
-    """Whether the hardware holds the actuator in its safe state."""
+    """Return True if the hardware holds the actuator in its safe state."""
     return bench.hardware.points[channel] == SAFE_VALUE
 
 

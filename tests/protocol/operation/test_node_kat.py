@@ -44,7 +44,7 @@ def load_dice(bench: Bench, opens: int, one_time: SoftwareKey) -> None:
 
 
 def message_key(bench: Bench) -> bytes:
-    """What it derived."""
+    """Return what it derived."""
     session = bench.tim._sessions.on("can:f1")
     assert session is not None
     return session.message_key

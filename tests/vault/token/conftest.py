@@ -27,7 +27,7 @@ def home(tmp_path):
 
 @pytest.fixture
 def store_id(request):
-    """One store per test, so that each test has keys of its own in the token."""
+    """Return one store per test, so that each test has keys of its own in the token."""
     return fingerprint(request.node.name.encode())[:32]
 
 

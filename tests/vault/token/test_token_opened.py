@@ -16,7 +16,7 @@ pytestmark = pytest.mark.system
 
 @pytest.fixture
 def closed(uri, home, store_id):
-    """A vault that nobody has open in this process: the module looks at a PIN only then."""
+    """Return a vault that nobody has open in this process: the module looks at a PIN only then."""
     unload()
     vault = Pkcs11Vault.create(home, store_id, uri, Person())
     vault.close()
