@@ -28,12 +28,12 @@ def _free(kind: socket.SocketKind) -> int:
 
 
 def free_udp_port() -> int:
-    """Return a UDP port of 127.0.0.1 that nobody has."""
+    """Return a UDP port of 127.0.0.1 that is free."""
     return _free(socket.SOCK_DGRAM)
 
 
 def free_tcp_port() -> int:
-    """Return a TCP port of 127.0.0.1 that nobody has."""
+    """Return a TCP port of 127.0.0.1 that is free."""
     return _free(socket.SOCK_STREAM)
 
 
@@ -46,7 +46,7 @@ def free_group() -> str:
 
 
 def free_bus() -> str:
-    """Return a CAN bus over multicast that nobody else is on."""
+    """Return a CAN bus over multicast that no other test uses."""
     return f"udp_multicast:{free_group()}?port={free_udp_port()}"
 
 
@@ -64,7 +64,7 @@ def new_uuid(taken: set[int]) -> bytes:
 
 
 def free_reader() -> str:
-    """Return a simulated NFC reader that nobody else uses."""
+    """Return a simulated NFC reader that no other test uses."""
     return f"udp:localhost:{free_udp_port()}"
 
 

@@ -40,7 +40,7 @@ _TIMES = re.compile(r"\d{4}-\d\d-\d\dT[\d:.]+Z?")
 
 @dataclass(frozen=True)
 class Links:
-    """A reader and a bus that nobody else uses."""
+    """A reader and a bus that no other test uses."""
 
     nfc: str = field(default_factory=free_reader)
     can: str = field(default_factory=free_bus)
@@ -300,7 +300,7 @@ class Station:
         return dict(reply["error"])
 
     def provision(self, via: str = "nfc", *more: object, code: int = 0) -> Any:
-        """Return all of it in one, over one of the desk's links."""
+        """Take all steps in one command, over one of the desk's links."""
         return self.ask("provision", *more, "--yes", *self.desk.links.over(via), code=code)
 
     def tables(self, *, without: tuple[str, ...] = ()) -> dict[str, list[Any]]:

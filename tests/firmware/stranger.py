@@ -401,7 +401,7 @@ class Owner:
         yield from ask(2, mac(okm[16:], b"station" + script))
 
     def open(self) -> Iterator[None]:
-        """Yield a session under the newest key that the node knows; the others go."""
+        """Open a session under the newest key that the node knows; the others go."""
         for key in list(self.keys):
             yield from self.plain(3)
             c, one_time = self.payload, Key(self.dice)

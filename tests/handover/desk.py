@@ -40,7 +40,7 @@ def key_up(station: Station, board: Board, *, name: str | None = None) -> None:
 
 
 def provisioned(station: Station, board: Board, profile: str = "temperature-sensor") -> ProvisionResult:
-    """Return all steps on one board."""
+    """Take all steps on one board."""
     with talk(board) as node:
         return provision(station, node, BuildOrder(profile), operator=AcceptingOperator(), reporter=SilentReporter())
 

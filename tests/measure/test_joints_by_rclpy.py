@@ -51,7 +51,7 @@ class Control:
 
 
 def moves(control: Control, process: Running, opening: float) -> bool:
-    """Return one more cycle of the controller; whether the gripper is where it was sent by now."""
+    """Run one more cycle of the controller; return True if the gripper is where it was sent by now."""
     control.cycle(opening)
     process.read(0.01)
     return any(abs(entry["value"] - opening) < 1e-4 for entry in acted(process))

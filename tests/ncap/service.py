@@ -113,7 +113,7 @@ class Service:
         return str(self.station.ask("ncap", "token", "add", name, *words)["token"])
 
     def raw(self, method: str, path: str, headers: dict[str, str | None] | None = None, body: Any = None) -> Answer:
-        """Return one request as it is said here; a header that is None is left out (Host too)."""
+        """Send one request exactly as given; a header that is None is left out (Host too)."""
         sent_headers: dict[str, str | None] = {"Host": f"127.0.0.1:{self.port}", **(headers or {})}
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE)
         try:

@@ -22,7 +22,7 @@ from tests.places import free_tcp_port
 
 @contextmanager
 def own_cluster() -> Iterator[Cluster]:
-    """Yield a running server of one's own; skip the test if Debian's `postgresql` is missing."""
+    """Yield a running server for this test; skip the test if Debian's `postgresql` is missing."""
     found = programs()
     if found is None:
         pytest.skip("no PostgreSQL 15 here (scripts/install-test-packages)")

@@ -83,7 +83,7 @@ class Desk:
         return LineRun(self.line, take_job(self.line, document), calibrations=calibrations, office=self.at_hand)
 
     def request(self, run: LineRun, built_board: Board) -> SignRequest:
-        """Return a good request for a board, as its line makes it, which nobody answers."""
+        """Return a good request for a board, as its line makes it, which is not answered."""
         self.at_hand.away = True
         with pytest.raises(OfficeSilentError):
             build(run, built_board)

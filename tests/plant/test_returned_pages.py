@@ -32,7 +32,7 @@ class Loss(Office):
         self.south = self.member("south", "base")
 
     def leaver(self, *roles: Role) -> Station:
-        """Return a station that wrote two pages and that everybody has heard."""
+        """Return a station that wrote two pages and that all stations have heard."""
         west = self.member("west", *roles)
         for _ in range(2):
             self.write(west)

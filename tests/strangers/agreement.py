@@ -115,7 +115,7 @@ class Node:
         return framed(b"\x03\x04\0\x80\1\1" + b"".join(bytes([t, len(v)]) + v for t, v in tuples))
 
     def handle(self, frame: bytes, inside: bool = False) -> bytes:
-        """Return one command frame, one reply frame."""
+        """Answer one command frame with one reply frame."""
         class_, function, payload = frame[2], frame[3], frame[6:]
         try:
             if (class_, function) == (1, 2):

@@ -92,7 +92,7 @@ class Station:
     # -- commands ------------------------------------------------------------------------------------------------------
 
     def raw(self, frame: bytes, *, again: bool = False, seconds: float = 10.0) -> bytes:
-        """Return one command frame and its reply frame; ``again``: under the transaction of the one before."""
+        """Send one command frame and return its reply frame; ``again``: under the transaction of the one before."""
         if not again:
             self.transaction = (self.transaction + 1) % 256
         for _ in range(3):
@@ -140,7 +140,7 @@ class Station:
         return self.command(0, 128, 4, seal(self.keys.down, self.counter, inner))
 
     def do(self, channel: int, class_: int, function: int, payload: bytes = b"") -> bytes:
-        """Return an inner command; its payload, or Refused."""
+        """Send an inner command; return its payload, or raise NodeRefusalError."""
         assert self.keys is not None
         frame = self.sealed(self.command(channel, class_, function, payload))
         counter, inner = unseal(self.keys.up, self.payload(self.raw(frame), True))

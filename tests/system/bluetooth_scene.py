@@ -27,7 +27,7 @@ class Air:
         self._running = running
 
     def ask(self, words: Any) -> Any:
-        """Return one line there, one back."""
+        """Send one line and return the line that comes back."""
         self._running.stdin.write(json.dumps(words) + "\n")
         self._running.stdin.flush()
         return json.loads(self._running.stdout.readline())

@@ -57,7 +57,7 @@ def measure(bench: Bench, node: dict[str, Any], where: str, seconds: float) -> d
 
 
 def two_stations(bench: Bench, node: dict[str, Any]) -> dict[str, Any]:
-    """Return one measures while another, under its own source address, asks who is there."""
+    """Measure with one station while another, under its own source address, asks who is there."""
     other = Bench("other")
     words = ["--home", other.home, "--json", "identify", "--via", "can", "--can", f"{CAN}?source=0xF2&node="]
     words[-1] = f"{words[-1]}{node['can_address']}"

@@ -115,14 +115,14 @@ class Tap:
         return self
 
     def piece(self, piece: Piece, note: str, answer: str) -> Piece:
-        """Return one payload record there and back."""
+        """Send one payload record and return the reply."""
         reply = self.write(message.encode([tnep.payload_record(piece.encode())]), note, answer)
         payload = tnep.external(message.decode(reply), tnep.TIM_TYPE)
         assert payload is not None
         return Piece.decode(payload)
 
     def exchange(self, command: Command, transaction: int) -> Tap:
-        """Return one whole command and its reply, in as many pieces as it takes."""
+        """Send one whole command and return its reply, in as many pieces as it takes."""
         frame = command.encode()
         requester = Requester(transaction, frame, room(self.mailbox.max_ndef))
         begin = len(self.entry["steps"])
@@ -257,7 +257,7 @@ def named(data: bytes) -> str:
 
 
 def _transfer(name: str, note: str, command: Command, *, state: str = "factory", fd: bool = False) -> dict[str, Any]:
-    """Return a whole command and its reply between one pair of addresses."""
+    """Send a whole command and its reply between one pair of addresses."""
     wire, tim = Wire(), node(name, state)
     ends = {
         "station": Pair(STATION_ADDRESS, CAN_ADDRESS, wire.sender("station"), fd=fd),

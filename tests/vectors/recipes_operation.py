@@ -83,7 +83,7 @@ class OperationScene:
         self.sessions.append({**record, "k_m": session.message_key.hex()})
 
     def exchange(self, command: Command, note: str, link: str = F1, *, plain: bool = False) -> OperationScene:
-        """Return a command and its reply: an inner one of this link's session, or a plain one."""
+        """Send a command: an inner one of this link's session, or a plain one."""
         reply = self.bench.plain(command, link) if plain else self.bench.send(command, link)
         step = {"at": self.bench.hardware.tick, "link": link, "note": note, "plain": plain}
         step |= {"command": command.encode().hex(), "reply": reply.encode().hex()}
@@ -114,7 +114,7 @@ class OperationScene:
         return self.until(self.bench.hardware.tick + ns, note)
 
     def event(self, channel: int, data_set: bytes, note: str) -> OperationScene:
-        """Return an event sensor sees something now."""
+        """Let an event sensor see something now."""
         self.bench.tim.event(channel, self.bench.hardware.tick, data_set)
         self._add({"at": self.bench.hardware.tick, "note": note, "event": channel, "data_set": data_set.hex()})
         return self
@@ -126,7 +126,7 @@ class OperationScene:
         return self
 
     def message(self, message: bytes, note: str, link: str = F1) -> OperationScene:
-        """Return a Drive message, in classic frames."""
+        """Send a Drive message, in classic frames."""
         pieces = [piece.data for piece in cut(message, fd=False, drive=True)]
         for data in pieces:
             self.bench.tim.drive(link, data)

@@ -51,7 +51,7 @@ def key(name: str) -> SoftwareKey:
 
 
 def keys() -> dict[str, Any]:
-    """Return all of them, as they stand in every file."""
+    """Return all of them, as they are in every file."""
     return {
         name: {"d": key(name).secret().hex(), "P": key(name).point.hex(), "fingerprint": fingerprint(key(name).point)}
         for name in NAMES + MORE_NAMES
@@ -240,7 +240,7 @@ class Scene:
         return reply
 
     def crafted_open(self, note: str, *, ahead: int = 0, point: bytes | None = None, held: bytes = K) -> Reply:
-        """Return an Open whose mac is right for the node's c plus ``ahead``, with any point as Es."""
+        """Send an Open whose mac is right for the node's c plus ``ahead``, with any point as Es."""
         counter = self.exchange(
             StationSession(held, UUID).request_counter(), "Open without payload asks for c."
         ).payload
@@ -250,7 +250,7 @@ class Scene:
         return self.exchange(security_command(Function.OPEN, payload), note, crafted=True)
 
     def sealed(self, label: str, command: Command, note: str, **more: Any) -> Reply:
-        """Return one inner command under the session's next counter."""
+        """Send one inner command under the session's next counter."""
         session, _, link = self.sessions[label]
         outer = self.exchange(session.seal(command), note, **{"link": link} | more)
         self.steps[-1]["inner"] = {"session": label, "command": command.encode().hex()}
@@ -263,7 +263,7 @@ class Scene:
         return reply
 
     def crafted(self, label: str, counter: int, command: Command, note: str) -> Reply:
-        """Return a sealed frame under any counter, which no good station would send."""
+        """Send a sealed frame under any counter, which no good station would send."""
         _, derived, link = self.sessions[label]
         payload = _seal(derived.to_node, counter, command.encode())
         return self.exchange(security_command(Function.SEALED, payload), note, link=link, crafted=True)

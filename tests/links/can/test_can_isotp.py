@@ -348,7 +348,7 @@ def bits_of(fields: str) -> str:
 
 
 def stuff_bits_of(bits: str) -> int:
-    """Return one more after five equal bits, stuffed bits counted in; read from ISO 11898-1 clause 10.5 bit by bit."""
+    """Add one bit after five equal ones, stuffed bits counted in; read from ISO 11898-1 clause 10.5 bit by bit."""
     out = ""
     for bit in bits:
         out += bit

@@ -77,7 +77,7 @@ StartNode = Callable[..., Process]
 
 @pytest.fixture
 def path() -> str:
-    """Return a simulated reader that nobody else uses."""
+    """Return a simulated reader that no other test uses."""
     return free_reader()
 
 
