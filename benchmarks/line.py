@@ -134,15 +134,15 @@ def least(files: Path, ca: Path, rows: int = 60) -> tuple[float, float, float]:
 
 def _signed(path: Path) -> list[tuple[bytes, bytes, bytes]]:
     """Return key, signature in DER and digest of the four checks of a document."""
-    one = ready(read(path.read_bytes()))
-    document, shown = one.evidence, one.shown
+    signed = ready(read(path.read_bytes()))
+    document, shown = signed.evidence, signed.shown
     assert shown is not None
     assert shown.station_key is not None
     assert shown.signature is not None
     raw = (
         (shown.node_key, node_key_message(document.uuid, shown.node_key), shown.node_key_signature),
-        (shown.station_key, one.datasheet, shown.signature),
-        (document.node, one.board, document.proof),
+        (shown.station_key, signed.datasheet, shown.signature),
+        (document.node, signed.board, document.proof),
     )
     checks = [(document.station, document.signature, hashlib.sha256(pae(document.payload)).digest())]
     for point, message, octets in raw:

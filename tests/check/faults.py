@@ -482,7 +482,7 @@ FAULTS: Final[dict[str, FaultyNode]] = {
     "FAULT_STMIN_IGNORED": FaultyNode(
         "STmin ignored", "can-flow-obeyed", "STmin 50 ms was asked for", more_bends.stmin_ignored, over="can"),
     "FAULT_WAIT_IGNORED": FaultyNode(
-        "a flow control that says wait taken for go on", "can-flow-obeyed", "that says wait", more_bends.wait_is_go_on,
+        "a flow control that says wait taken for go on", "can-flow-obeyed", "with Wait", more_bends.wait_is_go_on,
         over="can"),
     "FAULT_SHORT_FIRST_FRAME": FaultyNode(
         "a first frame of 7 octets", "can-lengths", "a first frame of 7 octets", more_bends.short_first_frame,

@@ -246,10 +246,10 @@ def test_while_another_station_measures_it_nothing_is_signed(hall: Hall, angle: 
     sequence = hall.ask("calibrate", "zero", "angle", 1, "--dry-run")["sequence"]
     elsewhere = hall.begin("angle", "--rate", 20, can=f"{hall.can}&source=0xF4", station=hall.copy("other"))
     here = hall.begin("angle", "--rate", 20)
-    for running, said in ((here, "by pid"), (elsewhere, "by another station, source address 0xF4")):
+    for running, reason in ((here, "by pid"), (elsewhere, "by another station, source address 0xF4")):
         running.wait_for('"event":"data"')
         refused = hall.ask("calibrate", "zero", "angle", 1, code=6)["error"]
-        assert f"is being measured {said}" in refused["message"]
+        assert f"is being measured {reason}" in refused["message"]
         running.signal(2)
         assert running.end().code == 0
     assert hall.ask("calibrate", "zero", "angle", 1)["sequence"] == sequence + 1

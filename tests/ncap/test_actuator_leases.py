@@ -14,10 +14,10 @@ class Events:
     """What a page would be told."""
 
     def __init__(self) -> None:
-        self.said: list[str] = []
+        self.states: list[str] = []
 
     def event(self, kind: str, **facts: object) -> None:
-        self.said.append(str(facts["state"]))
+        self.states.append(str(facts["state"]))
 
 
 @pytest.mark.parametrize(
@@ -33,5 +33,5 @@ def test_no_set_point_of_a_topic_moves_an_actuator_until_its_request_has_ended(
     leases._held["ab", 1] = held
     for _ in range(2):
         assert leases.admits(SetPointCommand("ab", 1, 0.5, 0.0)) is admitted
-    assert events.said == ([] if admitted else ["refused"]), "told once"
+    assert events.states == ([] if admitted else ["refused"]), "reported once"
     assert leases.admits(SetPointCommand("ab", 2, 0.5, 0.0))

@@ -94,14 +94,14 @@ def test_a_battery_is_charged_in_the_field_and_emptied_outside() -> None:
 def test_what_could_not_be_sent_is_reported_to_the_last_when_all_streams_have_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every ten seconds while one runs; nothing was left to do then, and what was missed last was told by nobody."""
-    made, told = (
+    """Every ten seconds while one runs; nothing was left to do then, and what was missed last was never reported."""
+    made, messages = (
         create(tmp_path / "node", uuid=bytes(range(10)), profile="magnetic-angular-position-sensor"),
         list[str](),
     )
     sheet = Sheet.from_image(Image(made.load().uuid, dict(made.load().blocks)))
     made.release()
-    node = VirtualNode(tmp_path / "node", board=lambda _file: Board(sheet, notify=told.append))
+    node = VirtualNode(tmp_path / "node", board=lambda _file: Board(sheet, notify=messages.append))
     counts = iter((1, 3, 4))
     running = iter((True, True, False))
     monkeypatch.setattr(Tim, "missed", property(lambda _tim: next(counts)))
@@ -109,4 +109,4 @@ def test_what_could_not_be_sent_is_reported_to_the_last_when_all_streams_have_en
     for wait in (0.1, 0.1, None):
         monkeypatch.setattr(Tim, "poll", lambda _tim, wait=wait: wait)
         node.beat()
-    assert [line.split()[0] + line[-4:] for line in told] == ["1(1).", "3(4)."]
+    assert [line.split()[0] + line[-4:] for line in messages] == ["1(1).", "3(4)."]

@@ -29,7 +29,9 @@ def await_start(lab: Lab) -> str:
     """Wait until the one virtual transducer runs: a page that feeds it while it starts is refused after ten seconds."""
     with client.connect(home=lab.station.home) as station:
         [made] = until(
-            lambda: [one for one in station.request("GET", "/virtual")["virtual"] if one["state"] == "running"]
+            lambda: [
+                virtual for virtual in station.request("GET", "/virtual")["virtual"] if virtual["state"] == "running"
+            ]
         )
     return str(made["uuid"])
 

@@ -73,18 +73,18 @@ def test_names_of_topics_are_kept_each_once(station: Station) -> None:
 
 
 def test_a_node_in_the_place_of_another_has_its_names_and_frames_and_keeps_its_own(station: Station) -> None:
-    told = station.measurements
+    names = station.measurements
     for uuid, channel, name in ((ONE, 0, "crane"), (ONE, 1, "slew"), (TWO, 1, "boom"), (THREE, 1, "hook")):
-        told.rename(uuid, channel, name)
-        told.set_frame(uuid, channel, f"{name} frame")
-    done = told.hand_on(ONE, TWO)
-    assert told.names == {(TWO, 0): "crane", (ONE, 1): "slew", (TWO, 1): "boom", (THREE, 1): "hook"}
-    assert told.frames == {(TWO, 0): "crane frame", (TWO, 1): "boom frame", (THREE, 1): "hook frame"}
+        names.rename(uuid, channel, name)
+        names.set_frame(uuid, channel, f"{name} frame")
+    done = names.hand_on(ONE, TWO)
+    assert names.names == {(TWO, 0): "crane", (ONE, 1): "slew", (TWO, 1): "boom", (THREE, 1): "hook"}
+    assert names.frames == {(TWO, 0): "crane frame", (TWO, 1): "boom frame", (THREE, 1): "hook frame"}
     assert done.topics == ("crane",)
     assert done.kept == ("The topic name 'slew' of channel 1: the new node has the name 'boom'.",)
-    told.hand_on(TWO, None)
-    assert told.names == {(ONE, 1): "slew", (THREE, 1): "hook"}
-    assert told.frames == {(THREE, 1): "hook frame"}
+    names.hand_on(TWO, None)
+    assert names.names == {(ONE, 1): "slew", (THREE, 1): "hook"}
+    assert names.frames == {(THREE, 1): "hook frame"}
 
 
 def test_how_nodes_are_detected_is_kept(station: Station, home: Path) -> None:
