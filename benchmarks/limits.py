@@ -145,6 +145,6 @@ def _found(octets: Callable[[Sizes], float]) -> Callable[[Sizes], float]:
 
 
 TYPE4 = Limit(lambda sizes: type4_finding() + type4(sizes), type4_waits, type4_in_two_steps)
-# What a node waits before it answers everyone is drawn at random: each tells its own (benchmarks.nodes).
+# What a node waits before it answers everyone is drawn at random: each prints its own (benchmarks.nodes).
 CLASSIC = Limit(_found(classic), lambda _: 0.0, classic)
 FD = Limit(_found(fd), lambda _: 0.0, fd)

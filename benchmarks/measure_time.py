@@ -131,7 +131,7 @@ class Bench:
             measuring.start()
             while job.measurement is None or not job.measurement.supervisors:
                 time.sleep(0.01)
-            time.sleep(1.5)  # it asked, nobody answered: it waits
+            time.sleep(1.5)  # it asked and got no answer: it waits
             offset = job.measurement._host.present[1]
             began, nodes = time.monotonic(), self._power(uuids)
             stack.callback(nodes.wait)

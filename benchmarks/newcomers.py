@@ -357,7 +357,7 @@ def one_after_the_other(on: Scene, joins: int) -> None:
         taken.append(came - announced)
         wired.append(on.wire.seconds(announced, came, address=address)[0])
         on.leaves(joiner)
-        time.sleep(1.0)  # as somebody who takes it off and puts it back: it is asked for meanwhile
+        time.sleep(1.0)  # as if a person took it off and put it back: it is asked for meanwhile
     taken.sort()
     on.rows.add(f"one joins {BASE}, first value after its Announce, p50", median(taken) * 1e3, "ms")
     p95 = taken[-max(1, round(0.05 * joins))]
@@ -400,7 +400,7 @@ def many(on: Scene, count: int, seconds: float, kind: str) -> None:
     on.rows.add("  measured until the last one's first value", elapsed, "s")
     on.rows.add("  of it the wire was taken by commands and replies", 100 * talk / elapsed, "%")
     on.rows.add("  and by data of those that were in", 100 * data / elapsed, "%")
-    time.sleep(5.0)  # that it runs is told after its first values, where all begin at once
+    time.sleep(5.0)  # that it runs is reported after its first values if all begin at once
     states = [report["state"] for report in on.here.measurements()[0]["nodes"]]
     on.rows.add(f"  measured of {count}", states.count("running"), "", aim=count, least=True)
     on.rows.add("  memory of the station", memory(on.ncap), "MB", aim=MEMORY + MEMORY_OF_A_NODE * count)

@@ -138,7 +138,7 @@ def test_a_recovery_key_that_openssl_made(home: Path, tmp_path: Path) -> None:
     assert restore(new, path)[0] == 2
     assert restore(new, path, "--recovery-key", str(private))[0] == 7
     code, _ = restore(new, path, "--recovery-key", str(private), passphrase="words of the key")
-    assert code == 6  # whose backup it is, only the fingerprint tells
+    assert code == 6  # only the fingerprint shows whose backup it is
     code, plan = restore(new, path, "--recovery-key", str(private), "--yes", passphrase="words of the key")
     assert (code, plan["action"]) == (0, "rebuilt")
 
@@ -200,7 +200,7 @@ def test_killed_in_the_middle_of_a_merge_the_store_is_old_or_new(home: Path, sea
         )
         os.close(read)
         assert process.stderr is not None
-        process.stderr.readline()  # the plan is told: the merge is next
+        process.stderr.readline()  # the plan is printed: the merge is next
         time.sleep(delay)
         process.kill()
         process.communicate()

@@ -224,7 +224,7 @@ class Node:
         links = self.desk.links
         where = [*(["--nfc", links.nfc] if nfc else []), *(["--can", links.can] if can else [])]
         self.process = self.desk.start("--json", "node", "run", self.folder, *where, *options, **more)
-        ready = self.process.wait_for_lines(1)[0]  # an actuator tells its state soon after
+        ready = self.process.wait_for_lines(1)[0]  # an actuator prints its state soon after
         assert ready.get("ready") is True, ready
         return self
 

@@ -66,7 +66,7 @@ def test_a_trial_build_is_not_written_by_the_next_plain_provision(station: Stati
     assert node.octets == before
     station.ask("draft", "drop", node.uuid)
     ended = results(station.provision("nfc"))
-    assert ended.pop("check") == "skipped"  # it does not measure: nobody asks its hardware
+    assert ended.pop("check") == "skipped"  # it does not measure: its hardware is not asked
     assert set(ended.values()) == {"done", "nothing to do"}
     assert node.octets == before
     station.ask("build", node.uuid, "--profile", ANGLE, "--name", "wanted after all")

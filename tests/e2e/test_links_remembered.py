@@ -43,7 +43,7 @@ def test_a_node_is_found_where_it_was_met_last_and_the_program_alone_says_who_is
     assert [(node["name"], node["verdict"]) for node in events["nodes"]] == [(ARM, "authentic")], "by its last bus"
     assert shlex.split(events["next"]) == ["teds-provision", "measure", ARM], "as it would be typed"
     assert station.ask("verify", ARM)["verdict"] == "authentic", "no link is named"
-    # the bus that somebody names goes before the one that is remembered, and is remembered from then on
+    # a named bus goes before the remembered one, and is remembered from then on
     node.stop()
     desk.links = type(desk.links)(desk.links.nfc, free_bus())
     node.start(nfc=False, can=True)

@@ -20,7 +20,7 @@ from .desk import ANGLE, ROOT, Links, Running, Station
 
 pytestmark = pytest.mark.link
 BOARDS = 6
-SAID = 8.0  # seconds after the last frame in which a lost board would be told
+SAID = 8.0  # seconds after the last frame in which a lost board would be reported
 
 
 @pytest.fixture

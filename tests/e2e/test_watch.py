@@ -27,7 +27,7 @@ def test_node_after_node_is_provisioned_as_it_is_tapped(desk: Desk, station: Sta
         assert (done["uuid"], done["verdict"]) == (node.uuid, "authentic")
         node.stop()
     ended = results(done)
-    assert ended.pop("check") == "skipped"  # it does not measure: nobody asks its hardware
+    assert ended.pop("check") == "skipped"  # it does not measure: its hardware is not asked
     assert set(ended.values()) == {"done", "nothing to do"}
     watch.signal(signal.SIGTERM)
     outcome = watch.end()
@@ -116,7 +116,9 @@ def test_several_readers_serve_several_taps_and_a_slow_board_delays_no_other(des
     desk.links = Links(nfc=ports[1], can=desk.links.can)
     quick.start()
     assert quick.process is not None
-    quick.process.signal(signal.SIGSTOP)  # it is not there yet: when it is to come, nobody waits for its start
+    quick.process.signal(
+        signal.SIGSTOP
+    )  # it is not there yet: when it is to come, the test need not wait for its start
     desk.links = Links(nfc=ports[0], can=desk.links.can)
     slow.start("--crypto-delay", "700")
     watch = station.start(*words)

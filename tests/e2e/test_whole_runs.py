@@ -43,7 +43,7 @@ def test_a_tapped_node_is_provisioned_and_a_second_run_finds_nothing_to_do(
     done = station.provision("nfc", "--profile", FINGER, "--name", "left index")
     assert list(results(done)) == STEPS
     ended = results(done)
-    assert ended.pop("check") == "skipped"  # it does not measure: nobody asks its hardware
+    assert ended.pop("check") == "skipped"  # it does not measure: its hardware is not asked
     assert set(ended.values()) == {"done"}
     assert done["uuid"] == node.uuid
     assert done["verdict"] == "authentic"
@@ -62,7 +62,7 @@ def test_a_node_that_has_only_a_bus_is_provisioned_from_factory_state(station: S
     node.start(nfc=False, can=True)
     done = station.provision("can", "--profile", ANGLE)
     ended = results(done)
-    assert ended.pop("check") == "skipped"  # it does not measure: nobody asks its hardware
+    assert ended.pop("check") == "skipped"  # it does not measure: its hardware is not asked
     assert set(ended.values()) == {"done"}
     assert done["verdict"] == "authentic"
     (entry,) = station.ask("whitelist", "list")["whitelist"]

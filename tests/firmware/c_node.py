@@ -47,7 +47,7 @@ class CNode:
             words += ["--images", self.folder / "images", "--owner", public(key, "raw"), "--image", image]
             words += ["--security-counter"]
         self.process = self.desk.start(*words, program=(str(builds.host()),), fork=False, **more)
-        ready = self.process.wait_for_lines(1)[0]  # an actuator tells its state soon after
+        ready = self.process.wait_for_lines(1)[0]  # an actuator prints its state soon after
         assert ready.get("ready") is True, ready
         return self
 

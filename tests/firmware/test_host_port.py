@@ -166,7 +166,7 @@ def test_an_actuator_is_set_held_and_goes_safe(desk: Desk, station: Station, nod
         return set(station.ask("mode", node.uuid, *rival)["channels"][0]["state"])
 
     until(lambda: state() == {"actuator", "claimed by other"})
-    held.process.kill()  # nobody goes on: the dead-man runs out
+    held.process.kill()  # no station goes on: the dead-man runs out
     held.end()
     until(lambda: state() == {"actuator", "safe", "stopped"})
 

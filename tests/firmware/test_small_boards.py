@@ -220,7 +220,7 @@ def test_a_datasheet_that_its_slot_does_not_hold_is_10_and_the_old_one_stays() -
 
 def test_if_the_old_slot_cannot_be_erased_a_write_and_a_reset_are_11() -> None:
     desk = CDesk()
-    desk.provision()  # nobody polled: the old slot is to be erased by whoever needs it
+    desk.provision()  # not polled: the next write has to erase the old slot
     desk.open()
     desk.node.fails(True)
     assert desk.stage((1, 12), NAME).reason == Reason.FLASH_FAILURE

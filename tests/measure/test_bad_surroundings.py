@@ -98,7 +98,7 @@ def test_a_reader_that_stalls_holds_up_no_recording(hall: Hall, tmp_path: Path) 
     file = tmp_path / "run.csv"
     running = hall.begin(hall.nodes["a"].uuid, "--rate", 500, "--to", file)
     running.wait_for('"event":"data"')
-    until = time.monotonic() + PATIENCE  # nobody reads its lines from here on: the pipe is full after a second
+    until = time.monotonic() + PATIENCE  # its lines are not read from here on: the pipe is full after a second
     before = rows(file)
     while rows(file) < before + 2000:
         assert time.monotonic() < until, "the recording went on"

@@ -258,7 +258,7 @@ def beside_announcements(hall: Hall, uuid: str, address: int) -> float:
 
 
 def test_a_node_that_a_stranger_moves_to_another_address_is_measured_on(hall: Hall) -> None:
-    best_of(3, 10, lambda: moved(hall))  # seconds: it announced itself, and nobody waited for the next look at the bus
+    best_of(3, 10, lambda: moved(hall))  # seconds: its Announce is enough, without the next look at the bus
 
 
 def moved(hall: Hall) -> float:

@@ -65,7 +65,7 @@ class SameHandoverError(Exception):
 
 
 class LostRequestError(Exception):
-    """A wrong Confirm made the node forget the Request in its RAM: in the model a step of its own, at any time."""
+    """A wrong Confirm made the node forget the Request in its RAM: a separate step in the model, at any time."""
 
 
 @dataclass
@@ -483,7 +483,7 @@ class Desk:
         assert key is not None
         assert self._number_of(key) in self.held(step.station)
         with self.talk(step.station) as node:
-            node.open(key)  # open_session would note, too, which key it was: in the model a step of its own
+            node.open(key)  # open_session would note, too, which key it was: a separate step in the model
             try:
                 write(station, node, signed.image)
             except PolicyError:

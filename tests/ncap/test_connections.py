@@ -62,7 +62,7 @@ def test_a_head_and_a_body_that_do_not_end_cost_the_connection(monkeypatch: pyte
     async def work(connect: Callable[[], Awaitable[Pair]]) -> None:
         second = await connect()
         await asyncio.sleep(0.05)  # the server has it
-        monkeypatch.setattr(server, "HEAD", 0.2)  # for whoever comes, and whoever has been answered, from now on
+        monkeypatch.setattr(server, "HEAD", 0.2)  # for new and for answered connections from now on
         monkeypatch.setattr(server, "BODY", 0.2)
         mute, head, body = [await connect() for _ in range(3)]
         head[1].write(GET + b"X: ")

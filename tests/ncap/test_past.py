@@ -75,7 +75,7 @@ def test_gaps_invalid_and_lost_samples_are_distinguished() -> None:
     past = History()
     past.block(block(NOW - 8, [[1.0, 5.0]] * 100, index=0))
     past.block(block(NOW - 5, [[1.0, 5.0]] * 100, index=300, valid=[[False, True]] * 100))  # 200 were lost before it
-    past.block(block(NOW - 4, [[1.0, 5.0]] * 100, index=0, run=1))  # begun anew: nothing was lost
+    past.block(block(NOW - 4, [[1.0, 5.0]] * 100, index=0, run=1))  # begun again: nothing was lost
     first, second = (past.channel_history(NODE, number, NOW - 60, NOW) for number in (1, 2))
     by_second = {at - NOW: place for place, at in enumerate(first["time"]) if first["bin"] == 1.0}
     if not by_second:  # the minute: in 10 ms

@@ -391,7 +391,7 @@ def test_systemd_hears_when_it_is_ready_that_it_lives_and_when_it_ends(desk: Des
         systemd.bind(str(where))
         systemd.settimeout(60)
 
-        def listen() -> None:  # all the time: a socket that is full holds up whoever writes to it
+        def listen() -> None:  # all the time: a full socket blocks its writer
             while b"STOPPING=1" not in heard:
                 heard.append(systemd.recv(100))
 
@@ -429,7 +429,7 @@ def test_a_store_that_a_newer_version_brought_forward_ends_the_service_in_words(
     home, process = lab.service.station.home, lab.service.process
     assert process is not None
     with closing(sqlite3.connect(home / "store.sqlite3", isolation_level=None)) as newer:
-        newer.execute("BEGIN")  # as a newer version does it: nobody sees one change without the other
+        newer.execute("BEGIN")  # as a newer version does it: no reader sees one change without the other
         newer.execute("ALTER TABLE nodes RENAME COLUMN name TO called")
         newer.execute(f"PRAGMA user_version={SCHEMA_VERSION + 1}")
         newer.execute("COMMIT")

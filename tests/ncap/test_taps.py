@@ -54,7 +54,7 @@ def test_a_provisioning_waits_for_the_tap_and_every_step_is_reported(desk: Desk)
         assert (found["name"], verdict(found), found["via"]) == ("crane", "authentic", "nfc")
         node.stop()
         until(lambda: not asked.node(node.uuid)["present"])
-        node.start()  # a tap that nobody asked for anything: it is looked at
+        node.start()  # a tap without a request: it is looked at
         until(lambda: asked.node(node.uuid)["present"])
     service.end()
 

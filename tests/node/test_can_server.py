@@ -239,7 +239,7 @@ def test_moves_away_from_a_smaller_crc_and_ends_the_sessions_there(
     station: RawStation, server: CanServer, node: EchoNode, hub: Hub
 ) -> None:
     assert len(station.ask(0x21, b"\x09" + COUNT)) == 1
-    station.bus.send(Frame(0x18DAF122, b"\x30\x00\x00"))  # somebody at 0x22 is heard
+    station.bus.send(Frame(0x18DAF122, b"\x30\x00\x00"))  # a station at 0x22 is heard
     station.bus.send(Frame(0x1CFF0021, Announce(0x21, 0, zlib.crc32(node.uuid) - 1).encode()))
     assert wait_for(lambda: node.address == 0x23)
     assert wait_for(lambda: any(announce.address == 0x23 for announce in announces(hub)))

@@ -293,7 +293,7 @@ def test_iio_scans_come_from_the_buffer(sysfs: Callable[..., Path], tmp_path: Pa
 
 def test_a_buffer_that_may_not_be_used_is_left_alone(sysfs: Callable[..., Path], tmp_path: Path) -> None:
     folder = sysfs(**ACCELEROMETER)
-    (tmp_path / "dev" / "iio:device0").mkdir()  # cannot be read, whoever runs this test
+    (tmp_path / "dev" / "iio:device0").mkdir()  # cannot be read by any user
     (folder / "buffer" / "length").unlink()
     (folder / "buffer" / "length").mkdir()
     messages: list[str] = []

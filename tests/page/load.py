@@ -35,9 +35,9 @@ class Load:
     seconds: float
     heap: tuple[int, ...]
     received: int  # points that the page took in
-    dropped: int  # messages that it was too slow for, as it tells
+    dropped: int  # messages that it was too slow for, by its own count
     drawn: int
-    left_out: int  # drawings, as it tells
+    left_out: int  # drawings, by its own count
     sampled: int  # by the station, of all channels that it measures
     lost: int  # between node and station
 
@@ -76,7 +76,7 @@ def run(browser: Browser, lab: Lab, seconds: float) -> Load:
             heaps.append(heap(devtools))
             sampled, lost = samples(station)
             station.request("DELETE", f"/measurements/{kept}", {})
-            page.wait_for_timeout(1500)  # the page tells of itself once a second
+            page.wait_for_timeout(1500)  # the page reports once a second
             counts, elapsed = counts_of(page), time.monotonic() - began
     return Load(
         elapsed, tuple(heaps), counts["received"], counts["dropped"], counts["drawn"], counts["skipped"], sampled, lost

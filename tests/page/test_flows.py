@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.system
 HOSTILE = '<img src=x onerror="document.title=1">"; DROP'
-TURNED = "\u202egrab\u200b"  # what turns the direction of writing, and what nobody sees
+TURNED = "\u202egrab\u200b"  # turns the direction of writing, and is invisible
 
 
 def received(page: Page) -> int:

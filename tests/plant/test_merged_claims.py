@@ -423,7 +423,7 @@ def test_a_ban_counts_from_a_keeper_and_from_who_has_the_key(four: list[Speaker]
         "another board"
     )
     theirs = seal_revocation(keep.key, uuid=A, node=PIN, why="lost", created=NOW)
-    base.page(base.event("revoked", A, statement=theirs.statement))  # carried by somebody else
+    base.page(base.event("revoked", A, statement=theirs.statement))  # carried by another station
     assert Reader(roster_of(four), pages_of(four)).view(A).bans
     keep.page(keep.event("lifted", None, of=event.hash_of_statement(theirs.statement)))
     assert not Reader(roster_of(four), pages_of(four)).view(A).bans

@@ -86,7 +86,7 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
                 assert "are missing here" in found.why
                 found = found._replace(why=due_verdict.why)
             assert found == due_verdict
-    for speaker in speakers:  # said anew, nothing changes
+    for speaker in speakers:  # repeated, it changes nothing
         recount(station, station.plant.pages.chain(speaker.fingerprint), roster)
     assert merged_views(station, roster, NODES) == seen
     assert plant.apply_pages.heads_digest(station)[1] == sum(

@@ -36,7 +36,7 @@ def test_no_frame_is_taken_for_an_announce_that_is_none(identifier: int, data: b
 @pytest.mark.parametrize(
     ("identifier", "data"),
     [
-        (0x1CFF0000, "0100000000010000"),  # nobody's address
+        (0x1CFF0000, "0100000000010000"),  # the address of no station
         (0x1CFF00F0, "0100000000010000"),  # a station's address
         (0x1CFF2021, "0100000000010000"),  # a data frame
         (0x1CFF0021, "0200000000010000"),  # another version

@@ -366,7 +366,7 @@ def test_the_last_counter_is_served_and_ends_the_session() -> None:
     desk = Desk().agree().open()
     session = desk.session
     assert session is not None
-    session._counter = 0xFFFFFFFE  # nobody waits for four thousand million frames
+    session._counter = 0xFFFFFFFE  # four thousand million frames would take too long
     assert desk.sealed(COMMANDS["identify"]).ok
     assert desk.plain(COMMANDS["sealed"]) == refusal(Reason.WRONG_STATE)
 

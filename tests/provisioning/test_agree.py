@@ -388,7 +388,7 @@ def test_a_lost_store_is_healed_by_a_tap_if_identity_and_ca_were_kept(station: S
     run(station, board)
     station.keys.remove(board.uuid)
     with pytest.raises(PolicyError, match="has a key that this station does not hold"):
-        run(station, board)  # whose key it is nobody knows: a person says that it is nobody else's
+        run(station, board)  # the owner of the key is unknown: a person states that it has no other
     assert run(station, board, rotate=True).epoch == 2
 
 

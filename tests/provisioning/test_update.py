@@ -321,7 +321,7 @@ def interrupted(owner: Owner, folder: Path, interruption: Callable[[UpdateBench,
     bench.station.close()
     bench.station = Station.open(folder / "home", ask=lambda prompt, confirm: PASSPHRASE)
     again = [bench.update(new, wait=2.0)]
-    if again[0].result == "reverted":  # power failed on trial, and nothing had been told
+    if again[0].result == "reverted":  # power failed on trial, and nothing had been reported
         again.append(bench.update(new, wait=2.0))
     assert again[-1].result in ("updated", "already"), (again, first)
     assert bench.runs == (new.version_text, False, False)

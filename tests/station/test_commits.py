@@ -45,7 +45,7 @@ class StatementLog:
         last, waits = "", True
         for statement in self.statements:
             word = statement.split(maxsplit=1)[0]
-            if word in _CHANGES and statement != last:  # SQLite tells a statement once more for its trigger
+            if word in _CHANGES and statement != last:  # SQLite traces a statement once more for its trigger
                 rows += 1
                 open_rows += 1
             elif word == "COMMIT":
@@ -96,7 +96,7 @@ def test_the_key_is_on_the_disk_before_its_confirmation_leaves_and_the_sequence_
     slowly = threading.Event()
 
     def synced(descriptor: int) -> None:
-        slowly.wait(0.2)  # nobody sets it: a slow disk
+        slowly.wait(0.2)  # never set: a slow disk
         plain(descriptor)
         steps.append("on the disk")
 

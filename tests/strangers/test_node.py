@@ -311,7 +311,7 @@ def test_a_node_that_is_busy_for_ever_is_reported_and_delays_no_other(
     assert ran([line for line in lines if line.get("uuid") == gripper.uuid]) == ["running", "ended"]
     whys = [line["why"] for line in lines if line["event"] == "status" and line["uuid"] == fd_angle.uuid]
     assert any("it is busy" in why and "again in 1 s, giving up in" in why for why in whys), whys
-    # Its datasheet is read all the same, and nobody vouches for it.
+    # Its datasheet is read all the same, without proof.
     words = ["verify", fd_angle.uuid, "--via", "can", "--can", fd_angle.can]
     verified = hall.station.ask(*words, code=5)
     assert verified["verdict"] == "unproven"

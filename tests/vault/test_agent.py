@@ -149,7 +149,7 @@ def test_the_process_keeps_its_secret(home: Path) -> None:
     locked = next(line for line in (proc / "status").read_text().splitlines() if line.startswith("VmLck"))
     assert int(locked.split()[1]) >= 4
     assert PASSPHRASE.encode() not in (proc / "cmdline").read_bytes()
-    with suppress(PermissionError):  # to whoever is not root it does not even tell that
+    with suppress(PermissionError):  # other users than root do not even see that
         assert {os.readlink(proc / "fd" / str(number)) for number in (0, 1, 2)} == {"/dev/null"}
 
 

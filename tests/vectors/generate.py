@@ -24,7 +24,7 @@ from . import (
 )
 from .scene import FOLDER, KAT, Scene, keys
 
-logging.getLogger("isotp").setLevel(logging.CRITICAL)  # it tells of every flow control that came late
+logging.getLogger("isotp").setLevel(logging.CRITICAL)  # it logs every flow control that came late
 FORMAT = "teds1-vectors/1"
 Recipe = Callable[[], Iterator[Any]]
 _MODULES = (

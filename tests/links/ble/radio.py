@@ -130,7 +130,7 @@ class Radio:
 
     def _start(self, words: list[str]) -> subprocess.Popen[str]:
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
-        quiet = subprocess.DEVNULL if words[0] == "dbus-daemon" else None  # it tells that it may not open 65536 files
+        quiet = subprocess.DEVNULL if words[0] == "dbus-daemon" else None  # it warns that it may not open 65536 files
         process = subprocess.Popen(
             words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=quiet, text=True, env=environment, cwd=ROOT
         )

@@ -119,10 +119,10 @@ def test_agreed_at_the_reader_and_written_over_the_air(desk: Desk, bench: Statio
     assert {("Request", "nfc"), ("Write", "ble"), ("Update", "ble")} <= links
     assert ("Write", "nfc") not in links
     assert ("Request", "ble") not in links
-    # while it is carried away: nobody needs the reader any more
+    # while it is carried away: the reader is not needed any more
     again = bench.ask("provision", "--profile", ANGLE, "--yes", "--via", "ble")
     ended = results(again)
-    assert ended.pop("check") == "skipped"  # it does not measure: nobody asks its hardware
+    assert ended.pop("check") == "skipped"  # it does not measure: its hardware is not asked
     assert set(ended.values()) == {"done", "nothing to do"}
     assert ended["write"] == "nothing to do"
     assert bench.ask("verify", node.uuid, *both)["verdict"] == "authentic"

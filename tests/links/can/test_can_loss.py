@@ -154,7 +154,7 @@ def test_an_order_is_sent_again_after_a_quarter_and_a_half_and_given_up_at_the_e
     best_of(5, 1.2, with_every_reply_lost, because="0.8 s are the wait itself")
     hub.frames.clear()
     with pytest.raises(LinkError):
-        link.exchange_within(write(bytes(20)), 0.8)  # whose flow control is lost: it is begun anew until then
+        link.exchange_within(write(bytes(20)), 0.8)  # whose flow control is lost: it is begun again until then
 
     def sent() -> int:
         return sum(identifier == 0x18DA21F1 for identifier, _ in list(hub.frames))

@@ -175,7 +175,7 @@ def test_two_stations_of_one_address_are_noticed_and_named(hub: Hub, nodes: Star
     ours, theirs, other = CanPort(hub.spec), CanPort(hub.spec), CanPort(hub.spec + "&source=0xF2")
     other.link(0x22).exchange(write(b"abc"))
     ours.link(0x21).exchange(write(b"abc"))
-    assert not ours.bus().conflicts.seen_within()  # a station of another address is nobody's rival
+    assert not ours.bus().conflicts.seen_within()  # a station of another address conflicts with none
     theirs.link(0x22).exchange(write(b"abcdefgh"))
     notices: list[Notice] = []
     ours.find_all(seconds=2, notice=notices.append)

@@ -93,7 +93,7 @@ def test_python_can_hears_us_and_we_hear_it(group: str) -> None:
 
 @pytest.mark.parametrize("filtered", [True, False])
 def test_our_own_frames_do_not_come_back(monkeypatch: pytest.MonkeyPatch, group: str, filtered: bool) -> None:
-    if not filtered:  # another system than Linux: told by the sender
+    if not filtered:  # another system than Linux: recognised by the sender
         monkeypatch.setattr(multicast, "_drop_own", lambda receiving, own: None)
     spec = parse_spec(group)
     bus, other = Bus(spec), Bus(spec)

@@ -170,7 +170,7 @@ def test_a_lease_lives_by_any_good_sealed_frame_and_is_one_per_session() -> None
 
 def test_a_frame_after_the_lease_does_not_revive_it() -> None:
     bench = Bench().open().operate(1, lease=1)
-    bench.hardware.tick += 1 * SECOND  # nobody polled
+    bench.hardware.tick += 1 * SECOND  # not polled
     assert bench.reason(read_data_set(1)) == Reason.WRONG_STATE
 
 

@@ -108,7 +108,7 @@ def test_a_missing_doubled_or_swapped_frame_drops_its_message_and_no_other(data:
     assembly = StreamAssembly(length, fd=False)
     whole = [assembly.add_segment(*piece) for piece in (*pieces[0], *hurt, *pieces[2])]
     found = [message for message in whole if message is not None]
-    harmless = fault == "doubled" and at in (0, len(pieces[1]) - 1)  # segment 0 begins anew; after the last is nothing
+    harmless = fault == "doubled" and at in (0, len(pieces[1]) - 1)  # segment 0 begins again; after the last is nothing
     assert found == (messages if harmless else [messages[0], messages[2]])
     assert assembly.broken >= (0 if harmless else 1) if fault != "missing" or at else True
 
