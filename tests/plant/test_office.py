@@ -203,8 +203,8 @@ def test_an_office_counts_the_boards_that_it_signed_before_their_line_reports(de
     found = attempts_of(desk.office, run.job.id, [row.document])
     (part,) = yield_stats(desk.office, run.job, found)
     assert (part.units, part.passed, part.attempts) == (2, 2, 2), "one by its evidence, the other by its page"
-    later = replace(found[0], uuid=board(3).uuid, attempt=2)  # of the first nothing was heard
-    failed = replace(found[0], uuid=board(4).uuid, code="no-node")
+    later = replace(found[0], uuid=make_board(3).uuid, attempt=2)  # of the first nothing was heard
+    failed = replace(found[0], uuid=make_board(4).uuid, code="no-node")
     (part,) = yield_stats(desk.office, run.job, [*found, later, failed, replace(failed, attempt=2, code=None)])
     assert (part.units, part.passed, part.first, part.first_pass) == (4, 4, 2, 0.5)
 
