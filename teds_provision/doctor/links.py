@@ -22,22 +22,20 @@ from teds_provision.lazy import late
 from teds_provision.links.ble.ble_errors import POWER_HINT
 from teds_provision.links.ble.bluez import AdapterFacts, adapters
 from teds_provision.links.ble.spec import BleSpec, parse_spec
+from teds_provision.links.can import bus as can_bus
+from teds_provision.links.can import spec as can_spec
+from teds_provision.links.nfc import pcsc_readers
 from teds_provision.links.nfc.usb_listing import READERS, usb_ids
 from teds_provision.links.ports import free_port
 
 if TYPE_CHECKING:
-    from teds_provision.links.can import bus as can_bus
     from teds_provision.links.can import bus_multiplexer
-    from teds_provision.links.can import spec as can_spec
-    from teds_provision.links.nfc import pcsc_readers
     from teds_provision.links.nfc import reader as nfc_reader
     from teds_provision.links.nfc import tag as nfc_tag
 else:
-    # python-can, nfcpy and pyserial: only if such a link was given, or PC/SC answers
-    can_bus, can_spec = late("teds_provision.links.can.bus"), late("teds_provision.links.can.spec")
+    # nfcpy and pyserial, and what shares a bus: only if such a link was given
     bus_multiplexer = late("teds_provision.links.can.bus_multiplexer")
     nfc_reader, nfc_tag = late("teds_provision.links.nfc.reader"), late("teds_provision.links.nfc.tag")
-    pcsc_readers = late("teds_provision.links.nfc.pcsc_readers")
 
 _ARPHRD_CAN: Final = 280  # linux/if_arp.h
 _IFF_UP: Final = 1

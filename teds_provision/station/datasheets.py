@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import fields
 from datetime import UTC, datetime
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from teds_provision import teds
 from teds_provision.errors import BadDataError
-from teds_provision.lazy import late
 from teds_provision.station.firmware_reports import FirmwareReports
 from teds_provision.station.nodes import Nodes
 from teds_provision.station.store.database import places
@@ -23,11 +23,6 @@ from teds_provision.station.store.store import Store
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.image import BlockId, Image
-
-if TYPE_CHECKING:
-    from teds_provision.teds import sheet
-else:  # the tables of all TEDS: a list decodes none
-    sheet = late("teds_provision.teds.sheet")
 
 _BLOCK = struct.Struct(">HBI")
 _MAX_OCTETS = 64 << 20
@@ -255,7 +250,7 @@ def _first_due(image: Image) -> str | None:
     """Return the day (ISO 8601) on which the first calibration of a datasheet ends, None if none does."""
     if not any(code == AccessCode.CALIBRATION for _, code in image):
         return None
-    ends = [channel.due for channel in sheet.Sheet.from_image(image).channels if channel.due is not None]
+    ends = [channel.due for channel in teds.sheet.Sheet.from_image(image).channels if channel.due is not None]
     return min(ends).strftime("%Y-%m-%d") if ends else None
 
 
