@@ -1,1 +1,1 @@
-"""What is measured: provisioning end to end, the codec, handovers, many nodes; run by the bench targets of make."""
+"""Benchmarks: provisioning end to end, the codec, handovers, many nodes; run by the bench targets of make."""

@@ -1,9 +1,9 @@
-"""What a user waits for: the shipped commands as processes of their own, from start to verdict.
+"""Waiting times of a user: the shipped commands as separate processes, from start to verdict.
 
 ``python -m benchmarks.commands [--only WORD] [--nodes 200]``: start-up, what a command costs that is neither link nor
 node nor Argon2id, one ``provision`` warm and cold (nothing compiled yet), ``--watch`` with boards that change at once,
 eight readers, a whole bus. Passphrase and Argon2id as shipped, but where many run side by side. Slow nodes take 80 ms
-for every point operation; beside them stands the floor, operations counted × 80 ms.
+for every point operation; beside them is the floor, operations counted × 80 ms.
 """
 
 from __future__ import annotations
@@ -292,7 +292,7 @@ def _changed_at_once(process: subprocess.Popen[str], watch: subprocess.Popen[str
 
 
 def _next_board(watch: subprocess.Popen[str]) -> bool:
-    """Read lines until one tells of a board."""
+    """Read lines until one reports a board."""
     assert watch.stdout is not None
     for text in watch.stdout:
         line = json.loads(text)

@@ -1,6 +1,6 @@
 """How much of the house a task passes through: modules entered by each of five verbs, own functions called.
 
-``python -m benchmarks.entered``; `make house` prints its last line. One node over NFC in a process of its own is
+``python -m benchmarks.entered``; `make house` prints its last line. One node over NFC in a separate process is
 provisioned in this one, from the look for a tag to the verdict. Then ``identify``, ``verify``, ``measure`` and
 ``export-keys`` run whole, from their words to their exit code, against a node on a CAN bus. Only calls of functions of
 ours are counted.
@@ -108,7 +108,7 @@ def verbs(folder: Path) -> Iterator[tuple[str, Counter[str]]]:
 
 
 def main() -> None:
-    """Provision and run the verbs, count, tell."""
+    """Provision, run the verbs, count them and print the result."""
     secret = secrets.token_hex(8)
     calls: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:

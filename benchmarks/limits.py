@@ -1,4 +1,4 @@
-"""What no tool can beat: how long the octets of an exchange occupy its link, and the waits that the contract demands.
+"""Limits that no tool can beat: how long an exchange's octets occupy its link, and the waits of the contract.
 
 Seconds, from (request, reply) sizes. Of a CAN bus a question counts with its answer; of a Type 4 tag the activation,
 the initial message, selecting and leaving the service, and t_wait before each answer (docs/contract, "NFC").

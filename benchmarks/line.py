@@ -1,9 +1,9 @@
 """A line's figures: evidence beside the bare signature checks, signatures of an office a second, boards an hour.
 
 Run: ``python -m benchmarks.line [FILES]`` (default 10,000; about two minutes). Evidence is checked by the shipped
-command on all cores, from its start to its last line; theirs is what ``openssl speed ecdsap256`` says of this machine
-now, times four (envelope, fields 100 and 102, the board's proof). The office answers requests that are signed and
-proven by as many boards, in memory and on one core: build, guard, compare, sign, durable. A line builds boards in
+command on all cores, from its start to its last line; theirs is what ``openssl speed ecdsap256`` measures on this
+machine now, times four (envelope, fields 100 and 102, the board's proof). The office answers requests that are signed
+and proven by as many boards, in memory and on one core: build, guard, compare, sign, durable. A line builds boards in
 memory with and without a job and evidence, in turn.
 
 No Python program comes near the bare checks: beside ours stands what the libraries alone need for one file, in turns in

@@ -1,11 +1,11 @@
 """A line of eight readers with jobs, an office behind PostgreSQL, and evidence, beside the same without them.
 
 ``python -m benchmarks.line_readers [--readers 8] [--boards 64] [--pace] [--crypto-delay MS]``: a line station and an
-office, each in a home of its own, joined to a registry on a server of the bench's own; the shipped commands, as
-processes: ``signer run``, and ``provision --watch`` over all readers, once with ``--profile`` alone at a station that
-signs itself, once with ``--job``. On a reader the next board lies as soon as the line about the last one is out. Nodes,
-server, office and line share this machine's cores: so beside boards an hour stands what the processor did for each
-board, by the line alone and by everybody. ``--pace`` makes a frame take what it takes at 106 kbit/s.
+office, each in its own home, joined to a registry on the bench's server; the shipped commands, as processes: ``signer
+run``, and ``provision --watch`` over all readers, once with ``--profile`` alone at a station that signs itself, once
+with ``--job``. On a reader the next board comes as soon as the line about the last one is out. Nodes, server, office
+and line share this machine's cores: so beside boards an hour is what the processor did for each board, by the line
+alone and by all processes. ``--pace`` makes a frame take what it takes at 106 kbit/s.
 """
 
 from __future__ import annotations

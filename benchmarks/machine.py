@@ -1,4 +1,4 @@
-"""What this machine does, told beside every figure in seconds: such a figure holds for its machine alone.
+"""Speed of this machine, printed beside every figure in seconds: such a figure holds for its machine alone.
 
 ``python -m benchmarks.machine`` prints the line by itself.
 """

@@ -1,7 +1,7 @@
 """A large machine for ten minutes: 20 nodes of 25 channels at 100 Hz on two FD buses into text, MCAP and one ROS array.
 
 Run: ``python -m benchmarks.measure_load [--seconds 600] [--nodes 1 5 20]``; the largest size runs for all of
-``seconds``, the others for a tenth. The nodes' CPU is not counted: a process of its own seals the messages of all of
+``seconds``, the others for a tenth. The nodes' CPU is not counted: another process seals the messages of all of
 them, two streams a node, and puts their frames on two CAN FD buses (udp_multicast) at their times. The station's side
 is the product's: ports, hearing threads, streams, the grid of the group, sinks; ROS is Cyclone DDS, its array alone.
 Counted is the CPU of this whole process (user and system). Sessions are left out, so clocks are known to 2 µs.
@@ -131,7 +131,7 @@ def feed(specs: list[str], nodes: int, began: int, messages: int) -> None:
 
 @dataclass
 class Load:
-    """What a run of one size came to; ``lags``: blocks by the time from their oldest tick to the sinks, 0.1 ms each."""
+    """Result of a run of one size; ``lags``: blocks by the time from their oldest tick to the sinks, 0.1 ms each."""
 
     nodes: int
     seconds: float

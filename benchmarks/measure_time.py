@@ -93,7 +93,7 @@ def _sender(server: CanServer, node: VirtualNode) -> Callable[[DataFrame], None]
 
 @dataclass
 class SizeResult:
-    """What one size came to; seconds."""
+    """Result of one size; seconds."""
 
     nodes: int
     stamps: np.ndarray

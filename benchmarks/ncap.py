@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.ncap [--nodes 200] [--clients 50] [--deaf 10] [--seconds 20]``: provisions a bus of virtual nodes
 and starts the daemon; how long until each is verified; then asks it while a virtual gripper is measured at 100 Hz and
-clients listen. ``--seconds 3600`` is the soak: memory and losses are told every minute.
+clients listen. ``--seconds 3600`` is the soak: memory and losses are printed every minute.
 """
 
 from __future__ import annotations

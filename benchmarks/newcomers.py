@@ -2,11 +2,11 @@
 
 Run: ``python -m benchmarks.newcomers [--joins 20] [--many 200] [--seconds 60] [--only one|twenty|many]``
 
-Virtual nodes in two processes on a paced bus (500 kbit/s, and FD 500k/2M for the many), `ncap run --measure all
---mqtt` as a user starts it, a mosquitto on loopback, and a listener that hears every frame: a node's Announce begins
-its time, its first value on an MQTT topic ends it. Nodes are immediate and known (their datasheets are kept), and their
-addresses do not meet. Computed stands what the frames of that many joinings occupy of the wire, taken from the frames
-of one; lost messages are told beside those that the nodes' own process could not send in time.
+Virtual nodes in two processes on a paced bus (500 kbit/s, and FD 500k/2M for the many), `ncap run --measure all --mqtt`
+as a user starts it, a mosquitto on loopback, and a listener that hears every frame: a node's Announce begins its time,
+its first value on an MQTT topic ends it. Nodes are immediate and known (their datasheets are kept), and their addresses
+do not meet. The computed row is what the frames of that many joinings occupy of the wire, taken from the frames of one;
+lost messages are printed beside those that the nodes' own process could not send in time.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ class Wire:
 
 
 class Topics:
-    """When the first value of each node came on a topic since :meth:`anew`."""
+    """Times at which the first value of each node came on a topic since :meth:`anew`."""
 
     def __init__(self, port: int) -> None:
         import paho.mqtt.client as paho

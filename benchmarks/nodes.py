@@ -1,6 +1,6 @@
 """The other side of the provisioning benchmarks: virtual nodes, one after the other on one reader or bus, or many.
 
-Started as a process of its own: ``python -m benchmarks.nodes nfc|can LINK [--pace] [--tag 2] [--crypto-delay MS]``. For
+Started as a separate process: ``python -m benchmarks.nodes nfc|can LINK [--pace] [--tag 2] [--crypto-delay MS]``. For
 every line on stdin it takes the present node away and puts a new one down, and answers with six words: the node's
 UUID, how many point operations (signatures, ECDH, checks of signatures; one-time keys are made in idle time) the node
 before it did, how many seconds its flash took to be safe (this machine's disk), and how many it waited, at random,
@@ -107,7 +107,7 @@ def one_after_the_other_in_c(options: argparse.Namespace, place: Path) -> None:
 
 
 def ended(process: subprocess.Popen[str]) -> dict[str, float]:
-    """Take a node in C away: what it says of its own part."""
+    """End a node in C and return the report of its own part."""
     process.terminate()
     output: dict[str, float] = json.loads(process.communicate(timeout=20)[0])
     return output

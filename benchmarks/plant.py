@@ -1,7 +1,7 @@
-"""The registry on a PostgreSQL of its own: 50 stations that push at once, waking, and a sync that finds nothing.
+"""The registry on its own PostgreSQL: 50 stations that push at once, waking, and a sync that finds nothing.
 
 ``python -m benchmarks.plant [--stations 50] [--pages 20] [--events 20]``; ``--history NODES`` alone: a newcomer takes
-in what was told of so many nodes, four events each, in a process of its own; ``--local BOARDS`` alone: boards in
+of events about that many nodes, four each, in a separate process; ``--local BOARDS`` alone: boards in
 memory, provisioned by a station that joined a registry and by one that joined none, in turn. Times are ratios:
 client and server share the machine. The floor beside it is as many empty round trips over the same connections.
 """

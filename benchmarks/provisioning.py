@@ -72,12 +72,12 @@ class TimedLink:
 
     @property
     def via(self) -> str:
-        """As the link says."""
+        """Return that of the link."""
         return str(self.inner.via)
 
     @property
     def capabilities(self) -> Capabilities:
-        """As the link says."""
+        """Return that of the link."""
         return self.inner.capabilities  # type: ignore[no-any-return]
 
     def exchange(self, frame: bytes) -> bytes:
@@ -136,7 +136,7 @@ class Run:
     """One node. Seconds; of ``link`` the octets take ``octets`` and the contract ``waits``; see limits.Limit.
 
     ``operations`` are those of the node's chip, ``flash`` the seconds until what it stored was safe. Of a node in C,
-    ``chip``: the seconds of its P-256; ``turned``: of all the rest of its own part.
+    ``chip``: the seconds of its P-256; ``turned``: of all the rest of its part.
     """
 
     find: float
@@ -171,7 +171,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Line:
-    """What one row of the table measures. ``limit`` gives the least seconds, None for unpaced links."""
+    """Subject of one row of the table. ``limit`` gives the least seconds, None for unpaced links."""
 
     title: str
     via: str
@@ -185,7 +185,7 @@ class Line:
 
     @property
     def asks_everyone(self) -> bool:
-        """Whether its nodes are found by a question to all, which each answers after a random wait."""
+        """True if its nodes are found by a broadcast, which each answers after a random wait."""
         return self.via == "can" and self.limit is not None and not self.named
 
 
@@ -226,7 +226,7 @@ def nodes(via: str, link: str, *extra: str) -> Iterator[subprocess.Popen[str]]:
 
 
 class NodeUsage(NamedTuple):
-    """What the node before took: point operations, seconds of its flash, and of its wait before it answered all.
+    """Costs of the node before: point operations, seconds of its flash, and of its wait before it answered all.
 
     Of a node in C also the seconds of its P-256, and of all else that was its own.
     """

@@ -53,7 +53,7 @@ def main(words: list[str]) -> None:
 
 
 def _run(station: Station, links: LinkSettings, name: str) -> tuple[ProvisionResult, float, float]:
-    """Provision whoever is there; seconds until it was found, and from then to the verdict."""
+    """Provision the node that is present; return seconds until it was found, and from then to the verdict."""
     began = time.perf_counter()
     with meet(station, links, None, SilentReporter()) as node:
         found = time.perf_counter()

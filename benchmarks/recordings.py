@@ -3,11 +3,11 @@
 Run: python -m benchmarks.recordings [--samples 10000000]
 
 The recording: one node of 25 channels at 1 kHz, 16-bit values that look like a sensor's. A copy by the library of a
-format is what somebody would write without this command: mcap's reader into mcap's writer, pandas' ``read_csv`` into
-``to_csv``, ``json.loads`` into ``json.dumps`` line by line. It says nothing of what is in the file; ``convert`` decodes
-all of it, checks it, and writes the other format, so it is held against the slower copy of the two (Parquet has none
-here: pyarrow copies columns that it need not read). Each in a process of its own; CPU seconds of it, imports included,
-and its largest memory.
+format is what a user would write without this command: mcap's reader into mcap's writer, pandas' ``read_csv`` into
+``to_csv``, ``json.loads`` into ``json.dumps`` line by line. It prints nothing of the file's content; ``convert``
+decodes all of it, checks it, and writes the other format, so it is held against the slower copy of the two (Parquet has
+none here: pyarrow copies columns that it need not read). Each in a separate process; CPU seconds of it, imports
+included, and its largest memory.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What grows with the number of nodes: commands on stores of 10 to 100,000 nodes, wall time, memory and exponents.
+"""Growth with the number of nodes: commands on stores of 10 to 100,000 nodes, wall time, memory and exponents.
 
 Run: ``python -m benchmarks.scale [SIZE …]`` (default 10 1000 10000 100000). Each command is the shipped one, a
 process of its own, the median of three runs (one at 100,000). ``CPU`` and ``MB`` are those at the largest size.

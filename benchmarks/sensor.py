@@ -3,9 +3,9 @@
 Run: ``python -m benchmarks.sensor [--seconds 60]``. Node and station are the shipped commands, processes of their own,
 on a bus that is held to the time of the wire: CAN FD by multicast, classic CAN over a socketcand server (a third
 process, of Python) and by multicast. Told apart are what the counters of the messages miss (*lost*), what the node did
-not take in time (it says so), and what the kernel of this machine threw away meanwhile, of all programs (*harness*).
-Bus load is that of the frames that went, to the bit; beside it the figure of docs/operation.md section 6, from which it
-may be 5 % off. On a machine that does other things too, ``nice -n -15`` stands for a quiet one.
+not take in time (it reports that), and what the kernel of this machine threw away meanwhile, of all programs
+(*harness*). Bus load is that of the frames that went, to the bit; beside it the figure of docs/operation.md section 6,
+from which it may be 5 % off. On a machine that does other things too, ``nice -n -15`` replaces a quiet one.
 """
 
 from __future__ import annotations

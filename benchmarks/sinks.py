@@ -146,7 +146,7 @@ print(json.dumps(lags), flush=True)
 
 
 class Master:
-    """Debian's rosmaster on a free port, with files of its own."""
+    """Debian's rosmaster on a free port, with its own files."""
 
     def __init__(self, folder: Path) -> None:
         with socket.socket() as free:

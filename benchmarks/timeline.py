@@ -1,4 +1,4 @@
-"""Where the time of one provisioning goes, exchange by exchange: what of each the wire needs, and what lies between.
+"""Where the time of one provisioning goes, exchange by exchange: what of each the wire needs, and the time between.
 
 ``python -m benchmarks.timeline ["CAN FD 500k/2M, named by UUID"] [--nodes 15]``: a row of the table of
 benchmarks.provisioning. Of each exchange: octets of request and reply, how long they occupy the wire, how long the

@@ -5,7 +5,7 @@ or in C if ``make firmware`` has built it) on a paced bus of this machine, provi
 process on the bus counts every frame; wire time is that of all frames of the upload, with their stuff bits. Frames that
 overlap on this simulated bus are counted one after the other. Aims for 256 KiB and a node in C: at most 1.25 times the
 wire on CAN 500 kbit/s, 1.5 times on CAN FD; twenty boards of 64 KiB on one bus 1.3 times that of all. The rows of nodes
-in C take 3 minutes. Behind each row stand the shares of a core that station and nodes took meanwhile: above 80 % the
+in C take 3 minutes. After each row are the shares of a core that station and nodes took meanwhile: above 80 % the
 machine is the limit. ``--exchanges`` shows between which frames the wire was free, and for how long.
 """
 

@@ -2,8 +2,8 @@
 
 Run: ``python -m benchmarks.verifying [COUNT]`` (default 10,000; half a minute). Ours is the shipped command from its
 start to its last line, compiled as an installer leaves it, its files in the page cache; theirs what ``openssl speed
-ecdsap256`` on all cores at once says of this machine now, times three. Two cores that work at once are each slower than
-one alone: what one alone does is printed beside. So is processor time of both, which a busy machine spoils less.
+ecdsap256`` on all cores at once measures on this machine now, times three. Two cores that work at once are each slower
+than one alone: what one alone does is printed beside. So is processor time of both, which a busy machine spoils less.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Run: ``python -m benchmarks.wrapped [--seconds 60] [--nodes 10] [--rate 1000]``
 
-A process of its own plays the sensors: one frame of each a millisecond, whose first signal counts. Another is
+Another process plays the sensors: one frame of each a millisecond, whose first signal counts. Another is
 `node run` as a user starts it, with all nodes; a third is `measure` into CSV. Counted are the processor time of the
 wrapper, messages that it could not send in time or that were lost on the way, values that were invalid, and of the
 counter how many values of the sensors are in the file. A sample takes the last frame, so two frames between two samples

@@ -122,7 +122,7 @@ LARGE_RUNS = [
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the checker said: errors found, states visited, wall seconds."""
+    """Result of the checker: errors found, states visited, wall seconds."""
 
     errors: int
     states: int
@@ -160,7 +160,7 @@ def _call(command: list[str], folder: Path) -> str:
 
 
 def tried(run: Run) -> Outcome:
-    """Run one checker in a folder of its own."""
+    """Run one checker in its own folder."""
     with tempfile.TemporaryDirectory() as folder:
         return check(run, Path(folder))
 

@@ -20,7 +20,7 @@ PACKAGE = "teds_provision"
 def resolve_named_tuples() -> None:
     """Write what the fields of named tuples are into their constructors.
 
-    ``typing`` leaves them there as text, in a namespace of its own where nobody finds the names.
+    ``typing`` leaves them there as text, in a namespace in which the names are not found.
     """
     for info in pkgutil.walk_packages(importlib.import_module(PACKAGE).__path__, f"{PACKAGE}."):
         if info.name.endswith("__main__"):

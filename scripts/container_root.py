@@ -1,6 +1,6 @@
 """Run the steps of service/Containerfile on a Debian root, where there is no container engine: `make container-root`.
 
-As root, with debootstrap: every COPY and RUN line is done in a copy of a fresh Debian with Python, which stands for the
+As root, with debootstrap: every COPY and RUN line is done in a copy of a fresh Debian with Python, which replaces the
 base image. At the end the installed program runs `demo` as the image's user on a read-only root, with /tmp and the
 user's home as the only places that can be written, as `podman run --read-only` has it.
 """
@@ -29,7 +29,7 @@ def run(*command: str) -> None:
 
 
 def base(folder: Path) -> Path:
-    """Return a Debian with Python, made once, which stands for the base image."""
+    """Return a Debian with Python, made once, which replaces the base image."""
     made = folder / "base"
     if not made.is_dir():
         partial = folder / "base.partial"

@@ -177,7 +177,7 @@ def recount(station: Station, chain: Chain, roster: Roster, *, again: bool = Fal
 
     Returns the pages that were folded now. ``again``: from the first one in any case.
     """
-    links = station.plant.pages.links(chain.id)
+    links = station.plant.pages.chain_links(chain.id)
     counts = counting(links, last=_last(roster, chain.station), accepted=chain.accepted)
     if counts.two is not None:
         why = "two histories part at this page" if chain.station != station.fingerprint else "of this very station"
@@ -260,7 +260,7 @@ def _keep_bans(station: Station, chain: Chain, values: Iterable[object], *, coun
 
 def counted_places(station: Station, roster: Roster, chain: Chain) -> frozenset[tuple[int, str]]:
     """Return number and H of the pages of a chain that count; of another history none above where the two part."""
-    links = station.plant.pages.links(chain.id)
+    links = station.plant.pages.chain_links(chain.id)
     return frozenset(counting(links, last=_last(roster, chain.station), accepted=chain.accepted).pages)
 
 

@@ -60,7 +60,7 @@ def fetch(station: Station, transport: Transport, roster: Roster) -> int:
         if fingerprint == station.fingerprint or fingerprint not in heads:
             continue
         chain = station.plant.pages.chain(fingerprint)
-        newest = max((n for n, _, _ in station.plant.pages.links(chain.id)), default=0)
+        newest = max((n for n, _, _ in station.plant.pages.chain_links(chain.id)), default=0)
         taken = take_carried(station, roster, fingerprint, transport.pages(fingerprint, newest))
         fetched += taken.pages
         _report_junk(station, roster, fingerprint, [carried.number for carried in taken.junk], transport)
@@ -79,7 +79,7 @@ def take_carried(
 
     A page that the station did not sign is no page: it ends nothing and may be asked for again.
     """
-    links = station.plant.pages.links(station.plant.pages.chain(author).id)
+    links = station.plant.pages.chain_links(station.plant.pages.chain(author).id)
     known, numbers = {hash for _, hash, _ in links}, {n for n, _, _ in links} | {0}
     taken = Taken()
     batch: list[Page] = []
@@ -112,7 +112,7 @@ def note_waiting(station: Station, author: str, taken: Taken) -> None:
     """Note that a chain waits for a newer version of this program, or that it does so no longer."""
     chain = station.plant.pages.chain(author)
     if taken.waits is not None:
-        newest = max((n for n, _, _ in station.plant.pages.links(chain.id)), default=0)
+        newest = max((n for n, _, _ in station.plant.pages.chain_links(chain.id)), default=0)
         alarm(station, "newer-format", author, newest + 1, taken.waits)
     if taken.waits != chain.waits:
         station.plant.pages.put_chain(replace(chain, waits=taken.waits))

@@ -157,7 +157,7 @@ def branch(station: Station, of: str, hash: str | None, transport: Transport | N
     """
     roster = require_roster(station)
     chain: Chain = station.plant.pages.chain(of)
-    links = station.plant.pages.links(chain.id)
+    links = station.plant.pages.chain_links(chain.id)
     partings = [chain.counted[0] + 1]  # the one that is undecided
     if chain.accepted is not None:  # and the one that was decided, which a person may decide differently
         partings.append(counting(links, last=None, accepted=None).two or 0)

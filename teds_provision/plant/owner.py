@@ -181,10 +181,10 @@ def page_place(station: Station, of: str, n: int) -> Place:
     if n == 0:
         return NOWHERE
     chain = station.plant.pages.chain(of)
-    found = [hash for number, hash, _ in station.plant.pages.links(chain.id) if number == n]
+    found = [hash for number, hash, _ in station.plant.pages.chain_links(chain.id) if number == n]
     if not found or n > chain.counted[0]:
         raise NotFoundError(f"Page {n} of that station is missing here or does not count.", hint="See: registry status")
-    for number, hash, previous in station.plant.pages.links(chain.id):
+    for number, hash, previous in station.plant.pages.chain_links(chain.id):
         if number == n + 1 and len(found) > 1 and previous in found:
             return n, previous
         if number == n and len(found) == 1:

@@ -186,7 +186,7 @@ def _beyond(station: Station, roster: Roster) -> dict[tuple[bytes, int, str], se
         if chain is None:
             continue
         counted = counted_places(station, roster, chain)
-        for n, hash, _ in station.plant.pages.links(chain.id):
+        for n, hash, _ in station.plant.pages.chain_links(chain.id):
             page = None if (n, hash) in counted else station.plant.pages.get(chain.id, n, hash)
             if page is None:
                 continue

@@ -50,7 +50,7 @@ def _digest(station: Station, database: Returned, roster: Roster) -> str:
     chains = station.plant.pages.chains()
     digest = hashlib.sha256(f"{roster.hash} {database.takes_pages}\n".encode())
     for name, state in states.items():
-        links = station.plant.pages.links(chains[name].id) if name in chains else []
+        links = station.plant.pages.chain_links(chains[name].id) if name in chains else []
         digest.update(f"{state} {' '.join(hash for _, hash, _ in links)}\n".encode())
     return digest.hexdigest()
 
@@ -82,7 +82,7 @@ def take(station: Station, database: Returned, roster: Roster) -> int:
     for author in sorted(roster.by_key):
         if author == station.fingerprint or not database.was_handed_in(author):
             continue
-        links = station.plant.pages.links(station.plant.pages.chain(author).id)
+        links = station.plant.pages.chain_links(station.plant.pages.chain(author).id)
         known = {hash for _, hash, _ in links}
         offers = [offer for offer in database.offers(author) if offer.hash not in known]
         liars: set[str] = set()
@@ -153,7 +153,7 @@ def _lacking(
 ) -> Iterator[tuple[int, bytes]]:
     """Yield number and octets of the pages here that are not there: those that count before all others."""
     counted = counted_places(station, roster, chain)
-    places = [(n, hash) for n, hash, _ in station.plant.pages.links(chain.id)]
+    places = [(n, hash) for n, hash, _ in station.plant.pages.chain_links(chain.id)]
     for n, hash in sorted(places, key=lambda place: (place not in counted, place)):
         row = station.plant.pages.get(chain.id, n, hash)
         if row is not None and (n, hashlib.sha256(octets_of(row)).hexdigest()) not in there:

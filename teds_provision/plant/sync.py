@@ -172,7 +172,7 @@ def _own_head(station: Station, transport: Transport, roster: Roster, done: Sync
     chain, joined = own_chain(station), station.plant.joined
     assert joined is not None
     restored = station.plant.restored
-    known = {(n, hash) for n, hash, _ in station.plant.pages.links(chain.id)}
+    known = {(n, hash) for n, hash, _ in station.plant.pages.chain_links(chain.id)}
     above = max(0, joined.acknowledged - 1) if connected and not restored else 0
     appended = _own_pages(station, transport, roster, done, above)
     found = appended + returned.own_pages(station, transport.returned, roster, {page.hash for page in appended})
@@ -369,7 +369,9 @@ def resume(station: Station, transport: Transport) -> int:
             if new:
                 newest = max(new, key=lambda page: (page.number, page.hash))
                 theirs = {(page.number, page.hash) for page in found}
-                counted = [(n, hash) for n, hash, _ in station.plant.pages.links(chain.id) if n <= chain.counted[0]]
+                counted = [
+                    (n, hash) for n, hash, _ in station.plant.pages.chain_links(chain.id) if n <= chain.counted[0]
+                ]
                 lost = [place for place in counted if place not in theirs and place[0] >= new[0].number]
                 station.plant.pages.put_chain(replace(chain, accepted=(newest.number, newest.hash)))
                 take_back(station, roster, new)
@@ -396,7 +398,7 @@ def _under_our_key(station: Station, transport: Transport, roster: Roster) -> li
 
 
 def _strange(station: Station, found: Sequence[Page]) -> list[Page]:
-    known = {(n, hash) for n, hash, _ in station.plant.pages.links(own_chain(station).id)}
+    known = {(n, hash) for n, hash, _ in station.plant.pages.chain_links(own_chain(station).id)}
     return [page for page in found if (page.number, page.hash) not in known]
 
 
@@ -459,7 +461,7 @@ def _push(station: Station, transport: Transport, roster: Roster, done: SyncResu
             {hash_of(carried.octets) for carried in transport.pages(fingerprint, 0)} if transport.everybody else set()
         )
         above = 0 if transport.everybody else heads.get(fingerprint, 0)
-        for n, hash, previous in station.plant.pages.links(chain.id):
+        for n, hash, previous in station.plant.pages.chain_links(chain.id):
             if n <= above or hash in there or (own and not transport.everybody and n > chain.counted[0]):
                 continue
             row = station.plant.pages.get(chain.id, n, hash)
@@ -485,7 +487,7 @@ def unseen_heads(station: Station, roster: Roster) -> dict[tuple[str, str, int, 
         chain = chains.get(about)
         if roster.member(who) is None or about not in roster.by_key or who == station.fingerprint:
             continue
-        links = station.plant.pages.links(chain.id) if chain is not None else []
+        links = station.plant.pages.chain_links(chain.id) if chain is not None else []
         if any((n, hash) == (number, named) for number, named, _ in links):
             continue
         here = chain.counted[0] if chain is not None else 0

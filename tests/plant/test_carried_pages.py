@@ -54,13 +54,13 @@ def test_pages_behind_a_gap_wait_until_it_is_filled(plants: Plant) -> None:
     plants.round()
     north, roster = plants.north, plants.north.plant.roster
     assert roster is not None
-    before = len(north.plant.pages.links(north.plant.pages.chain(west.fingerprint).id))
+    before = len(north.plant.pages.chain_links(north.plant.pages.chain(west.fingerprint).id))
     first, second, third = pages_of(plants, west)[-3:]
 
     assert take_carried(north, roster, west.fingerprint, [first, third]).pages == 1
     assert take_carried(north, roster, west.fingerprint, [third]).pages == 0
     assert take_carried(north, roster, west.fingerprint, [second, third]).pages == 2
-    assert len(north.plant.pages.links(north.plant.pages.chain(west.fingerprint).id)) == before + 3
+    assert len(north.plant.pages.chain_links(north.plant.pages.chain(west.fingerprint).id)) == before + 3
 
 
 def test_a_job_of_another_registry_is_refused_though_a_keeper_signed_it(tmp_path: Path) -> None:

@@ -191,7 +191,7 @@ def test_what_others_report_of_pages_that_are_missing_stops_a_rebuilt_home_alone
     west.page()
     for back in (west.copy(), west.station):
         with back.transaction():
-            north = back.plant.pages.chain(west.plants.north.fingerprint).chain
+            north = back.plant.pages.chain(west.plants.north.fingerprint).id
             back.plant.pages.put_heads(north, {back.fingerprint: (9, "ab" * 32)})
         if back is west.station:
             assert west.page().pushed == 1

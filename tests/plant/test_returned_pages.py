@@ -62,7 +62,7 @@ class Loss(Office):
             self.database.sql(member_sql(station.fingerprint, verifier(self.secrets[station.fingerprint])))
 
     def pages_here(self, station: Station, of: Station) -> list[str]:
-        return [hash for _, hash, _ in station.plant.pages.links(station.plant.pages.chain(of.fingerprint).id)]
+        return [hash for _, hash, _ in station.plant.pages.chain_links(station.plant.pages.chain(of.fingerprint).id)]
 
     def handed_in(self, of: Station) -> list[list[str]]:
         return self.database.sql(f"select n, hash from registry.found where author = '\\x{of.fingerprint}' order by n")

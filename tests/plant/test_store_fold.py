@@ -50,7 +50,7 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
     while waiting:  # a page comes when one before it is here, as a sync asks for them
         chance.shuffle(waiting)
         for page in list(waiting):
-            names = station.plant.pages.links(station.plant.pages.chain(page.station).id)
+            names = station.plant.pages.chain_links(station.plant.pages.chain(page.station).id)
             if page.number == 1 or any(n == page.number - 1 for n, _, _ in names):
                 roster = station.plant.roster
                 assert roster is not None

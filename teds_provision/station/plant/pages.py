@@ -94,7 +94,7 @@ class Pages:
              utc_now()),
         )  # fmt: skip
 
-    def links(self, chain_id: int) -> list[tuple[int, str, str]]:
+    def chain_links(self, chain_id: int) -> list[tuple[int, str, str]]:
         """Return number, H and ``previous`` of every page of a chain, both histories if there are two."""
         return self._store.execute("SELECT n, hash, previous FROM pages WHERE chain = ? ORDER BY n, hash", (chain_id,))
 
@@ -123,7 +123,7 @@ class Pages:
 
     def each(self, chain_id: int, after: int = 0) -> Iterator[PageRow]:
         """Give the pages of a chain above a number, both histories, one at a time."""
-        for n, hash, _ in self.links(chain_id):
+        for n, hash, _ in self.chain_links(chain_id):
             if n > after and (page := self.get(chain_id, n, hash)) is not None:
                 yield page
 

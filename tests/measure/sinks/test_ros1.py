@@ -35,7 +35,7 @@ pytestmark = [
 
 
 class Master:
-    """Debian's rosmaster on a free port, with files of its own."""
+    """Debian's rosmaster on a free port, with its own files."""
 
     def __init__(self, folder: Path) -> None:
         self.port = free_tcp_port()
