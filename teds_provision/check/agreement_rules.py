@@ -246,7 +246,7 @@ def confirm_without_request(probe: Probe) -> str:
 
 @rule("request-checks", "Key agreement", Stage.FACTORY)
 def request_checks(probe: Probe) -> str:
-    """Length before points before SIG104: 4, 15, 5."""
+    """Check the order of refusals: length (4) before points (15) before SIG104 (5)."""
     tapped_or_bus(probe)
     strange = StrangerStation.make()
     wrong = strange.request(certified=False)
@@ -260,7 +260,7 @@ def request_checks(probe: Probe) -> str:
 
 @rule("request-one-time", "Key agreement", Stage.FACTORY)
 def request_one_time(probe: Probe) -> str:
-    """E is a one-time key: neither the node's own point nor the station's static one; both get 15, before SIG104."""
+    """Check that E is a one-time key: the node's own point and the station's static one get 15, before SIG104."""
     tapped_or_bus(probe)
     strange, own = StrangerStation.make(), probe.node_key
     probe.refused(request(strange.request(one_time=own, certified=False)), Reason.BAD_POINT, "E the node's own point")
@@ -334,7 +334,7 @@ def agreement_fresh(probe: Probe) -> str:
 
 @rule("agreement-tags", "Key agreement", Stage.FACTORY)
 def agreement_tags(probe: Probe) -> str:
-    """165 octets: tagN is right over T, and sigN over T under the key that the node shows."""
+    """Check the reply of 165 octets: tagN over T, and sigN over T under the key that the node shows."""
     tapped_or_bus(probe)
     agree(probe, StrangerStation.make().credentials)
     return f"{REPLY_OCTETS} octets, tagN and sigN right"
@@ -398,7 +398,7 @@ def confirm_newest(probe: Probe) -> str:
 
 @rule("confirm-whole-tag", "Key agreement", Stage.AGREEMENT)
 def confirm_whole_tag(probe: Probe) -> str:
-    """All 16 octets of tagS are looked at: one that is wrong in its first or last octet alone gets 12."""
+    """Check that all 16 octets of tagS are compared: one wrong in only its first or last octet gets 12."""
     tapped_or_bus(probe)
     for at in (0, 15):
         agreed, tried = agree(probe)
@@ -465,7 +465,7 @@ def _slip_of_confirm(probe: Probe) -> slips.Slip | None:
 
 @rule("open", "Sessions", Stage.KEYED)
 def open_a_session(probe: Probe) -> str:
-    """En is a point, the tag shows that the node holds the key, and a sealed command gets a sealed reply."""
+    """Check that En is a point, the tag shows that the node holds the key, and a sealed command gets a sealed reply."""
     probe.open()
     inside, outside = probe.sealed_good(IDENTIFY), probe.good(IDENTIFY)
     holds(inside == outside, "Identify replies differently in the session and outside it.")
@@ -474,7 +474,7 @@ def open_a_session(probe: Probe) -> str:
 
 @rule("keyed-untapped", "Which command when", Stage.KEYED)
 def keyed_untapped(probe: Probe) -> str:
-    """Untapped Request, Confirm and Set CAN address get 3 once the node has a key."""
+    """Check that untapped Request, Confirm and Set CAN address get 3 once the node has a key."""
     if probe.tapped:
         raise NotApplicableError(f"Every command counts as tapped on this link. {OVER_CAN}")
     # what is refused here would change nothing even where it is let through: its SIG104, length and state are wrong
@@ -485,7 +485,7 @@ def keyed_untapped(probe: Probe) -> str:
 
 @rule("keyed-security", "The Security TEDS", Stage.KEYED)
 def keyed_security(probe: Probe) -> str:
-    """With a key too the Security TEDS agrees with Identify: a new epoch is in the initial one at once."""
+    """Check that the Security TEDS of a keyed node agrees with Identify: a new epoch is in the initial one at once."""
     return security_state(probe)
 
 
@@ -551,7 +551,7 @@ def first_owner_wins(probe: Probe) -> str:
 
 @rule("confirm-ends-sessions", "Key agreement", Stage.ROTATION)
 def confirm_ends_sessions(probe: Probe) -> str:
-    """After the reply to a good Confirm every session and half-open Open is over on every link; the old key is gone."""
+    """Check that a good Confirm ends every session and half-open Open on every link, and the old key."""
     old_key = probe.link_key
     own, others = probe.open(), []
     probe.sealed_good(IDENTIFY)
@@ -579,7 +579,7 @@ def confirm_ends_sessions(probe: Probe) -> str:
 
 @rule("rotation-keeps", "Key agreement", Stage.ROTATION)
 def rotation_keeps(probe: Probe) -> str:
-    """Another key changes the epoch alone: state, sequence and every TEDS stay.
+    """Check that another key changes only the epoch: state, sequence and every TEDS stay.
 
     Looks at what the Confirm of confirm-ends-sessions left.
     """

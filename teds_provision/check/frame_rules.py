@@ -216,7 +216,7 @@ def can_functional(probe: Probe) -> str:
 
 @rule("can-lengths", "CAN", Stage.PLAIN)
 def can_lengths(probe: Probe) -> str:
-    """Frames of a length that ISO 15765-2 has no place for are ignored: no flow control, no reply.
+    """Check that frames of lengths that ISO 15765-2 does not allow are ignored: no flow control, no reply.
 
     A first frame of what one frame would hold (FF_DLmin), and a classic single frame with the length of CAN FD.
     """

@@ -88,7 +88,7 @@ def can_flow_control(probe: Probe) -> str:
 
 @rule("can-busy", "CAN", Stage.PLAIN)
 def can_busy(probe: Probe) -> str:
-    """Beside another station's long request a first frame gets a flow control, or a single frame with refusal 17."""
+    """Check that during another station's long request a first frame gets a flow control, or a single frame with 17."""
     other = probe.from_station(1).line
     assert isinstance(other, MultiStationLink)
     first = probe.bus.begin(_HALF_SENT)

@@ -256,7 +256,7 @@ def operate_lease(probe: Probe) -> str:
 
 @rule("operate-digest", "1. A channel is claimed or idle", Stage.MEASURING, page=OPERATION_PAGE)
 def operate_digest(probe: Probe) -> str:
-    """Who claims has read the datasheet: each other digest than that of the Security TEDS as it is now gets 6."""
+    """Check that a claim proves that the datasheet was read: any digest but the present Security TEDS's gets 6."""
     channel, digest = _sensor(probe), _digest(probe)
     for at in (0, DIGEST_OCTETS - 1):
         wrong = digest[:at] + bytes([digest[at] ^ 1]) + digest[at + 1 :]
@@ -305,7 +305,7 @@ def operate_values(probe: Probe) -> str:
 
 @rule("operate-expires", "1. A channel is claimed or idle", Stage.MEASURING, page=OPERATION_PAGE)
 def operate_expires(probe: Probe) -> str:
-    """Without a good Sealed frame for as long as its lease a session loses its claims, and goes on."""
+    """Check that a session without a good Sealed frame for its lease loses its claims, and goes on."""
     channel = _sensor(probe)
     for lease in _SHORT_LEASES:
         began = probe.now()
@@ -381,7 +381,7 @@ def _messages(
 
 @rule("stream-messages", "3. Stream keys and data messages", Stage.MEASURING, page=OPERATION_PAGE)
 def stream_messages(probe: Probe) -> str:
-    """Each data message opens under the key of its run, with its counter in the nonce; a new run has a new key.
+    """Check that each data message opens under the key of its run, with its counter in the nonce.
 
     Counters grow, runs begin at 1; nothing leaves after the reply to Stop.
     """
@@ -487,7 +487,7 @@ def drive_replay(probe: Probe) -> str:
 
 @rule("trigger-token", "5. Clock, trigger, groups", Stage.MEASURING, page=OPERATION_PAGE)
 def trigger_token(probe: Probe) -> str:
-    """Only T marks what C armed, once: another T changes nothing, and T is worth nothing after its first use."""
+    """Check that only T marks what C armed, once: another T, and T after its first use, change nothing."""
     channel = _sensor(probe)
     with probe.framed.single_frames() as frames, _claimed(probe, channel):
         token, other = TriggerToken.draw(), TriggerToken.draw()

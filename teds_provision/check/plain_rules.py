@@ -51,7 +51,7 @@ _MEASURING: Final = range(Function.SAMPLE, Function.DRIVE + 1)
 
 @rule("identify", "Identify, Prove, List", Stage.PLAIN)
 def identify(probe: Probe) -> str:
-    """23 octets, version 1, every value in its range; the UUID under which it was found."""
+    """Check that Identify has 23 octets, version 1, every value in its range, and the UUID of the search."""
     found = probe.identity()
     holds(found.uuid == probe.uuid, f"Identify names {found.uuid.hex()}; the node was found as {probe.uuid.hex()}.")
     return f"{found.state.name.lower()}, epoch {found.epoch}, sequence {found.sequence}, {found.max_message} octets"
@@ -59,7 +59,7 @@ def identify(probe: Probe) -> str:
 
 @rule("max-message", "Command frames", Stage.PLAIN)
 def max_message(probe: Probe) -> str:
-    """MaxMessage is 512 to 4094; a frame of so many octets is handled, and one octet more gets 10."""
+    """Check that MaxMessage is 512 to 4094; a frame of that many octets is handled, one octet more gets 10."""
     most = probe.max_message
     holds(LEAST_MESSAGE <= most <= MOST_MESSAGE, f"Identify announces maxMessage {most}; 512 to 4094 are allowed.")
     unknown = Command(0, SECURITY, 99, bytes(most - COMMAND_HEADER))
@@ -159,7 +159,7 @@ def close_needs_session(probe: Probe) -> str:
 
 @rule("operation-needs-session", "Which command when", Stage.PLAIN)
 def operation_needs_session(probe: Probe) -> str:
-    """Every other class, unknown functions of class 1, and 128.12 to 128.20 get 3 outside a session."""
+    """Check that other classes, unknown functions of class 1, and 128.12 to 128.20 get 3 outside a session."""
     outside = [Command(1, 3, 1, b"\0"), Command(0, 5, 1), Command(0, COMMON, 99)]
     for command in outside + [Command(0, SECURITY, function) for function in _MEASURING]:
         seen = probe.refused(command, Reason.NOT_PERMITTED)
@@ -168,7 +168,7 @@ def operation_needs_session(probe: Probe) -> str:
 
 @rule("state-before-length", "Which command when", Stage.PLAIN)
 def state_before_length(probe: Probe) -> str:
-    """State and permission are looked at before lengths."""
+    """Check that state and permission are checked before lengths."""
     probe.refused(security_command(Function.CLOSE, b"\0"), Reason.NOT_PERMITTED)
     return probe.refused(Command(0, COMMON, TedsFunction.WRITE), Reason.NOT_PERMITTED)
 
@@ -191,7 +191,7 @@ def absent(probe: Probe) -> BlockId:
 
 @rule("list-ascending", "Identify, Prove, List", Stage.PLAIN)
 def list_ascending(probe: Probe) -> str:
-    """Every TEDS once, ascending as octet strings, the Security TEDS too, none that could never be held."""
+    """Check that List has every TEDS once, ascending as octet strings, the Security TEDS too, no impossible one."""
     listed = probe.listed()
     holds(listed == sorted(set(listed)), f"List (128.11) does not ascend, or names one twice: {listed}")
     holds(SECURITY_TEDS in listed, "List (128.11) leaves out the Security TEDS (channel 0, access code 128).")
@@ -202,7 +202,7 @@ def list_ascending(probe: Probe) -> str:
 
 @rule("teds-checksum", "The Security TEDS", Stage.PLAIN)
 def teds_checksum(probe: Probe) -> str:
-    """Length and Checksum of every TEDS are right."""
+    """Check Length and Checksum of every TEDS."""
     listed = probe.listed()
     for channel, code in listed:
         try:
@@ -214,7 +214,7 @@ def teds_checksum(probe: Probe) -> str:
 
 @rule("query-present", "Command frames", Stage.PLAIN)
 def query_present(probe: Probe) -> str:
-    """Size is what Read hands out, the checksum that of the TEDS; NotAvail not set, TextTEDS and MfgrDefine right."""
+    """Check that Query has Read's size and the TEDS's checksum; NotAvail not set, TextTEDS and MfgrDefine right."""
     listed = probe.listed()
     for block in listed:
         status, octets = _status(probe, block), probe.teds(block)
@@ -234,7 +234,7 @@ def query_present(probe: Probe) -> str:
 
 @rule("query-absent", "Command frames", Stage.PLAIN)
 def query_absent(probe: Probe) -> str:
-    """NotAvail, size 0, checksum 0 for what could be held and is not there."""
+    """Check that Query of an absent TEDS that the node could hold has NotAvail, size 0, checksum 0."""
     block = absent(probe)
     status = _status(probe, block)
     right = status.attributes & Attribute.NOT_AVAILABLE and (status.size, status.checksum, status.status) == (0, 0, 0)
@@ -269,7 +269,7 @@ def query_length(probe: Probe) -> str:
 
 @rule("read-end", "Command frames", Stage.PLAIN)
 def read_end(probe: Probe) -> str:
-    """From the end on, or past it: the size as offset, and no octets."""
+    """Check that Read from the end on, or past it, returns the size as offset, and no octets."""
     size = len(probe.teds(SECURITY_TEDS))
     for offset in (size, size + 1, 0xFFFFFFFF):
         payload = probe.good(read_teds(*SECURITY_TEDS, offset))
@@ -282,7 +282,7 @@ def read_end(probe: Probe) -> str:
 
 @rule("security-canonical", "The Security TEDS", Stage.PLAIN)
 def security_canonical(probe: Probe) -> str:
-    """Canonical form, and the values of this profile."""
+    """Check that the Security TEDS has canonical form, and the values of this profile."""
     shown = probe.security()
     holds(own_values(shown), "Security TEDS: fields 1 to 4, 105, 109, 110 are not those of this profile.")
     return "signed" if shown.signed else "initial"
@@ -290,7 +290,7 @@ def security_canonical(probe: Probe) -> str:
 
 @rule("node-key", "The Security TEDS", Stage.PLAIN)
 def node_key(probe: Probe) -> str:
-    """Field 101 is a point, and 102 its own signature over UUID and point, with low s."""
+    """Check that field 101 is a point, and 102 its own signature over UUID and point, with low s."""
     shown = probe.security()
     holds(is_point(shown.node_key), "Field 101 is no point on P-256.")
     message = node_key_message(probe.uuid, shown.node_key)

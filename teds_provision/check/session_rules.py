@@ -71,7 +71,7 @@ def open_replaced(probe: Probe) -> str:
 
 @rule("open-checks", "Sessions", Stage.SESSION)
 def open_checks(probe: Probe) -> str:
-    """Length, keyId, mac: 4, 16, 12, in this order, each over all of its octets, and none of them uses c up."""
+    """Check Open's refusals (length 4, keyId 16, mac 12, in this order, over all octets); none of them uses c up."""
     _opens(probe)
     key, before = probe.link_key, probe.opening_counter()
     point = SoftwareKey.generate().point
@@ -147,7 +147,7 @@ def open_one_time(probe: Probe) -> str:
 
 @rule("sealed-last-counter", "Sessions", Stage.SESSION)
 def sealed_last_counter(probe: Probe) -> str:
-    """Counter 2^32 - 1 is served, and ends the session."""
+    """Check that counter 2^32 - 1 is served, and ends the session."""
     session = probe.open()
     session.unseal(probe.good(session.seal(IDENTIFY, counter=LAST_COUNTER)).ljust(36, b"\0"))
     probe.session = None
@@ -156,7 +156,7 @@ def sealed_last_counter(probe: Probe) -> str:
 
 @rule("sealed-counter", "Sessions", Stage.SESSION)
 def sealed_counter(probe: Probe) -> str:
-    """Gaps are fine; a counter that was used, a lower one and 0 get 13; the session goes on."""
+    """Check that gaps are accepted; a used counter, a lower one and 0 get 13; the session goes on."""
     session = probe.open()
     last = session.seal(IDENTIFY, counter=9)
     session.unseal(probe.good(last).ljust(36, b"\0"))
@@ -175,7 +175,7 @@ def sealed_counter(probe: Probe) -> str:
 
 @rule("sealed-tag", "Sessions", Stage.SESSION)
 def sealed_tag(probe: Probe) -> str:
-    """Too short gets 4, a wrong tag 12; a bad frame ends nothing."""
+    """Check that a short frame gets 4, a wrong tag 12, and that a bad frame ends nothing."""
     session = probe.open()
     probe.sealed_good(IDENTIFY)
     probe.refused(security_command(Function.SEALED, bytes(35)), Reason.BAD_FORM)
@@ -354,7 +354,7 @@ def repetition_everyone(probe: Probe) -> str:
 
 @rule("repetition-two", "Repetition", Stage.SESSION)
 def repetition_two(probe: Probe) -> str:
-    """There is room for the stored replies of two links."""
+    """Check that the node has room for the stored replies of two links."""
     other = probe.from_station(1)
     first, second = _RepeatedIdentify(probe), _RepeatedIdentify(other)
     first.again(" after another station's request")
@@ -463,7 +463,7 @@ def close(probe: Probe) -> str:
 
 @rule("address-back", "Command frames", Stage.SESSION)
 def address_back(probe: Probe) -> str:
-    """10 s after a write of the address another one is taken."""
+    """Check that another address is accepted 10 s after a write of the address."""
     home = probe.home_address
     if not home or probe.identity().can_address == home:
         raise NotApplicableError("The rule address-moves moved no address.")

@@ -58,7 +58,7 @@ def _example(block: BlockId) -> bytes:
 
 @rule("write-checks", "Writing to flash", Stage.SESSION)
 def write_checks(probe: Probe) -> str:
-    """Payload shorter than 5 octets 4; beyond what is staged 4; never held 18. Nothing of it lasts."""
+    """Check that a payload below 5 octets gets 4, beyond the staged length 4, of a TEDS never held 18: no effect."""
     block = absent(probe)
     probe.sealed_refused(Command(block[0], COMMON, TedsFunction.WRITE, bytes([block[1], 0, 0, 0])), Reason.BAD_FORM)
     probe.sealed_refused(write_teds(*block, 1, b"\0"), Reason.BAD_FORM, "offset 1, nothing staged")
@@ -166,7 +166,7 @@ def write_drops(probe: Probe) -> str:
 
 @rule("staging-ends", "Sessions", Stage.SESSION)
 def staging_ends(probe: Probe) -> str:
-    """Staged TEDS go with the session: Update then answers like Query."""
+    """Check that staged TEDS end with the session: Update then answers like Query."""
     block = absent(probe)
     probe.sealed_good(write_teds(*block, 0, _example(block)))
     staged = TedsStatus.decode(probe.sealed_good(update_teds(*block)))
@@ -180,7 +180,7 @@ def staging_ends(probe: Probe) -> str:
 
 @rule("staging-shared", "Writing to flash", Stage.SESSION)
 def staging_shared(probe: Probe) -> str:
-    """There is one staging area: while a session has something in it, Write and Update in another get 17.
+    """Check that there is one staging area: while a session uses it, Write and Update in another get 17.
 
     17 comes after 4 and 18, and what is staged stays; it goes when its session ends.
     """
@@ -273,7 +273,7 @@ def _refused_over(probe: Probe, reason: Reason, why: str, octets: bytes) -> str:
 
 @rule("commit-signatures", "Writing to flash", Stage.COMMIT)
 def commit_signatures(probe: Probe) -> str:
-    """Another's 101, 104 of another CA, and a wrong field 100 get 5."""
+    """Check that another node's 101, 104 of another CA, and a wrong field 100 get 5."""
     other = SoftwareKey.generate()
     _refused_commit(probe, Reason.BAD_SIGNATURE, "101 of another node", lambda s: replace(s, node_key=other.point))
     forged = other.sign(b"no station key")
@@ -322,7 +322,7 @@ def commit_utf8(probe: Probe) -> str:
 
 @rule("commit-base64", "The Security TEDS", Stage.COMMIT)
 def commit_base64(probe: Probe) -> str:
-    """Fields 100 to 104 are base64 with spare bits zero and no other letters: else 4, signed as they may be."""
+    """Check that fields 100 to 104 are base64 with spare bits zero and no other letters, else 4, even if signed."""
     for field in (100, 101, 103, 104):
         block = _unsigned_block(probe)
         if field == 100:
@@ -342,7 +342,7 @@ def commit_base64(probe: Probe) -> str:
 
 @rule("commit-extra", "The Security TEDS", Stage.COMMIT)
 def commit_extra(probe: Probe) -> str:
-    """Fields 111 to 255 are skipped, and covered by the signature: one changed after signing gets 5."""
+    """Check that fields 111 to 255 are skipped, but signed: one changed after signing gets 5."""
     extra = {111: b"\x01", 200: b"of a later profile", 255: b""}
     good = _signed(probe, replace(_sheet(probe, stored_blocks(probe)), extra=extra))
     at = good.index(b"of a later profile")
@@ -419,7 +419,7 @@ def commit_own_check(probe: Probe) -> str:
 
 @rule("commit-values", "Writing to flash", Stage.COMMIT)
 def commit_values(probe: Probe) -> str:
-    """Fields 1 to 4, 105, 109 and 110 with other values than this profile's get 4, signed as they may be."""
+    """Check that other values in fields 1 to 4, 105, 109 and 110 than this profile's get 4, even if signed."""
     for field in OUR_VALUES:
 
         def other(sheet: SecurityTeds, field: int = field) -> SecurityTeds:
@@ -538,7 +538,7 @@ def _slip_of_commit(probe: Probe, reason: int | None, blocks: dict[BlockId, byte
 
 @rule("reset", "Reset", Stage.RESET)
 def reset(probe: Probe) -> str:
-    """In a session Reset erases key and trust and proves it; epoch and sequence stay, sessions end."""
+    """Check that Reset in a session erases key and trust, with proof; epoch and sequence stay, sessions end."""
     before, stored, challenge = probe.identity(), stored_blocks(probe), os.urandom(CHALLENGE_OCTETS)
     probe.sealed_refused(security_command(Function.RESET, challenge[1:]), Reason.BAD_FORM, "a challenge of 31 octets")
     proof = probe.sealed_good(security_command(Function.RESET, challenge))
@@ -558,7 +558,7 @@ def reset(probe: Probe) -> str:
 
 @rule("reset-forgets", "Reset", Stage.RESET)
 def reset_forgets(probe: Probe) -> str:
-    """After a reset the first owner wins again: a Request that shows another CA is answered, and nothing is sealed."""
+    """Check that after a reset the first owner wins again: a Request with another CA is answered, nothing is sealed."""
     tapped_or_bus(probe)
     if probe.identity().state != NodeState.FACTORY:
         raise NotApplicableError("The node was not reset.")
