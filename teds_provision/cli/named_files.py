@@ -1,4 +1,4 @@
-"""Files that a command line names: read with a limit, written completely or not at all."""
+"""Files that a command line names: read with a limit, written atomically."""
 
 from __future__ import annotations
 

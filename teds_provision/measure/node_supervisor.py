@@ -315,7 +315,7 @@ class NodeSupervisor:
     def _ask_who_answers(self) -> None:
         """Ask everyone on the bus while nothing is asked of the node itself: its replies would hide a second board's.
 
-        Only until its first value, for a caller that gives up in time: others are told by the next round anyway.
+        Only until its first value, for a caller that gives up in time: other waiters learn it from the next round.
         """
         if self.bus is None or self.ever_ran or self._request.patient:
             return

@@ -76,7 +76,7 @@ def own_pages(
     return list(good.values())
 
 
-def take(station: Station, database: Returned, roster: Roster) -> int:
+def take_in(station: Station, database: Returned, roster: Roster) -> int:
     """Take in the pages of others that members handed in, and return how many were new."""
     taken_pages, forged = 0, False
     for author in sorted(roster.by_key):

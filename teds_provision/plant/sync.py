@@ -118,7 +118,7 @@ def _return_pages(station: Station, transport: Transport, roster: Roster, done: 
     """Take what others handed in for stations that left, and hand in what the registry lacks of them."""
     if transport.returned is None or not returned.is_new(station, transport.returned, roster):
         return
-    done.fetched += returned.take(station, transport.returned, roster)
+    done.fetched += returned.take_in(station, transport.returned, roster)
     done.returned, refused = returned.hand_in(station, transport.returned, roster)
     if done.returned:
         pages = "1 page" if done.returned == 1 else f"{done.returned} pages"

@@ -181,20 +181,20 @@ class EvidenceTotals:
 
 
 _WORST: Final = (0, 7, 3, 8, 1, 4)
-Tell = Callable[[JudgedEvidence], str]
+RowFormatter = Callable[[JudgedEvidence], str]
 """The line of one file, as it is shown; called in whichever process judged it."""
 
 
 def verify_evidence(
-    grounds: EvidenceAnchors, files: Sequence[str], tell: Tell, *, processes: int | None = None
+    grounds: EvidenceAnchors, files: Sequence[str], format_row: RowFormatter, *, processes: int | None = None
 ) -> Iterator[tuple[list[str], EvidenceTotals]]:
-    """Judge every file, in order: yield the lines of ``tell`` for each, and their totals.
+    """Judge every file, in order: yield the lines of ``format_row`` for each, and their totals.
 
     A fault of one stops no other.
 
     More than a few files are shared among ``processes`` (as many as there are cores).
     """
-    work = _Work(grounds, tell, files)
+    work = _Work(grounds, format_row, files)
     workers = min(processes or cores_to_share(), (len(files) + _CHUNK - 1) // _CHUNK)
     if len(files) <= _FEW or workers <= 1:
         yield from (work.judge(range(at, min(at + _CHUNK, len(files)))) for at in range(0, len(files), _CHUNK))
@@ -208,14 +208,14 @@ def verify_evidence(
 @dataclass(frozen=True)
 class _Work:
     grounds: EvidenceAnchors
-    tell: Tell
+    format_row: RowFormatter
     files: Sequence[str]
 
     def judge(self, places: range) -> tuple[list[str], EvidenceTotals]:
         lines, totals = [], EvidenceTotals()
         for judged in judge_files(self.grounds, [Path(self.files[place]) for place in places]):
             totals.add(judged)
-            lines.append(self.tell(judged))
+            lines.append(self.format_row(judged))
         return lines, totals
 
 

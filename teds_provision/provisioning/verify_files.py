@@ -81,7 +81,7 @@ class VerdictTotals:
         return {"totals": {"files": self.files, **dict(sorted(self.verdicts.items()))}}
 
 
-Tell = Callable[[FileVerdict], str]
+RowFormatter = Callable[[FileVerdict], str]
 """The line of one file, as it is shown; called in whichever process judged it."""
 
 # From good to bad: a harmful calibration, a file that is not there or holds no image, one that is not authentic.
@@ -89,15 +89,15 @@ _WORST: Final = (0, 6, 7, 3, 8, 1, 4)
 
 
 def verify_files(
-    station: Station, files: Sequence[str], tell: Tell, *, processes: int | None = None
+    station: Station, files: Sequence[str], format_row: RowFormatter, *, processes: int | None = None
 ) -> Iterator[tuple[list[str], VerdictTotals]]:
-    """Judge every file, in order, some at a time: yield the lines of ``tell`` for each, and their totals.
+    """Judge every file, in order, some at a time: yield the lines of ``format_row`` for each, and their totals.
 
     A fault of one is its verdict and stops no other. More than a few files are shared among ``processes`` (as many as
     there are cores), which format them too: lines are quicker to send than verdicts with all their checks.
     """
     workers = min(processes or cores_to_share(), (len(files) + _CHUNK - 1) // _CHUNK)
-    work = _Work(snapshot_trust(station), tell, files)
+    work = _Work(snapshot_trust(station), format_row, files)
     if len(files) <= _FEW or workers <= 1:
         yield from (work.judge(range(at, at + 1)) for at in range(len(files)))
         return
@@ -113,7 +113,7 @@ class _Work:
     """Data that a process needs to judge files and to report them."""
 
     judging: TrustSource
-    tell: Tell
+    format_row: RowFormatter
     files: Sequence[str]
 
     def judge(self, places: range) -> tuple[list[str], VerdictTotals]:
@@ -122,7 +122,7 @@ class _Work:
         for some in _some([Path(self.files[place]) for place in places]):
             for found in _judged(self.judging, some):
                 totals.add(found)
-                lines.append(self.tell(found))
+                lines.append(self.format_row(found))
         return lines, totals
 
 

@@ -205,7 +205,7 @@ def _many(app: App, boards: BatchRun, operator: Operator, screen: Screen, *, tot
         for board in boards.many(operator):
             if boards.expected and not app.json:
                 _print_one_of(app, boards, board)
-            elif not screen.tells:
+            elif not screen.shows_boards:
                 _print_board(app, board, warn=not boards.expected, **_of_line(boards, board.uuid))
             screen.ended(board)
     finally:
@@ -469,9 +469,9 @@ class BatchState(Protocol):
 
 
 class Screen(Protocol):
-    """Display of each board's end; ``tells``: nothing else needs to be printed about it."""
+    """Display of each board's end; ``shows_boards``: nothing else needs to be printed about it."""
 
-    tells: bool
+    shows_boards: bool
 
     def ended(self, board: BoardResult) -> None:
         """Show how it ended."""
@@ -483,7 +483,7 @@ class Screen(Protocol):
 class _NoScreen:
     """No screen: a pipe, --json, --quiet, or no sheet. The bell is for people alone."""
 
-    tells = False
+    shows_boards = False
 
     def ended(self, board: BoardResult) -> None:
         """Do nothing: the line is printed already."""
@@ -522,7 +522,7 @@ class OperatorScreen:
     """Redrawn when a board is begun and when it ends, on stderr; ``live_line`` removes what runs below it."""
 
     def __init__(self, console: Console, boards: BatchState, live_line: Callable[[], None] = lambda: None) -> None:
-        self.tells = sys.stdout.isatty()  # a file or a pipe gets its lines all the same
+        self.shows_boards = sys.stdout.isatty()  # a file or a pipe gets its lines all the same
         self._console, self._boards, self._live_line = console, boards, live_line
         self._last: deque[BoardResult] = deque(maxlen=_LAST)
         self._draw(">>> ", self._next())

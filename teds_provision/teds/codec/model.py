@@ -1,4 +1,4 @@
-"""What decoding gives: fields in wire order, findings, one verdict (words of the vectors' index)."""
+"""Results of decoding: fields in wire order, findings, one verdict (words of the vectors' index)."""
 
 from __future__ import annotations
 
