@@ -4,7 +4,7 @@ Run: ``python -m benchmarks.handover [COUNT]``. Ours is everything between the c
 reading and unwrapping keys, the bundle, the file, the store's transaction with its sync to disk, the receipt. The floor
 is what no program that keeps the contract is spared, each by the quickest library at hand: JWS and JWE over the payload
 with JSON (jwcrypto), AES-GCM over every key, HMAC over every row that is sealed, and the rows read or written by SQLite
-with executemany. All in seconds of the processor, so that a busy machine spoils little. Aim: less than twice the floor.
+with executemany. All in seconds of the processor, so that a busy machine spoils little. Aim: 1.6 times the floor.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from teds_provision.station.store.records import NodeRecord, TrustRecord, Whitel
 from teds_provision.vault import passphrase
 
 ROUNDS = 3
-AIM = 2.0
+AIM = 1.6
 
 
 def make(home: Path, name: str) -> Station:
@@ -182,9 +182,7 @@ def main(count: int = 10_000) -> None:
             floor = theirs[at] + parts[at]
             met = "met" if elapsed < AIM * floor else "MISSED"
             parts_text = f"jwcrypto {theirs[at]:.2f} s, AES-GCM, HMAC and SQLite {parts[at]:.2f} s"
-            print(
-                f"  {name}: ours {elapsed:.2f} s; floor {parts_text}: {elapsed / floor:.2f} ×, aim {AIM:.0f} ×: {met}"
-            )
+            print(f"  {name}: ours {elapsed:.2f} s; floor {parts_text}: {elapsed / floor:.2f} ×, aim {AIM} ×: {met}")
         for name, ours, bare_tool in (("sign and seal", layer[0], theirs[0]), ("open and verify", layer[1], theirs[1])):
             print(
                 f"  JOSE alone, {name}: ours {ours:6.3f} s, jwcrypto {bare_tool:6.3f} s, ratio {ours / bare_tool:5.2f}"

@@ -141,10 +141,17 @@ def decode(teds: bytes) -> SecurityTeds:
     Every step of a provisioning decodes the same octets, so the last results are cached: they are immutable.
     """
     try:
-        block = unframe(teds)
+        block, parts = _walked(teds)
     except BadDataError as error:
         raise NotCanonicalError(error.message) from error
-    return decode_block(block)
+    return _read(block, parts)
+
+
+@lru_cache(maxsize=128)  # as decode: what is decoded is checked next, over the octets that are signed
+def _walked(teds: bytes) -> tuple[bytes, list[tuple[int, int, int]]]:
+    """Return the data block of a framed Security TEDS and the places of its tuples; raises BadDataError."""
+    block = unframe(teds)
+    return block, _places(block)
 
 
 def decode_block(block: bytes) -> SecurityTeds:
@@ -189,8 +196,7 @@ def _read(block: bytes, parts: list[tuple[int, int, int]]) -> SecurityTeds:
 
 def tbs(uuid: bytes, teds: bytes) -> bytes:
     """Return what field 100 signs: label ‖ UUID ‖ the data block without the tuple of type 100, cut from the octets."""
-    block = unframe(teds)
-    return _without_signature(uuid, block, _places(block))
+    return _without_signature(uuid, *_walked(teds))
 
 
 def _without_signature(uuid: bytes, block: bytes, places: list[tuple[int, int, int]]) -> bytes:
