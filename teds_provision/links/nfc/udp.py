@@ -94,10 +94,10 @@ class NodeDevice(UdpDevice):  # type: ignore[misc]
         self._pushed_back: _Frame | None = None
         _at(self, host, port)
 
-    def leave_field(self) -> None:
+    def mute(self) -> None:
         """Leave the field; a bound socket is kept."""
         if self.socket is not None and not self.bound:
-            super().leave_field()
+            super().mute()
 
     def close(self) -> None:
         """Close the socket."""

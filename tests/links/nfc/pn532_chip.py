@@ -96,7 +96,7 @@ class Chip:
         if data[1] != 0:
             return b"\0"
         self._field(on=True)
-        self._device.leave_field()
+        self._device.mute()
         self._target = self._device.sense_tta(nfc.clf.RemoteTarget("106A"))
         if self._target is None:
             return b"\0"
