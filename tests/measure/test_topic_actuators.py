@@ -30,13 +30,14 @@ class Node:
     message_key = bytes(32)
 
     def __init__(self, driven: Answer) -> None:
-        self.driven, self.asked, self.values = driven, 0, 0
+        self.driven, self.asked, self.values, self.others = driven, 0, 0, 0
 
     def request(self, command: Command, _doing: str, *, within: float | None = None) -> bytes:
         if (command.command_class, command.function) == (128, Function.DRIVE):
             self.asked += 1
             return self.driven()
         self.values += within is not None
+        self.others += within is None
         return b""
 
 
@@ -135,6 +136,7 @@ def test_a_set_point_that_grew_old_while_the_node_was_busy_moves_nothing() -> No
     until(lambda: scene.actuators.refused > 0)
     scene.actuators.close()
     assert (scene.node.values, scene.applied, scene.messages) == (0, [], [])
+    assert scene.node.others == 0, "nor is the actuator claimed for it"
     assert "s old" in scene.warnings[0]
 
 
