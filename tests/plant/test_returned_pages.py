@@ -78,11 +78,16 @@ def loss(tmp_path: Path, cluster: Cluster) -> Iterator[Loss]:
     made.plant.close()
 
 
+OTHER_ROLES = pytest.mark.nightly(
+    "tests/plant/test_returned_pages.py::test_the_pages_of_a_removed_station_return_whatever_it_was[roles0]"
+)
+
+
 @pytest.mark.parametrize(
     "roles",
     [
         ("line",),
-        ("keeper", "sign"),
+        pytest.param(("keeper", "sign"), marks=OTHER_ROLES),
         *(pytest.param(roles, marks=pytest.mark.soak) for roles in [("sign",), ("base",), ("audit",)]),
     ],
 )
@@ -150,6 +155,7 @@ def test_an_older_database_gets_what_it_lacks_of_a_removed_station(loss: Loss) -
     assert loss.pages_here(later, west) == loss.pages_here(loss.north, west)
 
 
+@pytest.mark.nightly("tests/plant/test_synced_by_database.py::test_nothing_new_is_one_round_trip")
 def test_nothing_new_is_one_round_trip_when_pages_were_handed_in(loss: Loss) -> None:
     west = loss.leaver("line")
     loss.remove(west)

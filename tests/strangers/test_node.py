@@ -105,7 +105,13 @@ def played(hall: Hall, name: str, address: int, *, fd: bool) -> Iterator[Strange
         made.end()
 
 
-@pytest.fixture(params=[False, True], ids=["classic", "fd"])
+CLASSIC = pytest.mark.nightly(
+    "tests/strangers/test_node.py::test_it_is_verified_sampled_and_measured[fd]; on a classic bus: "
+    "tests/strangers/test_station.py::test_streams_come_whole_in_time_and_end"
+)
+
+
+@pytest.fixture(params=[pytest.param(False, marks=CLASSIC), True], ids=["classic", "fd"])
 def angle(hall: Hall, request: pytest.FixtureRequest) -> Iterator[StrangerNode]:
     with played(hall, "a", 0x31, fd=request.param) as made:
         yield made
