@@ -98,6 +98,7 @@ bench-ncap: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.ncap --seconds $(SECONDS)
 	$(BIN)/python -m benchmarks.newcomers
 	$(BIN)/python -m benchmarks.crowd
+	$(BIN)/python -m benchmarks.footprint
 
 bench-page: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.page --seconds $(SECONDS)

@@ -18,6 +18,7 @@ LEAST: dict[str, tuple[tuple[str, ...], ...]] = {
     "commands": (("--nodes", "5"),),
     "crowd": (("--nodes", "5"),),
     "entered": ((),),
+    "footprint": (("--nodes", "5", "--seconds", "1", "--soak", "2"),),
     "handover": (("20",),),
     "limits": (),
     "line": (("20",),),

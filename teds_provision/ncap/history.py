@@ -2,8 +2,9 @@
 
 Bins of 1 s for an hour, and of 10 ms for the last minute. A bin holds the least and the greatest valid value (SI), how
 many samples came, how many of them were not valid, and (those of 1 s) how many were lost. One channel takes 98.4 kB at
-most, whatever its rate: 14 octets a second of the hour, 8 a bin of the minute. A thousand channels stay below 100 MB;
-what was silent for an hour is forgotten.
+most, whatever its rate: 14 octets a second of the hour, 8 a bin of the minute. Of a slow channel those bins of the
+minute alone are kept that hold something. A thousand channels stay below 100 MB; what was silent for an hour is
+forgotten.
 
 If a channel's datasheet gives its values another meaning (unit, calibration, zero), a new segment begins: no bin holds
 values of two segments. The bin in which it begins drops what the segment before left there.
@@ -11,16 +12,19 @@ values of two segments. The bin in which it begins drops what the segment before
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Container, Iterable
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Any, Final
 
 from teds_provision.arrays import NDArray, np
 from teds_provision.errors import NotFoundError
 from teds_provision.measure.blocks import Block, ChannelFacts
+from teds_provision.ncap.bins import Bins, FewBins
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.codec.model import Units
 
@@ -28,112 +32,10 @@ HOUR, MINUTE = 3600, 60
 FINE: Final = 0.01  # seconds of a bin of the last minute
 _WAITING = 4096  # blocks that wait to be taken in; a thread that brings more takes them in itself
 _EVERY = 0.5  # seconds
-_LATE: Final = 2.0  # seconds by which samples may come behind others; more, and the clock was put back
-
+_FEW: Final = 8  # instants of a block that are taken in one by one: numpy's calls cost more than so many samples
 _EDGE: Final = 1e-6  # of a bin: a moment so short before an edge counts as behind it, as 0.01 is no binary fraction
 
 Key = tuple[str, int]
-
-
-class _Bins:
-    """A ring of bins of one width, by their number since 1970. The newest is ``newest``; those before it stay ``size``.
-
-    ``coarse``: the greatest value is kept as the distance from the least, rounded up to 8 bits of mantissa (0.4 % of
-    the distance, 0.8 at most), and counts end at 255: half the memory. Else both are Float32, counts end at 65535.
-    """
-
-    def __init__(self, width: float, size: int, *, coarse: bool) -> None:
-        self.width, self.size, self.coarse = width, size, coarse
-        self.newest = -1
-        counts = np.uint8 if coarse else np.uint16
-        self._low = np.full(size, np.nan, np.float32)
-        self._high = np.zeros(size, np.uint16) if coarse else np.full(size, np.nan, np.float32)
-        # samples, invalid, lost; what never happened takes no memory
-        self._counts: list[NDArray[Any] | None] = [np.zeros(size, counts), *([None] * (1 if coarse else 2))]
-        self._type, self._most = counts, np.iinfo(counts).max
-        self._starts: list[tuple[int, int]] = []  # first bin and number of each segment, both ascending
-
-    def add(
-        self, numbers: NDArray[Any], low: NDArray[Any], high: NDArray[Any], counts: NDArray[Any], segment: int
-    ) -> None:
-        """Take in bins of a segment, ascending and each once.
-
-        ``counts`` has a row each for samples, invalid and lost ones.
-        """
-        first, last = int(numbers[0]), int(numbers[-1])
-        if self.newest >= 0 and first < self.newest - _LATE / self.width:
-            self._forget(first, self.newest)  # the clock was put back: that time is overwritten
-            self.newest = first - 1
-        self._extend_to(first, segment)
-        if last > self.newest:
-            self._forget(max(self.newest + 1, last - self.size + 1), last)
-            self.newest = last
-        kept = numbers > self.newest - self.size
-        slots = numbers[kept] % self.size
-        least = np.fmin(self._low[slots], low[kept]).astype(np.float32)
-        self._put_high(slots, least, np.fmax(self._high_of(slots), high[kept]))
-        self._low[slots] = least
-        for row, more in enumerate(counts[: len(self._counts), kept]):
-            held = self._counts[row]
-            if held is None and more.any():
-                held = self._counts[row] = np.zeros(self.size, self._type)
-            if held is not None:
-                held[slots] = np.minimum(held[slots].astype(np.int64) + more, self._most)
-
-    def _extend_to(self, first: int, segment: int) -> None:
-        """Let a segment begin at bin ``first`` at the latest; older segments lose their bins from there on."""
-        if self._starts and self._starts[-1][1] == segment and self._starts[-1][0] <= first:
-            return
-        own = self._starts[-1][0] if self._starts and self._starts[-1][1] == segment else self.newest + 1
-        if first < own:
-            self._forget(first, own - 1)
-        oldest = self.newest - self.size + 1
-        kept = [start for start in self._starts if start[0] < first and start[1] != segment]
-        gone = sum(start <= oldest for start, _ in kept[1:])  # segments without a bin in the ring
-        self._starts = [*kept[gone:], (first, segment)]
-
-    @property
-    def segments(self) -> set[int]:
-        """The segments that may have bins here."""
-        return {segment for _, segment in self._starts}
-
-    def segments_of(self, numbers: NDArray[Any]) -> NDArray[Any]:
-        """Return the segment of each bin."""
-        at = np.searchsorted([first for first, _ in self._starts], numbers, side="right") - 1
-        return np.array([segment for _, segment in self._starts], np.int64)[at]
-
-    def _forget(self, first: int, last: int) -> None:
-        """Empty the bins from ``first`` to ``last``."""
-        slots = np.arange(first, last + 1) % self.size if last - first < self.size else slice(None)
-        self._low[slots] = np.nan
-        self._high[slots] = 0 if self.coarse else np.nan
-        for held in self._counts:
-            if held is not None:
-                held[slots] = 0
-
-    def _high_of(self, slots: NDArray[Any]) -> NDArray[Any]:
-        if not self.coarse:
-            return np.asarray(self._high[slots])
-        return np.asarray(self._low[slots] + (self._high[slots].astype(np.uint32) << 16).view(np.float32))
-
-    def _put_high(self, slots: NDArray[Any], low: NDArray[Any], high: NDArray[Any]) -> None:
-        if not self.coarse:
-            self._high[slots] = high
-            return
-        apart = np.nan_to_num(high - low, nan=0.0, posinf=3e38).astype(np.float32)
-        self._high[slots] = ((apart.view(np.uint32).astype(np.uint64) + 0xFFFF) >> 16).astype(np.uint16)
-
-    def between(self, first: int, last: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """Return number, least, greatest and counts of the non-empty bins from ``first`` to ``last``."""
-        numbers = np.arange(max(first, self.newest - self.size + 1, 0), min(last, self.newest) + 1)
-        slots = numbers % self.size
-        nothing = np.zeros(len(slots), np.int64)
-        counts = np.stack([nothing if held is None else held[slots].astype(np.int64) for held in self._counts])
-        some = counts.any(axis=0)
-        slots, counts = slots[some], counts[:, some]
-        if self.coarse:
-            counts = np.vstack([counts, nothing[some]])
-        return numbers[some], self._low[slots], self._high_of(slots), counts
 
 
 @dataclass(frozen=True)
@@ -172,8 +74,8 @@ def raw_numbers(block: Block, column: int) -> NDArray[Any]:
 
 class _Channel:
     def __init__(self, meaning: _Meaning) -> None:
-        self.hour = _Bins(1.0, HOUR, coarse=False)
-        self.minute = _Bins(FINE, round(MINUTE / FINE), coarse=True)
+        self.hour = Bins(1.0, HOUR, coarse=False)
+        self.minute: Bins | FewBins = FewBins(FINE, round(MINUTE / FINE))
         self.segment, self.meaning = 0, meaning
         self._meanings = {0: meaning}
 
@@ -185,6 +87,22 @@ class _Channel:
             for segment, known in self._meanings.items()
             if any(segment in bins.segments for bins in (self.hour, self.minute))
         } | {self.segment: meaning}
+
+    def add_one(self, at: float, value: float, invalid: int, lost: int) -> None:
+        """Take in one sample."""
+        self.hour.add_one(math.floor(at + _EDGE), value, invalid, lost, self.segment)
+        minute = self.minute
+        if isinstance(minute, FewBins) and minute.full:
+            minute = self.minute = minute.all_bins()
+        minute.add_one(math.floor(at / FINE + _EDGE), value, invalid, lost, self.segment)
+
+    def ring(self, *, fine: bool) -> Bins:
+        """Return the bins of the last minute, or of the hour, for many samples at a time."""
+        if not fine:
+            return self.hour
+        if isinstance(self.minute, FewBins):
+            self.minute = self.minute.all_bins()
+        return self.minute
 
     def described(self, segment: int) -> dict[str, Any]:
         """Return a segment with its SI unit; one of raw numbers has none."""
@@ -264,16 +182,35 @@ class History:
         channel = self._channels.get(key)
         if channel is None:
             channel = self._channels[key] = _Channel(meaning)
-        elif channel.meaning != meaning:
+        elif channel.meaning is not meaning and channel.meaning != meaning:
             channel.begin_segment(meaning)
         return channel
 
     def _put(self, block: Block) -> None:
-        at = np.asarray(block.time, np.float64)
         run, key = (block.run, block.channels[0]), (block.uuid, block.stream)
         known = self._streams.get(key)
         lost = max(0, block.index - known.expected) if known is not None and known.run == run else 0
         self._streams[key] = _Stream(run, block.index + len(block.time))
+        if len(block.time) <= _FEW:
+            self._put_few(block, lost)
+        else:
+            self._put_many(block, lost)
+
+    def _put_few(self, block: Block, lost: int) -> None:
+        """Take in samples one by one; ``lost`` were missing before the first."""
+        moments = list(accumulate(block.time.tolist(), max))
+        for column, number in enumerate(block.channels):
+            channel = self._channel((block.uuid, number))
+            valid = block.valid[:, column].tolist()
+            values = (raw_numbers(block, column) if channel.meaning.raw else block.value[:, column]).tolist()
+            missing = lost
+            for at, value, is_valid in zip(moments, values, valid, strict=True):
+                channel.add_one(at, value if is_valid or channel.meaning.raw else math.nan, not is_valid, missing)
+                missing = 0
+
+    def _put_many(self, block: Block, lost: int) -> None:
+        """Take in samples all at once; ``lost`` were missing before the first."""
+        at = np.asarray(block.time, np.float64)
         valid = np.asarray(block.valid, bool)
         values = np.where(valid, block.value, np.nan)
         for column, number in enumerate(block.channels):
@@ -290,9 +227,8 @@ class History:
             gone[0] = lost
             for column, number in enumerate(block.channels):
                 one = self._channel((block.uuid, number))
-                bins = one.minute if fine else one.hour
                 counts = np.stack([total, invalid[:, column], gone])
-                bins.add(numbers, low[:, column], high[:, column], counts, one.segment)
+                one.ring(fine=fine).add(numbers, low[:, column], high[:, column], counts, one.segment)
 
     # -- what is asked -----------------------------------------------------------------------------------------------
 
@@ -322,7 +258,9 @@ class History:
                     hint="Start a measurement; the station keeps an hour of it in memory.",
                 )
             newest = (one.minute.newest + 1) * FINE
-            bins = one.minute if begin >= newest - MINUTE - 1 and end - begin <= MINUTE + 1 else one.hour
+            bins: Bins | FewBins = (
+                one.minute if begin >= newest - MINUTE - 1 and end - begin <= MINUTE + 1 else one.hour
+            )
             first, last = (int(np.floor(moment / bins.width + _EDGE)) for moment in (begin, end))
             first, last = max(first, bins.newest - bins.size + 1), min(last, bins.newest)
             numbers, low, high, counts = bins.between(first, last)
@@ -351,7 +289,7 @@ class History:
         }
 
 
-def _rate(hour: _Bins) -> float | None:
+def _rate(hour: Bins) -> float | None:
     """Return samples a second of the last ten whole seconds that have any; None if they are long past."""
     newest = hour.newest
     numbers, _, _, counts = hour.between(newest - 10, newest - 1)

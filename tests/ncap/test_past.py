@@ -11,6 +11,7 @@ import pytest
 
 from teds_provision.errors import NotFoundError
 from teds_provision.measure.blocks import Block, ChannelFacts
+from teds_provision.ncap.bins import Bins, FewBins
 from teds_provision.ncap.history import HOUR, History
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput
 
@@ -129,12 +130,16 @@ def test_a_channel_takes_less_than_a_hundred_thousand_octets() -> None:
     ramp(past, NOW - 70, 70)
     past.channel_history(NODE, 1)
     channel = past._channels[NODE, 1]
-    rings = [ring for bins in (channel.hour, channel.minute) for ring in (bins._low, bins._high, *bins._counts)]
+    rings = [
+        ring for bins in (channel.hour, channel.ring(fine=True)) for ring in (bins._low, bins._high, *bins._counts)
+    ]
     held = sum(ring.nbytes for ring in rings if ring is not None)
     assert held <= 78_000, "nothing was lost, nothing invalid"
     past.block(block(NOW, [[1.0]] * 100, index=9000, valid=[[False]] * 100))
     past.channel_history(NODE, 1)
-    rings = [ring for bins in (channel.hour, channel.minute) for ring in (bins._low, bins._high, *bins._counts)]
+    rings = [
+        ring for bins in (channel.hour, channel.ring(fine=True)) for ring in (bins._low, bins._high, *bins._counts)
+    ]
     held = sum(ring.nbytes for ring in rings if ring is not None)
     assert held <= 98_400
 
@@ -171,3 +176,56 @@ def line(zero: float = 0.0, by: str = "") -> Calibration:
     """Return a calibration of channel 1."""
     part = CalibrationInput(1, 1, (0.0, 65536.0), (0.0,))
     return Calibration(1, "linear", (part,), (0.0, 1e-4), zero_offset=zero, by=by)
+
+
+@pytest.mark.parametrize("rate", [1.0, 40.0, 400.0])
+def test_samples_one_by_one_leave_the_past_that_they_leave_together(rate: float) -> None:
+    drawn = np.random.default_rng(round(rate))
+    values = drawn.normal(size=(round(150 * rate), 2)) * 100
+    valid = drawn.random(values.shape) > 0.1
+    first, one_by_one, together = NOW - 150 + 0.003, History(), History()  # no sample is at the edge of a bin
+    for past, most in ((one_by_one, 8), (together, len(values))):
+        at = 0
+        while at < len(values):
+            end = min(len(values), at + most)
+            missing = 3 * (at > len(values) // 2)  # what comes behind the middle follows a gap
+            past.block(
+                block(
+                    first + at / rate,
+                    values[at:end].tolist(),
+                    rate=rate,
+                    index=at + missing,
+                    valid=valid[at:end].tolist(),
+                )
+            )
+            at = end
+    for channel in (1, 2):
+        for since in (first, NOW - 20):
+            few, many = (
+                past.channel_history(NODE, channel, since, NOW, points=3600) for past in (one_by_one, together)
+            )
+            assert few["bin"] == many["bin"]
+            assert few["bin"] == (1.0 if since == first else pytest.approx(0.01))
+            for name in ("time", "low", "count", "invalid", "segment"):
+                assert few[name] == many[name], name
+            for least, high, other in zip(few["low"], few["high"], many["high"], strict=True):
+                assert (high is None) == (other is None)
+                assert high is None or high == pytest.approx(other, abs=0.02 * (other - least) + 1e-4)
+    assert sum(few["lost"]) == 0, "the last minute does not keep it"
+    lost = one_by_one.channel_history(NODE, 1, first, NOW, points=3600)["lost"]
+    assert (sum(lost), max(lost)) == (3, 3)
+
+
+def test_a_slow_channel_takes_half_of_the_memory_and_one_that_becomes_quick_loses_nothing() -> None:
+    past, first = History(), float(NOW - 60)
+    for second in range(30):
+        past.block(block(first + second, [[float(second)]], index=second))
+    past.channel_history(NODE, 1)
+    channel = past._channels[NODE, 1]
+    assert type(channel.minute) is FewBins
+    ramp(past, first + 30, 30, rate=1000.0)
+    fine = past.channel_history(NODE, 1, first + 5, NOW, points=6000)
+    assert type(past._channels[NODE, 1].minute) is Bins
+    assert fine["time"][:26] == [first + second for second in range(5, 31)]
+    assert fine["low"][:25] == fine["high"][:25] == [float(second) for second in range(5, 30)]
+    assert sum(fine["count"]) == 25 + 30_000
