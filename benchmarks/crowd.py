@@ -1,10 +1,14 @@
 """200 nodes in C on one bus: provisioned together, then switched on together under a station that measures all.
 
-``python -m benchmarks.crowd [--nodes 200] [--only 500|FD]``: the nodes in one process (``tests/firmware/crowd.py``), a
-paced bus whose senders add up how long their frames take the wire, `provision --all` and `ncap run --measure all
---mqtt` as a user starts them, a mosquitto on loopback. A row is the time from the start of the conversation with the
-first node until the last node has its verdict, or from power-on to the last node's first value, to the wire time of
-all frames until then. Beside it: the processor time of the station and of the nodes' one process meanwhile.
+``python -m benchmarks.crowd [--nodes 200] [--only 500|FD] [--alone]``: the nodes in one process
+(``tests/firmware/crowd.py``), a paced bus whose senders add up how long their frames take the wire, `provision --all`
+and `ncap run --measure all --mqtt` as a user starts them, a mosquitto on loopback. A row is the time from the start of
+the conversation with the first node until the last node has its verdict, or from power-on to the last node's first
+value, to the wire time of all frames until then. Beside it: the processor time of the station and of the nodes' one
+process meanwhile.
+
+``--alone``: the store lies in memory and the station has the first core to itself; nodes, broker and this process have
+the others. What is left above the wire's time is then the station's own: one interpreter, on one core.
 """
 
 from __future__ import annotations
@@ -29,6 +33,8 @@ from teds_provision.links.can.pacing import Wire
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.links.ports import free_port
 
+FIRST = min(os.sched_getaffinity(0))
+MEMORY = Path("/dev/shm")  # a file system in memory
 ALL_AIM, MEASURE_AIM = 1.15, {"500 kbit/s": 1.2, "FD 500k/2M": 1.5}
 _TICKS = os.sysconf("SC_CLK_TCK")
 
@@ -62,20 +68,29 @@ def crowd(link: str, count: int) -> Iterator[Nodes]:
         process.wait(20)
 
 
+def to_itself(process: subprocess.Popen[str], options: argparse.Namespace) -> subprocess.Popen[str]:
+    """Give a process of the station the first core, if that was asked for; the others are everyone else's."""
+    if options.alone:
+        os.sched_setaffinity(process.pid, {FIRST})
+    return process
+
+
 def worked(pid: int) -> float:
     """Return the seconds of processor time of a running process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS
 
 
-def provisioned(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kind: str) -> None:
+def provisioned(
+    rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kind: str, options: argparse.Namespace
+) -> None:
     """Measure ``provision --all``."""
     listed = home.parent / "list.csv"
     listed.write_text("uuid\n" + "".join(f"{uuid}\n" for uuid in nodes.uuids))
     finished(started(home, "whitelist", "import", str(listed)))
     time.sleep(1.0)  # Announces
     cpu, busy = nodes.ask("cpu"), wire.busy_seconds
-    process = started(home, *PROVISION, "--all", "--via", "can", "--can", link)
+    process = to_itself(started(home, *PROVISION, "--all", "--via", "can", "--can", link), options)
     assert process.stdout is not None
     assert process.stderr is not None
     threading.Thread(target=process.stderr.read, daemon=True).start()
@@ -98,11 +113,19 @@ def provisioned(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kin
         print(f"  failed: {failure}")
     rows.add("  the wire time of all frames", taken, "s")
     rows.add("  ratio", seconds / taken, "×", aim=ALL_AIM)
+    add_work(rows, own, taken, nodes.ask("cpu") - cpu)
+
+
+def add_work(rows: Rows, own: float, wire: float, nodes: float) -> None:
+    """Add the processor time of the station, also to the wire time, and of the nodes' process."""
     rows.add("  processor time of the station", own, "s")
-    rows.add("  of the nodes' one process", nodes.ask("cpu") - cpu, "s")
+    rows.add("  that to the wire time: one interpreter takes no less", own / wire, "×")
+    rows.add("  of the nodes' one process", nodes, "s")
 
 
-def measured(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kind: str) -> None:
+def measured(
+    rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kind: str, options: argparse.Namespace
+) -> None:
     """Measure ``ncap run --measure all``, with power for all nodes at once."""
     nodes.ask("off")
     with ExitStack() as stack:
@@ -117,7 +140,7 @@ def measured(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kind: 
         broker = [str(MOSQUITTO), "-c", str(home.parent / "broker.conf")]
         process(subprocess.Popen(broker, stderr=subprocess.DEVNULL, text=True))
         words = ("ncap", "run", "--measure", "all", "--rate", "1", "--mqtt", f"mqtt://127.0.0.1:{port}")
-        ncap = process(started(home, *words, "--can", link))
+        ncap = process(to_itself(started(home, *words, "--can", link), options))
         assert ncap.stdout is not None
         assert ncap.stderr is not None
         ncap.stdout.readline()
@@ -136,8 +159,7 @@ def measured(rows: Rows, home: Path, link: str, nodes: Nodes, wire: Wire, kind: 
         rows.add(f"{len(nodes.uuids)} switched on together, {kind}: last first value", seconds, "s")
         rows.add("  the wire time of all frames until then", taken, "s")
         rows.add("  ratio", seconds / taken, "×", aim=MEASURE_AIM[kind])
-        rows.add("  processor time of the station", own, "s")
-        rows.add("  of the nodes' one process", cpu, "s")
+        add_work(rows, own, taken, cpu)
         rows.add("  half of them had a value after", sorted(topics.first.values())[len(nodes.uuids) // 2] - began, "s")
         rows.add("  running", states.count("running"), "")
 
@@ -146,9 +168,16 @@ def main(words: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--nodes", type=int, default=200)
     parser.add_argument("--only", default="", help="500 (kbit/s) or FD")
+    parser.add_argument("--alone", action="store_true", help="store in memory, the station on a core of its own")
     options = parser.parse_args(words)
     if MOSQUITTO is None:
         raise SystemExit("mosquitto is not installed: apt-get install mosquitto")
+    if options.alone:
+        os.environ["BENCH_DISK"] = str(MEMORY)
+        cores = os.sched_getaffinity(0)
+        if len(cores) < 2:
+            raise SystemExit("--alone needs two cores.")
+        os.sched_setaffinity(0, cores - {min(cores)})
     rows = Rows()
     for kind, more in (("500 kbit/s", ""), ("FD 500k/2M", "&fd=1")):
         if not kind.startswith(options.only):
@@ -156,8 +185,8 @@ def main(words: list[str] | None = None) -> None:
         link = f"udp_multicast:239.74.163.13?port={free_port()}{more}&pace=1"
         wire = Wire(parse_spec(link).wire)
         with station(quick=True) as home, crowd(link, options.nodes) as nodes:
-            provisioned(rows, home, link, nodes, wire, kind)
-            measured(rows, home, link, nodes, wire, kind)
+            provisioned(rows, home, link, nodes, wire, kind, options)
+            measured(rows, home, link, nodes, wire, kind, options)
         wire.close()
 
 

@@ -62,7 +62,7 @@ def provision_all(home: Path, link: str, nodes: Nodes) -> None:
 
 
 def measured(rows: Rows, count: int, rate: float, seconds: float, soak: float) -> None:
-    """Measure so many nodes; tell what that costs."""
+    """Measure so many nodes, and add what that costs."""
     with station(quick=True) as home, ExitStack() as stack:
         links: list[str] = []
         for first in range(0, count, A_BUS):
@@ -87,7 +87,7 @@ def measured(rows: Rows, count: int, rate: float, seconds: float, soak: float) -
             threading.Thread(target=stream.read, daemon=True).start()
         here = stack.enter_context(client.connect(home=home))
         settled(here, count)
-        tell(rows, here, ncap.pid, count, rate, seconds)
+        add_costs(rows, here, ncap.pid, count, rate, seconds)
         if soak:
             soaked(rows, here, ncap.pid, count, soak)
 
@@ -120,20 +120,20 @@ def samples(here: client.Client) -> tuple[int, int]:
     )
 
 
-def tell(rows: Rows, here: client.Client, pid: int, count: int, rate: float, seconds: float) -> None:
-    """One row each: memory, threads, processor time."""
+def add_costs(rows: Rows, here: client.Client, pid: int, count: int, rate: float, seconds: float) -> None:
+    """Add one row each: memory, threads, processor time."""
     resident, proportional = memory(pid)
-    rows.tell(f"{count} nodes: memory of the station", resident, "MB", aim=MEMORY + MEMORY_OF_A_NODE * count)
-    rows.tell("  proportional", proportional, "MB")
-    rows.tell("  its threads", threads(pid), "")
+    rows.add(f"{count} nodes: memory of the station", resident, "MB", aim=MEMORY + MEMORY_OF_A_NODE * count)
+    rows.add("  proportional", proportional, "MB")
+    rows.add("  its threads", threads(pid), "")
     time.sleep(1.5)  # reports come once a second
     (before, lost), own, began = samples(here), worked(pid), time.monotonic()
     time.sleep(seconds)
     cores = (worked(pid) - own) / (time.monotonic() - began)
     after, lost_after = samples(here)
-    rows.tell("  values", (after - before) / (time.monotonic() - began), "/s")
-    rows.tell("  lost, late or bad", lost_after - lost, "")
-    rows.tell("  processor", cores, "cores", aim=CPU_AIM if (count, rate) == (CPU_NODES, CPU_RATE) else None)
+    rows.add("  values", (after - before) / (time.monotonic() - began), "/s")
+    rows.add("  lost, late or bad", lost_after - lost, "")
+    rows.add("  processor", cores, "cores", aim=CPU_AIM if (count, rate) == (CPU_NODES, CPU_RATE) else None)
 
 
 def soaked(rows: Rows, here: client.Client, pid: int, count: int, seconds: float) -> None:
@@ -145,12 +145,12 @@ def soaked(rows: Rows, here: client.Client, pid: int, count: int, seconds: float
     hours, megabytes = zip(*points, strict=True)
     middle, level = sum(hours) / len(points), sum(megabytes) / len(points)
     slope = sum((at - middle) * (each - level) for at, each in points) / sum((at - middle) ** 2 for at in hours)
-    rows.tell(
+    rows.add(
         f"  {seconds / 60:.0f} minutes with {count} nodes: growth", slope, "MB/h", aim=GROWTH + GROWTH_OF_A_NODE * count
     )
-    rows.tell("  from", megabytes[0], "MB")
-    rows.tell("  to", megabytes[-1], "MB")
-    rows.tell("  lost, late or bad since the start", samples(here)[1], "")
+    rows.add("  from", megabytes[0], "MB")
+    rows.add("  to", megabytes[-1], "MB")
+    rows.add("  lost, late or bad since the start", samples(here)[1], "")
 
 
 def main(words: list[str] | None = None) -> None:

@@ -62,7 +62,8 @@ FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 LOOKING = 2.0  # seconds that a node which ran before is looked for, between its reports
 WORKED_ON, NOTICE_AFTER, LONGEST_WORK = 0.05, 0.5, 60.0
 """Seconds between checks whether a command works on the node, until that is reported, and until it counts as hung."""
-LOOK = 0.2  # seconds between looks at how it does
+LOOK = 0.2  # seconds between looks at how it does while something is about to happen
+CALM = 0.5  # seconds between them while nothing is: a thousand nodes are a thousand threads that wake
 LOOK_FOR_DATA = 0.4  # seconds after an announcement in which data shows that it was not the node's
 ANNOUNCED = 1.0  # seconds until a node without such data is asked after it
 DECIDED = 0.5  # seconds between looks whether this station's own decision against a node was taken back
@@ -496,7 +497,8 @@ class NodeSupervisor:
         reported_at = time.monotonic()
         lied, mark = False, ""
         while not self._stop.is_set():
-            self._anew.wait(LOOK)
+            if self._anew.wait(LOOK if rest is not None or self._announced or self._elsewhere else CALM):
+                self._anew.clear()  # it announced itself; the end of the measurement has an event of its own
             standing.require()
             if standing.mark != mark:
                 mark = standing.mark
@@ -536,7 +538,9 @@ class NodeSupervisor:
         self._heard_announce()
 
     def _heard_announce(self) -> None:
-        self._announced = self._announced or time.monotonic()
+        if not self._announced:
+            self._announced = time.monotonic()
+            self._anew.set()
 
     def _doubted(self, now: float) -> bool:
         """Return True if an Announce is a reason to ask the node: then it has started again, or moved.

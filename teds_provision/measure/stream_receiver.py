@@ -83,6 +83,11 @@ class ReceivedStream:
         """True if a message waits which no other will join soon."""
         return self._at_once and bool(self._came)
 
+    @property
+    def holds(self) -> bool:
+        """True if messages wait here."""
+        return bool(self._came or self.early)
+
     def begin(self, start: int) -> None:
         """Begin a triggered stream, as its first instant is known: from now on its silence counts."""
         with self._order:
@@ -160,6 +165,7 @@ class StreamReceiver:
         self._port = port
         self._streams: dict[tuple[int, int], ReceivedStream] = {}
         self._early: dict[tuple[int, int], EarlyMessages] = {}
+        self._new: deque[ReceivedStream] = deque()  # registered, and not looked at yet
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._looks = 0
@@ -185,6 +191,7 @@ class StreamReceiver:
             if key in self._early:
                 heard.early = self._early[key].messages
             self._streams = {**self._streams, key: heard}
+            self._new.append(heard)
             self._early.pop(key, None)
 
     def hear_out(self, heard: ReceivedStream, wanted: int) -> None:
@@ -235,6 +242,7 @@ class StreamReceiver:
 
     def _hear(self) -> None:
         """Hear until the thread is to end; raises LinkError."""
+        waiting = {id(heard): heard for heard in self._streams.values()}  # may hold messages that are not handed on yet
         with self._port.listen() as listener:
             self.failure = None
             looked = time.monotonic()
@@ -243,9 +251,13 @@ class StreamReceiver:
                 came = listener.get_all(SLICE)
                 touched = {(message.node, message.stream): self._dispatch(message) for message in came}
                 for heard in touched.values():
-                    if heard is not None and heard.due:
+                    if heard is None:
+                        continue
+                    if heard.due:
                         heard.finish()
-                looked = self._flush(looked, listener.lost)
+                    else:
+                        waiting[id(heard)] = heard
+                looked = self._flush(waiting, looked, listener.lost)
                 self._looks += 1
                 time.sleep(REST)
 
@@ -259,12 +271,17 @@ class StreamReceiver:
             early.messages.append(message)
         return heard
 
-    def _flush(self, looked: float, lost: int) -> float:
+    def _flush(self, waiting: dict[int, ReceivedStream], looked: float, lost: int) -> float:
         """Hand on, now and then, what has waited; gives when that was last done."""
         now = time.monotonic()
         if now - looked < SLICE:
             return looked
         self.lost_frames = lost
-        for heard in self._streams.values():
+        while self._new:
+            heard = self._new.popleft()
+            waiting[id(heard)] = heard
+        for key, heard in list(waiting.items()):
             heard.flush(now)
+            if not heard.holds:
+                del waiting[key]
         return now

@@ -247,6 +247,11 @@ class Bus:
         """True if :meth:`wait` sleeps."""
         return self._descriptor >= 0
 
+    @property
+    def stamps_arrivals(self) -> bool:
+        """True if a frame's time of arrival is the kernel's, whenever it is read."""
+        return self._clock_is_ours
+
     def drain(self, most: int = 10_000) -> None:
         """Throw away what has come in unread."""
         for _ in range(most):

@@ -78,6 +78,10 @@ class BusReader:
             else:
                 self._bus.wait(_ALIVE_SECONDS, self._woken)
                 self._read_all()
+                if self._bus.stamps_arrivals and not self._leaning:
+                    # Nobody waits for a reply: data gather, since a waking costs more than a frame. Who comes meanwhile
+                    # reads by itself, and the frames keep the kernel's time of arrival.
+                    time.sleep(_NAP_SECONDS)
 
     def stop(self) -> None:
         """Stop all reading; returns when no thread reads."""

@@ -153,6 +153,8 @@ class Measurement:
 
     def _trigger(self) -> None:
         """Send the trigger when it is due; report the nodes that it waits for, and how long."""
+        if not self.request.trigger:
+            return
         late = [supervisor for supervisor in self.supervisors if not supervisor.ready.is_set()]
         if self._common_start.due(len(self.supervisors) - len(late), len(self.supervisors)):
             trigger.pull(self._common_start, self.supervisors, self.watcher.note)

@@ -35,6 +35,7 @@ LIVE_WAITING = 256  # items that a live sink may owe: newest wins
 BUDGET: Final = 5000  # messages a second that one process carried to ROS 1, ROS 2 or MQTT (docs/ros.md)
 ROWS: Final = 1000  # rows a second of an array on a topic, at most; a recorder takes all of them
 TICK = 0.05  # seconds between looks at the clock while nothing comes
+LIVE_REST = 0.003  # seconds for which items gather before a live sink takes the next: a waking costs more than an item
 RECORDER_LOOKS = 0.02  # seconds between looks of a recorder at what waits
 TOGETHER = 64  # items that a recorder takes at a time, at most
 CLOSING = 30.0  # seconds for a recorder to write what it owes
@@ -279,6 +280,8 @@ class ThreadedSink(ABC):
             items, done = self._next()
             for item in items:
                 self._one(item)
+            if items and not self.recorder and not self._items and not self._closing:
+                time.sleep(LIVE_REST)
             now = time.monotonic()
             if not items or now - looked >= TICK:
                 self._beat(now)

@@ -51,6 +51,7 @@ FILES: Final = ("password-file", "ca", "cert", "key")
 """Keys of the URL; each names a file."""
 _MOST_OCTETS: Final = 1 << 20
 PORTS = {"mqtt": 1883, "mqtts": 8883}
+_JSON: Final = json.JSONEncoder(allow_nan=False)  # json.dumps would make one for each message
 _FULL: Final = 15  # what the library answers where WAITING messages wait
 _FAREWELL: Final = 2.0  # seconds for the broker to take that this measurement has ended
 KEEP_ALIVE = 15  # seconds: the broker reports offline after one and a half of it
@@ -277,7 +278,7 @@ class MqttSink(ThreadedSink):
         if block.test_pattern or self._station.scalar_rate <= 0 or not len(block.time):
             return
         newest = self._newest.setdefault(block.uuid, {})
-        known = [self._facts.get((block.uuid, n), ChannelFacts(block.uuid, "", n, "")) for n in block.channels]
+        known = [self._facts.get((block.uuid, n)) or ChannelFacts(block.uuid, "", n, "") for n in block.channels]
         for column, facts in enumerate(known):
             newest[self._field(facts)] = self._shown(facts, float(block.value[-1, column]))
         now = time.monotonic()
@@ -303,7 +304,7 @@ class MqttSink(ThreadedSink):
 
     def _publish(self, topic: str, words: dict[str, Any], *, qos: int = 0, retain: bool = False) -> bool:
         """Return True if the library took it; without a connection it keeps QoS 1 messages and drops the rest."""
-        octets = json.dumps(words, allow_nan=False).encode()
+        octets = _JSON.encode(words).encode()
         if self._client.publish(topic, octets, qos=qos, retain=retain).rc == _FULL:
             return False
         self._count(octets=len(octets), messages=1)

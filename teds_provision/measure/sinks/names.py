@@ -11,6 +11,7 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Set
+from functools import lru_cache
 from itertools import chain
 from typing import Final, TypeVar
 
@@ -21,6 +22,7 @@ LONGEST = 60
 TOKEN = re.compile(r"[A-Za-z](?:[A-Za-z0-9]|_(?=[A-Za-z0-9]))*\Z")
 
 
+@lru_cache(maxsize=4096)  # asked for each value that goes to a broker
 def slug(text: str) -> str:
     """Return an operator's or a datasheet's name as one part of a topic; empty if nothing is left of it."""
     letters = unicodedata.normalize("NFKD", text.casefold()).encode("ascii", "ignore").decode().lower()
