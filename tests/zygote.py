@@ -348,7 +348,7 @@ def _become(request: _Request) -> None:
 
 def _leave(code: int) -> None:
     """End as Python does, but for freeing what the zygote imported, which is most of the cost of a short command."""
-    threading._shutdown()
+    threading._shutdown()  # type: ignore[attr-defined]  # what Python itself calls at its end
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError, AttributeError):

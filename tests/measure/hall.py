@@ -64,6 +64,8 @@ class HallNode:
     def start(self, *words: object, can: str = "", fault: str = "") -> HallNode:
         """Power on: the product's node, or one with a fault."""
         bus = self.bus = can or self.bus or self.hall.can
+        program: tuple[str, ...]
+        given: list[object]
         if fault:
             program, given = FAULTY, [fault, bus, self.folder, *words]
         else:

@@ -93,7 +93,8 @@ class MeasuringStation(SealedLine):
 
     def hear(self, receiver: Receiver, messages: int, seconds: float = PATIENCE) -> list[StreamMessage]:
         """Return the next messages of one stream."""
-        assembly, heard = StreamAssembly(receiver.plan.length, fd=self.fd), []
+        assembly = StreamAssembly(receiver.plan.length, fd=self.fd)
+        heard: list[StreamMessage] = []
         until = time.monotonic() + seconds
         while len(heard) < messages:
             left = until - time.monotonic()

@@ -21,7 +21,8 @@ from teds_provision.errors import (
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, TedsFunction
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning.agree import require_session
-from teds_provision.provisioning.build import BuildOrder, merged
+from teds_provision.provisioning.build import BuildOrder
+from teds_provision.provisioning.calibration_guard import merged
 from teds_provision.provisioning.identify import IdentifiedNode
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import ProvisionResult, provision
@@ -160,9 +161,12 @@ def test_a_node_that_is_always_busy_ends_with_the_link(
 
 @pytest.mark.parametrize("garbage", [b"", b"\x01", b"\x01\x00\x05abc", b"\x01\x00\x00", bytes(400)])
 def test_garbage_is_an_error_of_ours_and_changes_nothing(station: Station, board: Board, garbage: bytes) -> None:
+    def garbage_from(count: int) -> Callable[[int, bytes], bytes]:
+        return lambda n, reply: garbage if n >= count else reply
+
     for count in range(1, 12):
         with pytest.raises(TedsProvisionError):
-            run(station, board, MemoryLink(board, tamper=lambda n, reply, at=count: garbage if n >= at else reply))
+            run(station, board, MemoryLink(board, tamper=garbage_from(count)))
     assert run(station, board).verified.verdict == "authentic"
 
 

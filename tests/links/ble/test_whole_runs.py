@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -166,9 +167,13 @@ def test_two_nodes_are_measured_over_the_air(desk: Desk, air: Air) -> None:
         radio.do("drop", 0)
         running.wait_for('"state":"lost"')
         lost = len(running.out)
+
+        def has_come_back(uuid: str) -> bool:
+            running.read(0.1)
+            return running.out[lost:].count(f'"event":"data","uuid":"{uuid}"') > ENOUGH
+
         for uuid in uuids:  # each by itself: the one that was cut comes back later, the other one's do not count for it
-            data = f'"event":"data","uuid":"{uuid}"'
-            until(lambda data=data: (running.read(0.1), running.out[lost:].count(data) > ENOUGH)[1])
+            until(partial(has_come_back, uuid))
         running.signal(signal.SIGTERM)
         done = running.end()
         assert done.code == 0, done
