@@ -64,6 +64,7 @@ def test_a_page_that_is_not_there_would_be_found() -> None:
 # -- names in pages and docstrings -------------------------------------------------------------------------------------
 
 PACKAGE = ROOT / "teds_provision"
+SEE = re.compile(r"\b[Ss]ee\s+(?:``)?((?:[a-z_]+\.)*[A-Z][a-z]\w*(?:\.\w+)*)")
 ROLE = re.compile(r":(mod|func|class|meth|data|attr|exc):`~?([^`]+)`")
 
 
@@ -161,6 +162,26 @@ def test_what_docstrings_refer_to_exists() -> None:
     ] == []
     here = PACKAGE / "limits.py"
     assert len(unknown_roles(here, "x = 1  # :func:`gone` :mod:`.gone` :func:`x`", every)) == 2
+
+
+def unknown_sees(text: str, every: set[str]) -> list[str]:
+    """Return the names behind "see" of which a part is nowhere: a module, a class or what belongs to it."""
+    return [name for name in SEE.findall(text) if not every.issuperset(name.split("."))]
+
+
+def test_each_name_that_a_docstring_says_to_see_exists() -> None:
+    files = sorted(PACKAGE.rglob("*.py"))
+    every = set().union(*map(defined, files), *(path.relative_to(PACKAGE).with_suffix("").parts for path in files))
+    wrong = [
+        f"{path.relative_to(ROOT)}: see {name}"
+        for path in files
+        for node in ast.walk(parsed(path))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        for name in unknown_sees(node.value, every)
+    ]
+    assert wrong == []
+    text = "see\\nNodeHandler, see ``links.ports.Trace``; see NodeHandlerHandler; see ``Link.nowhere``"
+    assert unknown_sees(text, every) == ["NodeHandlerHandler", "Link.nowhere"]
 
 
 # -- the form of a page ------------------------------------------------------------------------------------------------

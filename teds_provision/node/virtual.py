@@ -288,7 +288,7 @@ class VirtualNode:
         return reply
 
     def reply_left(self, link: str) -> None:
-        """Let data follow; see MeasuringHandlerHandler."""
+        """Let data follow; see MeasuringHandler."""
         with self._core.interrupt():
             self.tim.reply_left(link)
         self._wake()
@@ -299,13 +299,13 @@ class VirtualNode:
             self.tim.link_lost(link)
 
     def trigger(self, link: str, token: bytes, tick: int) -> None:
-        """Handle a trigger; see MeasuringHandlerHandler."""
+        """Handle a trigger; see MeasuringHandler."""
         with self._core.interrupt():
             self.tim.trigger(link, token, tick)
         self._wake()
 
     def drive(self, link: str, data: bytes) -> None:
-        """Handle a Drive frame; see MeasuringHandlerHandler."""
+        """Handle a Drive frame; see MeasuringHandler."""
         with self._core.interrupt():
             self.tim.drive(link, data)
 
@@ -336,7 +336,7 @@ class VirtualNode:
         return self.tim.actuator_claimed()
 
     def tick(self, at: float = 0.0) -> int:
-        """Return the present tick, or that of ``at`` (see MeasuringHandlerHandler); 0 for a node without clock."""
+        """Return the present tick, or that of ``at`` (see MeasuringHandler); 0 for a node without clock."""
         if self.board is None:
             return 0
         # A simulation's clock does not advance between its lines: a moment ago it was the same tick.
