@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from teds_provision.api import answers, bodies
-from teds_provision.cli.measure.measure import measure
+from teds_provision.cli.measure.measure import CONTINUED_WITH, measure
 from teds_provision.cli.measure.sample import set_value
 from teds_provision.cli.service import ncap
 from teds_provision.measure.request import MeasurementRequest
@@ -114,3 +114,16 @@ def test_each_option_of_a_setting_is_made_from_it() -> None:
         if flag in flags
     ]
     assert found == []
+
+
+NOT_SAID = frozenset(
+    ("group", "uuids", "match", "frozen", "channels", "kind", "trigger", "actuators", "dead_man", "scalar_rate")
+)
+"""Settings of a continued measurement that need no word: what it measures and how is seen in its values."""
+
+
+def test_each_setting_is_said_of_a_continued_measurement_or_needs_no_word() -> None:
+    """A new one belongs into ``CONTINUED_WITH``, where people are to know of it, or above."""
+    said = {"rate", "sinks", *CONTINUED_WITH}
+    assert said | NOT_SAID == set(NAMES)
+    assert not said & NOT_SAID

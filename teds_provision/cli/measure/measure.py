@@ -52,6 +52,9 @@ MOST_NAMED = 3
 _ABOVE = ("rate", "channels", "kind", "trigger", "test_pattern", "unsigned", "actuators", "dead_man", "require")
 """Settings whose options stand above others in the help; one that is added is the last."""
 
+CONTINUED_WITH = {"test_pattern": "test pattern", "unsigned": "including unsigned nodes", "require": "with --require"}
+"""What is said of a measurement that goes on, beside its rate and sinks, for each setting that it has."""
+
 
 @command(
     "teds-provision measure 8d4d --can socketcan:can0 --to run.csv --to run.mcap",
@@ -248,12 +251,7 @@ def _carried_on(app: App, station: Station, asked: KeptMeasurement) -> KeptMeasu
         return asked
     rate = f"{kept.rate:g} Hz" if kept.rate else "the datasheets' rates"
     to = f" to {', '.join(kept.sinks)}" if kept.sinks else ""
-    more = {
-        "test pattern": kept.test_pattern,
-        "including unsigned nodes": kept.unsigned,
-        "with --require": kept.require,
-    }
-    beside = "".join(f", {name}" for name, asked_for in more.items() if asked_for)
+    beside = "".join(f", {words}" for name, words in CONTINUED_WITH.items() if getattr(kept, name))
     app.note(f"Continuing the measurement started at {kept.created}: {rate}{to}{beside}.")
     return kept
 
