@@ -83,8 +83,8 @@ class BackgroundReread:
 
     def _conclude(self, image: Image) -> None:
         trusted, uuid = self._verified, self._verified.sheet.uuid
-        known = freshness_floor_of(self._station, uuid, trusted.node.proven)
-        verified = readings.keep(self._station, trusted.node, image, by=self._by, known=known, c=self._c).verified
+        floor = freshness_floor_of(self._station, uuid, trusted.node.proven)
+        verified = readings.keep(self._station, trusted.node, image, by=self._by, floor=floor, c=self._c).verified
         same = hashlib.sha256(image.security or b"").hexdigest() == trusted.fingerprint
         if same and verified.verdict in (
             "authentic",

@@ -163,7 +163,7 @@ def open_unverified(station: Station, node: Conversation, *, by: str) -> Verifie
     if looked.kept:  # its Security TEDS names no digest of the others: what was read before the start proves nothing
         c, image = node.open_counter, read_image(node)
         verified = keep(
-            station, node, image, by=by, known=freshness_floor_of(station, node.uuid, node.proven), c=c
+            station, node, image, by=by, floor=freshness_floor_of(station, node.uuid, node.proven), c=c
         ).verified
         if verified.verdict != "unsigned":
             require_authentic(verified)

@@ -607,7 +607,7 @@ def _proposal(station: Station, prepared: PreparedOrder, present: NodeSnapshot) 
 
 def _intact(station: Station, present: NodeSnapshot) -> bool:
     """Return True if the node's datasheet is authentic for this station, so that its values may be kept."""
-    checks = verify_image(station, present.image, known=FreshnessFloor(present.identity))
+    checks = verify_image(station, present.image, floor=FreshnessFloor(present.identity))
     return Verification(present.image.uuid, tuple(checks)).verdict == "authentic"
 
 
@@ -625,7 +625,7 @@ def _mended(station: Station, prepared: PreparedOrder, present: NodeSnapshot) ->
         if datasheet.digests(blocks) != shown.signed_blocks:
             continue
         checks = verify_image(
-            station, Image(uuid, {**blocks, SECURITY: octets}), known=FreshnessFloor(present.identity)
+            station, Image(uuid, {**blocks, SECURITY: octets}), floor=FreshnessFloor(present.identity)
         )
         if Verification(uuid, tuple(checks)).verdict == "authentic":
             return Proposal(Image(uuid, blocks), (), named=True)

@@ -20,13 +20,13 @@ from teds_provision.teds.image import Image
 MAX_IMAGE_OCTETS: Final = 16 << 20
 
 
-def node_or_image(station: Station, text: str, *, node: bool = False) -> bytes | Image:
+def node_or_image(station: Station, text: str, *, is_node: bool = False) -> bytes | Image:
     """Return the image of a file, or the UUID that ``text`` names; raises NotFoundError if it is neither.
 
-    If both match, the file wins unless ``node`` is true.
+    If both match, the file wins unless ``is_node`` is true.
     """
     path = Path(text)
-    if node:
+    if is_node:
         with suppress(NotFoundError):
             return station.nodes.resolve(text)
     if path.is_file():

@@ -33,7 +33,7 @@ def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter
         image = read_image(visit.node)
         check = provenance_check(visit.node, visit.who.point, why)
         if visit.node.sealed:
-            known = freshness_floor_of(station, uuid, visit.node.proven or read_identity(visit.node))
+            floor = freshness_floor_of(station, uuid, visit.node.proven or read_identity(visit.node))
             with station.durable("read"):
-                keep(station, visit.node, image, by="read", known=known, c=c)
+                keep(station, visit.node, image, by="read", floor=floor, c=c)
         return ReadReport(image, unproven(uuid, check.why) if check.result == "failed" else None)

@@ -40,7 +40,7 @@ def keep(
     image: Image,
     *,
     by: str,
-    known: FreshnessFloor | None,
+    floor: FreshnessFloor | None,
     c: bytes | None = None,
     more: Sequence[Check] = (),
     profile: str | None = None,
@@ -51,7 +51,7 @@ def keep(
     are checks that were made at the node. Returns the verdict on this very reading, whether it was kept or not.
     """
     c = (c or node.open_counter) if node.sealed else None
-    return keep_read(station, image, c, by=by, known=known, more=more, profile=profile)
+    return keep_read(station, image, c, by=by, floor=floor, more=more, profile=profile)
 
 
 def keep_read(
@@ -60,12 +60,12 @@ def keep_read(
     c: bytes | None,
     *,
     by: str,
-    known: FreshnessFloor | None,
+    floor: FreshnessFloor | None,
     more: Sequence[Check] = (),
     profile: str | None = None,
 ) -> NodeVerdict:
     """Keep as :func:`keep` does; ``c`` is the counter of the session in which it was read, None for none."""
-    row, judged = judge_reading(station, image, c, by=by, known=known, more=more)
+    row, judged = judge_reading(station, image, c, by=by, floor=floor, more=more)
     keep_judged(station, row, judged, image, profile)
     return judged
 
@@ -76,11 +76,11 @@ def judge_reading(
     c: bytes | None,
     *,
     by: str,
-    known: FreshnessFloor | None,
+    floor: FreshnessFloor | None,
     more: Sequence[Check] = (),
 ) -> tuple[NodeReading, NodeVerdict]:
     """Return the row of a reading and the verdict on it; nothing is kept yet. See :func:`keep_read`."""
-    checks, signers = static_checks(image, known)
+    checks, signers = static_checks(image, floor)
     own = [*checks, *more]
     row = NodeReading(image.uuid, utc_now(), by, c, True, _packed(image), *signers, _written(own))
     return row, _judged(station, row, keyed=is_keyed(station, image.uuid))
@@ -114,7 +114,7 @@ def is_known(station: Station, node: Conversation, image: Image) -> bool:
 
 
 def cached_image_if_current(
-    station: Station, node: Conversation, security_teds: bytes, known: FreshnessFloor
+    station: Station, node: Conversation, security_teds: bytes, floor: FreshnessFloor
 ) -> Image | None:
     """Return the datasheet that was read before, if its Security TEDS is the same and it had no fault.
 
@@ -126,7 +126,7 @@ def cached_image_if_current(
         return None
     if image.security != security_teds or _packed(image) != row.digests or row.failed - MERELY_UNSIGNED:
         return None
-    checks, _ = static_checks(image, known)
+    checks, _ = static_checks(image, floor)
     if {check.name for check in checks if check.result == "failed"} - MERELY_UNSIGNED:
         return None
     if not row.is_of_this_start(node.open_counter):

@@ -169,9 +169,10 @@ class FreshnessFloor:
 
 
 def freshness_floor_of(station: Station, uuid: bytes, identity: Identity | None) -> FreshnessFloor:
-    """Return this station's bounds for a node's datasheet.
+    """Return this station's bounds for a node's datasheet: those of the one that the store has of it.
 
-    Only signed values count: any device could serve the others.
+    It is the stored datasheet whose signature is checked here, not the one that was just read. Only signed values
+    count: any device could serve the others.
     """
     image = station.datasheets.datasheet(uuid)
     octets = image.security if image is not None else None
@@ -187,12 +188,12 @@ def freshness_floor_of(station: Station, uuid: bytes, identity: Identity | None)
     return FreshnessFloor(identity, shown.sequence, shown.key_epoch) if trusted else FreshnessFloor(identity)
 
 
-def verify_image(station: TrustSource, image: Image, *, known: FreshnessFloor | None = None) -> list[Check]:
-    """Check an image as far as octets and this station's trust go; ``known`` is None for a file judged alone.
+def verify_image(station: TrustSource, image: Image, *, floor: FreshnessFloor | None = None) -> list[Check]:
+    """Check an image as far as octets and this station's trust go; ``floor`` is None for a file judged alone.
 
     Never raises on any octets.
     """
-    return _checks(station, image, _proofs(image), known)
+    return _checks(station, image, _proofs(image), floor)
 
 
 def verify_images(station: TrustSource, images: Iterable[Image]) -> list[list[Check]]:
@@ -245,9 +246,13 @@ def _shown(image: Image) -> _Shown:
         return error
 
 
-def _checks(station: TrustSource, image: Image, proofs: _SecurityFields, known: FreshnessFloor | None) -> list[Check]:
+def _checks(station: TrustSource, image: Image, proofs: _SecurityFields, floor: FreshnessFloor | None) -> list[Check]:
     return judge(
-        station, image.uuid, _own_checks(image, proofs, known), Signers.from_security_teds(proofs.shown), image.security
+        station,
+        image.uuid,
+        _own_checks_and_freshness(image, proofs, floor),
+        Signers.from_security_teds(proofs.shown),
+        image.security,
     )
 
 
@@ -268,7 +273,7 @@ class Signers(NamedTuple):
         return cls(shown.node_key, shown.node_key_signature, *signed)
 
 
-def static_checks(image: Image, known: FreshnessFloor | None) -> tuple[list[Check], Signers]:
+def static_checks(image: Image, floor: FreshnessFloor | None) -> tuple[list[Check], Signers]:
     """Return the checks that no later change of trust alters, and the input of :func:`judge` for the others.
 
     The image's own checks are cached for a moment: both the record of a write and the verdict need them.
@@ -276,10 +281,10 @@ def static_checks(image: Image, known: FreshnessFloor | None) -> tuple[list[Chec
     cached = next((cached for asked, cached in tuple(_CHECKED) if asked is image), None)
     if cached is None:
         proofs = _proofs(image)
-        cached = proofs.shown, _by_itself(image, proofs)
+        cached = proofs.shown, _own_checks(image, proofs)
         _CHECKED.append((image, cached))
     shown, checks = cached
-    return [*checks, *_not_older(shown, known)], Signers.from_security_teds(shown)
+    return [*checks, *_not_older(shown, floor)], Signers.from_security_teds(shown)
 
 
 _Shown = SecurityTeds | NotCanonicalError | None
@@ -287,13 +292,13 @@ _CHECKED: Final[deque[tuple[Image, tuple[_Shown, tuple[Check, ...]]]]] = deque(m
 
 
 def judge(
-    station: TrustSource, uuid: bytes, octets: Iterable[Check], signers: Signers, security_teds: bytes | None
+    station: TrustSource, uuid: bytes, own_checks: Iterable[Check], signers: Signers, security_teds: bytes | None
 ) -> list[Check]:
-    """Return all checks of a datasheet: those of its ``octets``, and those of today's pins, bans and trust.
+    """Return all checks: the datasheet's ``own_checks``, which trust does not alter, and today's pins, bans and trust.
 
     ``security_teds``: the TEDS itself or its SHA-256, by which the plant's stations name what they signed.
     """
-    checks = {check[0]: check for check in octets}
+    checks = {check[0]: check for check in own_checks}
     if signers.node_key is not None:
         if "node key" not in checks:
             checks["node key"] = _pinned(station, uuid, signers.node_key)
@@ -314,16 +319,16 @@ ABOUT_THE_REST: Final = frozenset({"form", "signed TEDS", "every TEDS is signed"
 """Checks of other TEDS than the Security TEDS."""
 
 
-def _own_checks(image: Image, proofs: _SecurityFields, known: FreshnessFloor | None) -> list[Check]:
-    return [*_by_itself(image, proofs), *_not_older(proofs.shown, known)]
+def _own_checks_and_freshness(image: Image, proofs: _SecurityFields, floor: FreshnessFloor | None) -> list[Check]:
+    return [*_own_checks(image, proofs), *_not_older(proofs.shown, floor)]
 
 
-def _not_older(shown: _Shown, known: FreshnessFloor | None) -> list[Check]:
+def _not_older(shown: _Shown, floor: FreshnessFloor | None) -> list[Check]:
     """Check that a datasheet is not older than what is known of its node."""
-    return [_epoch(shown, known), _sequence(shown, known)] if isinstance(shown, SecurityTeds) else []
+    return [_epoch(shown, floor), _sequence(shown, floor)] if isinstance(shown, SecurityTeds) else []
 
 
-def _by_itself(image: Image, proofs: _SecurityFields) -> tuple[Check, ...]:
+def _own_checks(image: Image, proofs: _SecurityFields) -> tuple[Check, ...]:
     """Return the checks of an image that need no other knowledge."""
     shown = proofs.shown
     checks = [_form(image, known_good=SECURITY if isinstance(shown, SecurityTeds) else None)]
@@ -445,27 +450,27 @@ _NO_EPOCH: Final = Check("key epoch", "skipped", _FILE_ALONE)
 _NO_SEQUENCE: Final = Check("sequence", "skipped", _FILE_ALONE)
 
 
-def _epoch(shown: SecurityTeds, known: FreshnessFloor | None) -> Check:
+def _epoch(shown: SecurityTeds, floor: FreshnessFloor | None) -> Check:
     name = "key epoch"
-    if known is None:
+    if floor is None:
         return _NO_EPOCH
-    if known.identity is not None and shown.key_epoch > known.identity.epoch:
-        why = f"signed for epoch {shown.key_epoch}, but the node is at {known.identity.epoch}"
+    if floor.identity is not None and shown.key_epoch > floor.identity.epoch:
+        why = f"signed for epoch {shown.key_epoch}, but the node is at {floor.identity.epoch}"
         return Check(name, "failed", why)
-    why = f"signed for epoch {shown.key_epoch}, older than the {known.key_epoch} that this station saw"
-    return _check(name, shown.key_epoch >= known.key_epoch, why, str(shown.key_epoch))
+    why = f"signed for epoch {shown.key_epoch}, older than the {floor.key_epoch} that this station saw"
+    return _check(name, shown.key_epoch >= floor.key_epoch, why, str(shown.key_epoch))
 
 
-def _sequence(shown: SecurityTeds, known: FreshnessFloor | None) -> Check:
+def _sequence(shown: SecurityTeds, floor: FreshnessFloor | None) -> Check:
     name = "sequence"
-    if known is None:
+    if floor is None:
         return _NO_SEQUENCE
-    if known.identity is not None and shown.sequence < known.identity.sequence:
-        own = known.identity.sequence
+    if floor.identity is not None and shown.sequence < floor.identity.sequence:
+        own = floor.identity.sequence
         why = f"sequence {shown.sequence} is older than the node's own {own}: an old datasheet was restored"
         return Check(name, "failed", why)
-    why = f"sequence {shown.sequence} is older than the {known.sequence} that this station saw on the node"
-    return _check(name, shown.sequence >= known.sequence, why, str(shown.sequence))
+    why = f"sequence {shown.sequence} is older than the {floor.sequence} that this station saw on the node"
+    return _check(name, shown.sequence >= floor.sequence, why, str(shown.sequence))
 
 
 def _not_revoked(station: TrustSource, uuid: bytes) -> Check:

@@ -72,14 +72,14 @@ def verify_in_session(station: Station, node: Conversation, *, by: str) -> NodeV
     identity, c = read_identity(node), node.open_counter
     keep_firmware(station, node.uuid, read_firmware(node))
     octets = read_block(node, SECURITY)
-    known = freshness_floor_of(station, node.uuid, identity)
-    image = readings.cached_image_if_current(station, node, octets, known)
+    floor = freshness_floor_of(station, node.uuid, identity)
+    image = readings.cached_image_if_current(station, node, octets, floor)
     if image is not None:
         judged = readings.verdict_of(station, node.uuid)
         assert judged is not None, "a reading that stands is there"
         return NodeVerification(image, judged)
     image = read_image(node)
-    return NodeVerification(image, readings.keep(station, node, image, by=by, known=known, c=c))
+    return NodeVerification(image, readings.keep(station, node, image, by=by, floor=floor, c=c))
 
 
 def open_or_say_why(station: Station, node: Conversation) -> str:
@@ -121,16 +121,16 @@ def judge_and_keep(
     identity = (node.proven or read_identity(node)) if node.sealed else None
     firmware = read_firmware(node) if node.sealed else None
     possessed, vouch = possession_check(lambda: prove(node, point)), provenance_check(node, point, why)
-    known = freshness_floor_of(station, node.uuid, identity)
+    floor = freshness_floor_of(station, node.uuid, identity)
     if vouch.result == "failed":
         with station.reading():
-            verified = Verification(node.uuid, (*verify_image(station, image, known=known), possessed, vouch))
+            verified = Verification(node.uuid, (*verify_image(station, image, floor=floor), possessed, vouch))
         station.audit("verify", node.uuid, verified.verdict, why=why)
         return NodeVerdict(verified, "plain", utc_now(), by)
     more = [possessed] if node.sealed or vouch.result == "skipped" else [possessed, vouch]
     c = (c or node.open_counter) if node.sealed else None
     with station.reading():
-        row, judged = readings.judge_reading(station, image, c, by=by, known=known, more=more)
+        row, judged = readings.judge_reading(station, image, c, by=by, floor=floor, more=more)
 
     def record() -> None:
         with station.durable("verify"):
@@ -189,14 +189,14 @@ def verify_at(
     *,
     accept_calibration: str | None = None,
     accept_firmware: bool = False,
-    node: bool = False,
+    is_node: bool = False,
 ) -> VerifyReport:
-    """Check the image file, or the node, that ``what`` names; with ``node`` a node's name goes first.
+    """Check the image file, or the node, that ``what`` names; with ``is_node`` a node's name goes first.
 
     ``accept_firmware``: the calibration holds with the firmware that runs now. ``error``: NotAuthenticError (4),
     UnprovenError (5), or PolicyError (6) for a calibration that would hurt.
     """
-    found = node_or_image(station, what, node=node)
+    found = node_or_image(station, what, is_node=is_node)
     if isinstance(found, Image):
         return verify_image_alone(station, found, accept_calibration)
     firmware: KnownFirmware | None = None

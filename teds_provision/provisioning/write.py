@@ -92,9 +92,9 @@ def write(
         has = has or read_image(node)
         if all(has.blocks.get(block) == image.blocks[block] for block in image):
             if not is_known(station, node, has):
-                known = freshness_floor_of(station, image.uuid, node.proven or read_identity(node))
+                floor = freshness_floor_of(station, image.uuid, node.proven or read_identity(node))
                 with station.durable("write", more_follows=True):
-                    keep(station, node, has, by="write", known=known)
+                    keep(station, node, has, by="write", floor=floor)
             return WriteResult(0, time.monotonic() - started, has)
     identity, firmware = node.proven or read_identity(node), read_firmware(node)
     _require_newer(station, image.uuid, signed, identity, jump=jump)
@@ -163,7 +163,7 @@ def _conclude(
     def record() -> None:  # asks the node nothing: the next message may be on its way
         with station.durable("write", more_follows=True):
             keep_read(
-                station, back, c, by="write", known=freshness_floor_of(station, image.uuid, identity), profile=named
+                station, back, c, by="write", floor=freshness_floor_of(station, image.uuid, identity), profile=named
             )
             if differing:
                 station.audit("write", image.uuid, "read-back differs", block=list(differing[0]))

@@ -210,9 +210,9 @@ PATTERNS = (
         "tests/node/test_can_server.py",
     ),
     # verdicts
-    Pattern("an epoch seen before", "_epoch", "shown.key_epoch >= known.key_epoch", "True"),
-    Pattern("a sequence seen before", "_sequence", "shown.sequence >= known.sequence", "True"),
-    Pattern("an epoch of the future", "_epoch", "shown.key_epoch > known.identity.epoch", "False"),
+    Pattern("an epoch seen before", "_epoch", "shown.key_epoch >= floor.key_epoch", "True"),
+    Pattern("a sequence seen before", "_sequence", "shown.sequence >= floor.sequence", "True"),
+    Pattern("an epoch of the future", "_epoch", "shown.key_epoch > floor.identity.epoch", "False"),
     Pattern(
         "only good signatures are floors", "freshness_floor_of", "datasheet.signature_good(shown, octets, uuid)", "True"
     ),

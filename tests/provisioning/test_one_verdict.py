@@ -352,5 +352,5 @@ def test_a_node_without_its_key_is_not_authentic_by_any_row(station: Station, bo
     with talk(board) as node:
         require_session(station, node)
         failed = possession_check(lambda: (_ for _ in ()).throw(NotAuthenticError("It does not hold the key.")))  # type: ignore[arg-type, return-value]
-        readings.keep(station, node, read_image(node), by="verify", known=None, more=[failed])
+        readings.keep(station, node, read_image(node), by="verify", floor=None, more=[failed])
     assert shown(station, board) == ("not authentic", "session")

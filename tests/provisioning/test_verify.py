@@ -40,8 +40,8 @@ def verdict(station: Station, image: Image) -> str:
 
 
 def failed(station: Station, image: Image, identity: Identity | None = None) -> list[str]:
-    known = FreshnessFloor(identity) if identity is not None else None
-    return [check.name for check in verify_image(station, image, known=known) if check.result == "failed"]
+    floor = FreshnessFloor(identity) if identity is not None else None
+    return [check.name for check in verify_image(station, image, floor=floor) if check.result == "failed"]
 
 
 def test_a_good_image_is_authentic(station: Station, image: Image) -> None:
@@ -202,12 +202,12 @@ def test_an_epoch_older_than_one_that_was_seen_is_caught_without_a_session_too(s
     with talk(board) as node:
         agree(station, node, identify(station, node), rotate=True)
     new = run(station, board).image
-    known = freshness_floor_of(station, board.uuid, None)
-    assert (known.identity, known.sequence, known.key_epoch) == (None, 2, 2)
+    floor = freshness_floor_of(station, board.uuid, None)
+    assert (floor.identity, floor.sequence, floor.key_epoch) == (None, 2, 2)
     for image, expected in ((old, "failed"), (new, "passed")):
-        checks = {check.name: check for check in verify_image(station, image, known=replace(known, sequence=1))}
+        checks = {check.name: check for check in verify_image(station, image, floor=replace(floor, sequence=1))}
         assert (checks["key epoch"].result, checks["sequence"].result) == (expected, "passed")
-    (check,) = [check for check in verify_image(station, old, known=known) if check.name == "key epoch"]
+    (check,) = [check for check in verify_image(station, old, floor=floor) if check.name == "key epoch"]
     assert check.why == "signed for epoch 1, older than the 2 that this station saw"
 
 

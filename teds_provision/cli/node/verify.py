@@ -64,7 +64,7 @@ def verify(
             reporter_for(app),
             accept_calibration=accept_calibration,
             accept_firmware=accept_firmware,
-            node=node,
+            is_node=node,
         )
     verified = done.verified
     result: dict[str, Any] = {**verified.to_json(), "warnings": list(done.warnings)}

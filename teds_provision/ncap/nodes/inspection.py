@@ -72,9 +72,9 @@ def read_anew(station: Station, node: Conversation) -> tuple[Image, NodeVerdict]
         return None
     c, identity = node.open_counter, read_identity(node)
     image = read_image(node)
-    known = freshness_floor_of(station, node.uuid, identity)
+    floor = freshness_floor_of(station, node.uuid, identity)
     with station.durable("read"):
-        return image, keep(station, node, image, by="ncap", known=known, c=c)
+        return image, keep(station, node, image, by="ncap", floor=floor, c=c)
 
 
 def _stranger(station: Station, node: Conversation, who: IdentifiedNode) -> NodeInspection:
@@ -93,7 +93,7 @@ def _stranger(station: Station, node: Conversation, who: IdentifiedNode) -> Node
     image = Image(node.uuid, blocks)
     why = "the node does not open a session with any key held here" if is_keyed(station, node.uuid) else ""
     reported = firmware_of(station, node.uuid, read_firmware(node, once=True))
-    checks = (*verify_image(station, image, known=freshness_floor_of(station, node.uuid, None)), session_check("", why))
+    checks = (*verify_image(station, image, floor=freshness_floor_of(station, node.uuid, None)), session_check("", why))
     return NodeInspection(
         NodeVerdict(Verification(node.uuid, checks), "plain", utc_now(), "ncap"),
         Sheet.from_image(image),

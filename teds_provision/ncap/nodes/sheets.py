@@ -77,7 +77,7 @@ class Sheets:
         image = read_image(node)
         why = "it opens no session under our key" if is_keyed(station, node.uuid) else ""
         checks = (
-            *verify_image(station, image, known=freshness_floor_of(station, node.uuid, None)),
+            *verify_image(station, image, floor=freshness_floor_of(station, node.uuid, None)),
             session_check("", why),
         )
         return DatasheetRead(image, NodeVerdict(Verification(node.uuid, checks), "plain", utc_now(), "ncap"), now=True)
