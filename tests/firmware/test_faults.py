@@ -142,7 +142,7 @@ class Board(nodes.MeasuringBoard):
 
 def check(folder: Path, station: Station, patch: pytest.MonkeyPatch, name: str, over: str = "nfc") -> CheckReport:
     patch.setattr(Board, "library", built(folder, name), raising=False)
-    patch.setattr(nodes, "Measuring", Board)
+    patch.setattr(nodes, "MeasuringBoard", Board)
     patch.setattr(nodes, "Board", Board)
     over = FAULTS[name].over if name else over
     patch.setattr(Board, "measures", over.startswith("measuring"))

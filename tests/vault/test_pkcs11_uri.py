@@ -26,14 +26,14 @@ def test_every_attribute_is_read():
 @pytest.mark.parametrize("between", ["&", "?"])
 def test_no_uri_may_hold_a_pin_and_the_message_does_not_repeat_it(query, between):
     text = f"pkcs11:token=t{M}&{query}" if between == "&" else f"pkcs11:token=t?{query}&module-path=/lib/m.so"
-    with pytest.raises(UsageError, match="may not hold a PIN") as refused:
+    with pytest.raises(UsageError, match="may not contain a PIN") as refused:
         Pkcs11Uri.parse(text)
     assert "1234" not in str(refused.value)
     assert "--passphrase-fd" in refused.value.hint
 
 
 def test_a_pin_among_the_path_attributes_is_refused_as_well():
-    with pytest.raises(UsageError, match="may not hold a PIN"):
+    with pytest.raises(UsageError, match="may not contain a PIN"):
         Pkcs11Uri.parse("pkcs11:token=t;pin-value=1234" + M)
 
 
