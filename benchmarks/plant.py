@@ -30,7 +30,7 @@ from teds_provision.plant.sync import sync
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.document import hash_of
-from teds_provision.protocol.plant.page import PageDraft, seal_page
+from teds_provision.protocol.plant.page import PageDraft, sign_page
 from teds_provision.provisioning.build import BuildOrder, prepare
 from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
@@ -55,7 +55,7 @@ def chain(key: SoftwareKey, pages: int, events: int) -> Pages:
             for _ in range(events)
         ]  # fmt: skip
         draft = PageDraft(REGISTRY, n, before, "0" * 16, datetime.now(UTC), {}, (1, "0" * 64))
-        octets = seal_page(draft, page_events, key)
+        octets = sign_page(draft, page_events, key)
         made.append((n, before, octets))
         before = hash_of(octets)
     return made
@@ -155,7 +155,7 @@ def _history(nodes: int) -> None:
             draft = PageDraft(
                 made.roster.registry, place[0] + 1, place[1], "0" * 16, datetime.now(UTC), {}, (1, "0" * 64)
             )
-            octets = seal_page(draft, events, key)
+            octets = sign_page(draft, events, key)
             place = draft.number, hash_of(octets)
             stick.append(west.fingerprint, draft.number, draft.previous, place[1], octets)
         made.close()
@@ -244,7 +244,7 @@ def _woken(posts: list[postgres.Registry], keys: list[SoftwareKey]) -> None:
     n, before = writer.look().heads[name]
     for n in range(n + 1, n + 101):  # noqa: B020
         draft = PageDraft(REGISTRY, n, before, "0" * 16, datetime.now(UTC), {}, (1, "0" * 64))
-        octets = seal_page(draft, [], keys[2])
+        octets = sign_page(draft, [], keys[2])
         began = time.perf_counter()
         pushing = threading.Thread(target=writer.append, args=([(n, before, octets)],))
         pushing.start()

@@ -34,7 +34,7 @@ def request(station: Station) -> bytes:
     )
     if kept is not None and replace(open_request(kept[1]), created=made.created) == made:
         return kept[1]
-    octets = made.sealed(station.vault.identity())
+    octets = made.signed(station.vault.identity())
     with station.transaction():
         station.plant.keep_login(secret, octets)
         station.audit("registry", None, "requested", fingerprint=station.fingerprint)

@@ -274,7 +274,7 @@ class PlantWatch:
             page is not None
             and (datetime.now(UTC) - datetime.fromisoformat(page.created)).total_seconds() > _EMPTY_PAGE
         ):
-            plant.sync.close_page(station, roster, empty=True)
+            plant.sync.write_page(station, roster, empty=True)
 
     def _listen(self) -> None:
         """Start a sync when the registry notifies of a change."""

@@ -34,7 +34,7 @@ from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.evidence import PASSED
 from teds_provision.protocol.plant.merged_claims import MergedClaims
-from teds_provision.protocol.plant.page import MOST_EVENTS, MOST_PAYLOAD, Page, PageDraft, open_page, seal_page
+from teds_provision.protocol.plant.page import MOST_EVENTS, MOST_PAYLOAD, Page, PageDraft, open_page, sign_page
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.sanitize import counted
 from teds_provision.station.plant.line import UnitRow
@@ -93,10 +93,10 @@ def sync(station: Station, transport: Transport, *, connected: bool = True) -> S
                 f"This station was removed from {roster.name} (roster {roster.version}).",
                 hint="A removed key cannot return: create a new station (init) and have it added.",
             )
-        _own_head(station, transport, roster, done, connected=connected)
+        _check_own_chain(station, transport, roster, done, connected=connected)
         if again := fold_new_acts(station, roster):
             done.remarks.append(f"{counted(again, 'page')} read again: this version shows more of what pages say")
-        while close_page(station, roster) is not None:
+        while write_page(station, roster) is not None:
             pass
         _push(station, transport, roster, done, connected=connected)
         done.fetched += fetching.fetch(station, transport, roster)
@@ -167,7 +167,9 @@ def own_chain(station: Station) -> Chain:
     return station.plant.pages.chain(station.fingerprint)
 
 
-def _own_head(station: Station, transport: Transport, roster: Roster, done: SyncResult, *, connected: bool) -> None:
+def _check_own_chain(
+    station: Station, transport: Transport, roster: Roster, done: SyncResult, *, connected: bool
+) -> None:
     """Check the pages under this station's key before any is added, in the order of contract/plant.md, section 6."""
     chain, joined = own_chain(station), station.plant.joined
     assert joined is not None
@@ -411,7 +413,7 @@ def _report_again(station: Station, chain: Chain, lost: Sequence[tuple[int, str]
                 station.plant.queue_event(item)
 
 
-def close_page(station: Station, roster: Roster, *, empty: bool = False) -> Page | None:
+def write_page(station: Station, roster: Roster, *, empty: bool = False) -> Page | None:
     """Put what waits into the next page, in one transaction; None if nothing does (unless ``empty``)."""
     with station.transaction():
         chain = own_chain(station)
@@ -430,7 +432,7 @@ def close_page(station: Station, roster: Roster, *, empty: bool = False) -> Page
         draft = PageDraft(
             roster.registry, n + 1, previous, station.plant.home, now(), _fresh_heads(station, chain), entry
         )
-        octets = seal_page(draft, [made for _, made in events], station.vault.identity())
+        octets = sign_page(draft, [made for _, made in events], station.vault.identity())
         page = open_page(octets, roster.registry, lambda kid: station.point)
         take_pages(station, roster, [page])
         station.plant.drop_events([id for id, _ in events])

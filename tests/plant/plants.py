@@ -14,7 +14,7 @@ from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.chain import CountedPages, counting
 from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.merged_claims import BanStatement, LocalState, MergedClaims, merge_claims
-from teds_provision.protocol.plant.page import Page, PageDraft, open_page, seal_page
+from teds_provision.protocol.plant.page import Page, PageDraft, open_page, sign_page
 from teds_provision.protocol.plant.roster import Member, Place, RemovedMember, Roster, open_roster, seal_roster
 from teds_provision.protocol.plant.signer import SignatureClaim, SignerVerdict, signing
 
@@ -55,7 +55,7 @@ class Speaker:
         """Write the next page, or another one after an earlier place."""
         n, previous = self.head if after is None else after
         draft = PageDraft(REGISTRY, n + 1, previous, "0" * 16, NOW, heads, (1, "0" * 64))
-        octets = seal_page(draft, events, self.key)
+        octets = sign_page(draft, events, self.key)
         self.pages.append(octets)
         opened = open_page(octets, REGISTRY, lambda kid: self.key.point)
         self.head = opened.number, opened.hash

@@ -128,7 +128,9 @@ def test_a_document_larger_than_its_kind_is_not_even_parsed() -> None:
 def test_a_request_is_signed_by_the_key_that_it_shows() -> None:
     read = document.open_request(octets_of("member-request"))
     assert (read.name, read.point) == ("south", KEYS["south"].point)
-    forged = document.seal(KAT["documents"]["member-request"]["payload"], KEYS["west"], document.MEMBER_REQUEST)
+    forged = document.sign_document(
+        KAT["documents"]["member-request"]["payload"], KEYS["west"], document.MEMBER_REQUEST
+    )
     with pytest.raises(NotAuthenticError):
         document.open_request(forged)
 
@@ -205,7 +207,7 @@ def test_no_station_leaves_a_roster_without_being_removed_and_none_comes_back() 
 def test_a_roster_that_does_not_add_up_is_refused_with_words(change: dict[str, object], why: str) -> None:
     members = {**KAT["documents"]["roster 1"]["payload"], **change}
     with pytest.raises(BadDataError, match=why):
-        open_roster(document.seal(members, CA, document.ROSTER), CA.point)
+        open_roster(document.sign_document(members, CA, document.ROSTER), CA.point)
 
 
 def test_a_key_or_a_name_occurs_once_in_a_roster() -> None:
@@ -225,7 +227,7 @@ def test_unknown_roles_are_passed_over_and_none_is_audit() -> None:
     members = KAT["documents"]["roster 1"]["payload"]
     first = {**members["members"][0], "roles": ["driver", "keeper"]}
     second = {**members["members"][1], "roles": ["driver"]}
-    read = open_roster(document.seal({**members, "members": [first, second]}, CA, document.ROSTER), CA.point)
+    read = open_roster(document.sign_document({**members, "members": [first, second]}, CA, document.ROSTER), CA.point)
     assert [sorted(member.roles) for member in read.members] == [["keeper"], ["audit"]]
 
 
@@ -254,14 +256,14 @@ def test_a_page_is_its_members_and_of_its_registry() -> None:
         page.open_page(octets_of("west 1"), "00000000-0000-4000-8000-000000000000", POINTS.get)
     with pytest.raises(NotAuthenticError):
         page.open_page(octets_of("west 1"), KAT["registry"], lambda kid: None)
-    posed = document.seal(KAT["documents"]["west 1"]["payload"], KEYS["south"], document.PAGE)
+    posed = document.sign_document(KAT["documents"]["west 1"]["payload"], KEYS["south"], document.PAGE)
     with pytest.raises(BadDataError, match="another station"):
         page.open_page(posed, KAT["registry"], POINTS.get)
 
 
 def test_what_is_wrong_beside_the_chain_does_not_end_it() -> None:
     members = {**KAT["documents"]["west 1"]["payload"], "home": 7, "created": None, "heads": {"x": 1}, "audit": []}
-    read = page.open_page(document.seal(members, KEYS["west"], document.PAGE), KAT["registry"], POINTS.get)
+    read = page.open_page(document.sign_document(members, KEYS["west"], document.PAGE), KAT["registry"], POINTS.get)
     assert (read.home, read.created, read.heads) == ("", "", {})
 
 
@@ -269,7 +271,7 @@ def test_what_is_wrong_beside_the_chain_does_not_end_it() -> None:
 def test_a_page_without_its_place_in_a_chain_is_junk(change: dict[str, object]) -> None:
     members = {**KAT["documents"]["west 1"]["payload"], **change}
     with pytest.raises(BadDataError):
-        page.open_page(document.seal(members, KEYS["west"], document.PAGE), KAT["registry"], POINTS.get)
+        page.open_page(document.sign_document(members, KEYS["west"], document.PAGE), KAT["registry"], POINTS.get)
 
 
 def test_an_event_that_is_not_of_its_form_is_reported_and_one_that_is_not_known_is_passed_over() -> None:
@@ -303,11 +305,11 @@ def test_a_page_takes_no_more_than_readers_do() -> None:
     draft = page.PageDraft(KAT["registry"], 1, "", "0" * 16, NOW, {}, (1, "0" * 64))
     unpinned = event.made("unpinned", "0" * 16, "2026-02-01T12:00:00Z", bytes(10), {})
     with pytest.raises(BadDataError, match="1000"):
-        page.seal_page(draft, [unpinned] * 1001, KEYS["west"])
+        page.sign_page(draft, [unpinned] * 1001, KEYS["west"])
     with pytest.raises(BadDataError, match="700000"):
-        page.seal_page(draft, [{**unpinned, "x": "y" * 1000}] * 900, KEYS["west"])
-    assert hash_of(page.seal_page(draft, [unpinned], KEYS["west"])) == hash_of(
-        page.seal_page(draft, [unpinned], KEYS["west"])
+        page.sign_page(draft, [{**unpinned, "x": "y" * 1000}] * 900, KEYS["west"])
+    assert hash_of(page.sign_page(draft, [unpinned], KEYS["west"])) == hash_of(
+        page.sign_page(draft, [unpinned], KEYS["west"])
     )
 
 

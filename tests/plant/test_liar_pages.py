@@ -11,7 +11,7 @@ import pytest
 from teds_provision import plant
 from teds_provision.cli.rendering import local_time
 from teds_provision.plant.folder_transport import FolderTransport
-from teds_provision.protocol.plant.document import PAGE, hash_of, seal
+from teds_provision.protocol.plant.document import PAGE, hash_of, sign_document
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry
 from tests.plant.stations import Plant
@@ -78,7 +78,7 @@ def lied(plants: Plant, liar: Station, change: dict[str, Any]) -> int:
     if members["heads"] == "own":
         members["heads"] = {liar.fingerprint: [n + 100, LIE], plants.north.fingerprint: [FAR, LIE]}
     liar.unlock()
-    octets = seal(members, liar.vault.identity(), PAGE)
+    octets = sign_document(members, liar.vault.identity(), PAGE)
     FolderTransport(plants.stick).append(liar.fingerprint, n + 1, previous, hash_of(octets), octets)
     return n + 1
 

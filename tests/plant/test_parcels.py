@@ -136,7 +136,7 @@ def test_abandoned_requests_do_not_keep_jobs_out(plant: Plant) -> None:
 
     def send(kind: document.DocumentKind, n: int) -> None:
         members = {"format": kind.format, "id": f"6f1c0a52-6f0e-4c1b-8a55-{n:012d}"}
-        signed = document.seal(members, north.vault.identity(), kind)
+        signed = document.sign_document(members, north.vault.identity(), kind)
         sealed = jose.encrypt(signed, [west.point], cty=CONTENT_TYPE)
         plant.transport.send(Parcel(f"{kind.typ} {n}", west.fingerprint, sealed, time_text(now(60)), north.fingerprint))
 
@@ -154,7 +154,7 @@ def test_abandoned_requests_do_not_keep_jobs_out(plant: Plant) -> None:
 
 
 def test_an_answer_is_kept_of_the_office_that_was_asked_and_once(plant: Plant) -> None:
-    from teds_provision.protocol.plant.document import SIGNED, seal
+    from teds_provision.protocol.plant.document import SIGNED, sign_document
 
     plant.roster(ROLES)
     west, north = plant["west"], plant["north"]
@@ -162,7 +162,7 @@ def test_an_answer_is_kept_of_the_office_that_was_asked_and_once(plant: Plant) -
     west.plant.line.put_sign_request(asked)
 
     def kept(by: Station, of: str = asked.hash) -> int:
-        signed = seal({"format": SIGNED.format, "of": of}, by.vault.identity(), SIGNED)
+        signed = sign_document({"format": SIGNED.format, "of": of}, by.vault.identity(), SIGNED)
         sealed = jose.encrypt(signed, [west.point], cty=CONTENT_TYPE)
         plant.transport.send(Parcel(os.urandom(4).hex(), west.fingerprint, sealed, time_text(now(60)), by.fingerprint))
         sync(plant, "west")
@@ -394,7 +394,7 @@ def test_a_job_travels_sealed_and_comes_out_as_it_was_signed(plant: Plant) -> No
 
     plant.roster(ROLES)
     members = {"format": document.JOB.format, "id": "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"}
-    signed = document.seal(members, plant["north"].vault.identity(), document.JOB)
+    signed = document.sign_document(members, plant["north"].vault.identity(), document.JOB)
     sign_requests.send(plant["north"], plant.transport, plant["west"].fingerprint, signed, members["id"])
     [parcel] = plant.transport.there.values()
     assert b"teds-job" not in parcel.octets

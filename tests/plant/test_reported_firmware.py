@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from teds_provision import plant
-from teds_provision.plant.sync import close_page
+from teds_provision.plant.sync import write_page
 from teds_provision.protocol.messages.firmware import FirmwareFlag, FirmwareReport
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.roster import Share
@@ -331,7 +331,7 @@ def test_a_home_that_a_backup_rebuilt_reports_what_it_sees_next(plants: Plant) -
     """Its row is older than its own last page: as a hint it is replaced, and reported, whatever the board says."""
     board = board_with(plants.north, OLD)
     look(plants.north, board)
-    close_page(plants.north, plant.apply_pages.require_roster(plants.north))
+    write_page(plants.north, plant.apply_pages.require_roster(plants.north))
     plants.north.firmware_reports.make_hint(board.uuid)
     record = plants.north.firmware_reports.get(board.uuid)
     assert record is not None

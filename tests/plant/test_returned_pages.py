@@ -243,7 +243,7 @@ def test_another_history_that_a_thief_wrote_gives_way_to_the_rosters_last(loss: 
     draft = plant_room.sync.PageDraft(
         roster.registry, 2, first, "0" * 16, plant_room.apply_pages.now(), {}, (1, "0" * 64)
     )
-    other = plant_room.sync.seal_page(draft, [], west.credentials().key)
+    other = plant_room.sync.sign_page(draft, [], west.credentials().key)
     loss.remove(west)
     loss.lose(loss.north, loss.south)
     liar = loss.member("liar", "audit")

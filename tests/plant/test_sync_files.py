@@ -18,7 +18,7 @@ from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.sync import resume, sync
 from teds_provision.plant.transport import CarriedPage
 from teds_provision.protocol.plant.document import hash_of
-from teds_provision.protocol.plant.page import PageDraft, seal_page
+from teds_provision.protocol.plant.page import PageDraft, sign_page
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import WhitelistEntry
 from tests.plant.stations import Plant, ask
@@ -317,7 +317,7 @@ def test_a_page_of_a_clock_a_year_ahead_counts_and_no_name_of_it_wins_for_ever(p
     assert roster is not None
     ahead = datetime.now(UTC) + timedelta(days=365)
     draft = PageDraft(roster.registry, chain.counted[0] + 1, chain.counted[1], "0" * 16, ahead, {}, (1, "0" * 64))
-    octets = seal_page(draft, [], south.vault.identity())
+    octets = sign_page(draft, [], south.vault.identity())
     FolderTransport(plants.stick).append(south.fingerprint, draft.number, draft.previous, hash_of(octets), octets)
     plants.sync(plants.north)
     assert plants.north.plant.pages.chain(south.fingerprint).counted[0] == draft.number

@@ -70,7 +70,7 @@ def payload(members: Mapping[str, Any]) -> bytes:
     return json.dumps(members, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
 
 
-def seal(members: Mapping[str, Any], key: PrivateKey, kind: DocumentKind) -> bytes:
+def sign_document(members: Mapping[str, Any], key: PrivateKey, kind: DocumentKind) -> bytes:
     """Sign a document; raises BadDataError if it is larger than readers accept."""
     octets = jose.sign_compact(payload(members), key, typ=kind.typ)
     check_size(len(octets), kind.most, kind.what)
@@ -272,7 +272,7 @@ class MemberRequest:
         """Of the station's key."""
         return fingerprint(self.point)
 
-    def sealed(self, key: PrivateKey) -> bytes:
+    def signed(self, key: PrivateKey) -> bytes:
         """Return the request, signed by the station itself."""
         members = {
             "format": MEMBER_REQUEST.format,
@@ -282,7 +282,7 @@ class MemberRequest:
             "login": self.login,
             "created": self.created.strftime("%Y-%m-%dT%H:%M:%SZ"),
         }
-        return seal(members, key, MEMBER_REQUEST)
+        return sign_document(members, key, MEMBER_REQUEST)
 
 
 def open_request(octets: bytes) -> MemberRequest:

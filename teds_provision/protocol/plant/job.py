@@ -14,7 +14,15 @@ from typing import Any, Final, Literal
 from teds_provision.errors import BadDataError
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import PrivateKey, fingerprint
-from teds_provision.protocol.plant.document import JOB, Fields, is_form, is_name, is_number, open_document, seal
+from teds_provision.protocol.plant.document import (
+    JOB,
+    Fields,
+    is_form,
+    is_name,
+    is_number,
+    open_document,
+    sign_document,
+)
 
 MOST_BOARDS: Final = 32_768
 MOST_STATIONS: Final = 256
@@ -143,7 +151,7 @@ class Job:
 
 def seal_job(job: Job, key: PrivateKey) -> bytes:
     """Sign a job; what no reader would take raises BadDataError."""
-    octets = seal(job.unsigned(), key, JOB)
+    octets = sign_document(job.unsigned(), key, JOB)
     open_job(octets, lambda kid: key.point if kid == fingerprint(key.point) else None)
     return octets
 

@@ -22,7 +22,7 @@ from teds_provision.protocol.plant.document import (
     is_time,
     open_document,
     payload,
-    seal,
+    sign_document,
 )
 
 MOST_EVENTS: Final = 1000
@@ -110,7 +110,7 @@ class PageDraft:
     audit: tuple[int, str]
 
 
-def seal_page(draft: PageDraft, events: Sequence[Mapping[str, Any]], key: PrivateKey) -> bytes:
+def sign_page(draft: PageDraft, events: Sequence[Mapping[str, Any]], key: PrivateKey) -> bytes:
     """Sign a page; raises BadDataError if it exceeds the limits of a page."""
     if len(events) > MOST_EVENTS:
         raise BadDataError(f"A page takes {MOST_EVENTS} events, not {len(events)}.")
@@ -128,4 +128,4 @@ def seal_page(draft: PageDraft, events: Sequence[Mapping[str, Any]], key: Privat
     }
     if len(payload(members)) > MOST_PAYLOAD:
         raise BadDataError(f"The payload of a page has at most {MOST_PAYLOAD} octets.")
-    return seal(members, key, PAGE)
+    return sign_document(members, key, PAGE)

@@ -14,7 +14,7 @@ from typing import Any, Final, Literal
 from teds_provision.errors import BadDataError
 from teds_provision.protocol.handover.strict_json import base64url, time_text
 from teds_provision.protocol.keys import PrivateKey, fingerprint, station_key_message, verify
-from teds_provision.protocol.plant.document import ROSTER, Fields, is_form, is_name, open_document, seal
+from teds_provision.protocol.plant.document import ROSTER, Fields, is_form, is_name, open_document, sign_document
 
 MOST_MEMBERS: Final = 256
 MOST_REMOVED: Final = 1024
@@ -185,7 +185,7 @@ def _signed_up_to(place: Place | None) -> dict[str, object]:
 
 def seal_roster(roster: Roster, ca: PrivateKey) -> bytes:
     """Sign a roster; what no reader would take raises BadDataError."""
-    octets = seal(roster.unsigned(), ca, ROSTER)
+    octets = sign_document(roster.unsigned(), ca, ROSTER)
     open_roster(octets, ca.point)
     return octets
 

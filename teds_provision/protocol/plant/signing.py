@@ -26,7 +26,7 @@ from teds_provision.protocol.plant.document import (
     is_number,
     is_text,
     open_document,
-    seal,
+    sign_document,
 )
 from teds_provision.teds.image import SECURITY, BlockId, Image
 
@@ -115,7 +115,7 @@ class SignRequest:
 
 def seal_request(request: SignRequest, line: PrivateKey) -> bytes:
     """Sign a request; raises BadDataError if it is larger than an office reads."""
-    return seal(request.unsigned(), line, SIGN_REQUEST)
+    return sign_document(request.unsigned(), line, SIGN_REQUEST)
 
 
 def open_request(octets: bytes, find_key: Callable[[str], bytes | None]) -> SignRequest:
@@ -176,7 +176,7 @@ class Answer:
 
 def seal_answer(answer: Answer, office: PrivateKey) -> bytes:
     """Sign an answer."""
-    return seal(answer.unsigned(), office, SIGNED)
+    return sign_document(answer.unsigned(), office, SIGNED)
 
 
 def open_answer(octets: bytes, find_key: Callable[[str], bytes | None]) -> Answer:
