@@ -23,7 +23,7 @@ from teds_provision.protocol.keys import (
 from teds_provision.protocol.messages.frames import (
     COMMAND_HEADER,
     COMMON,
-    SECURITY,
+    SECURITY_CLASS,
     Attribute,
     Command,
     Function,
@@ -62,10 +62,10 @@ def max_message(probe: Probe) -> str:
     """Check that MaxMessage is 512 to 4094; a frame of that many octets is handled, one octet more gets 10."""
     most = probe.max_message
     holds(LEAST_MESSAGE <= most <= MOST_MESSAGE, f"Identify announces maxMessage {most}; 512 to 4094 are allowed.")
-    unknown = Command(0, SECURITY, 99, bytes(most - COMMAND_HEADER))
+    unknown = Command(0, SECURITY_CLASS, 99, bytes(most - COMMAND_HEADER))
     seen = probe.refused(unknown, Reason.UNKNOWN_COMMAND, "a frame of maxMessage octets")
     if most < MOST_MESSAGE:
-        longer = Command(0, SECURITY, 99, bytes(most + 1 - COMMAND_HEADER))
+        longer = Command(0, SECURITY_CLASS, 99, bytes(most + 1 - COMMAND_HEADER))
         seen = probe.refused(longer, Reason.TOO_LARGE, "one octet longer than maxMessage")
     return seen
 
@@ -127,7 +127,7 @@ def frame_length(probe: Probe) -> str:
 @rule("refusal-form", "Command frames", Stage.PLAIN)
 def refusal_form(probe: Probe) -> str:
     """Check that a refusal is status 0 and one octet of reason."""
-    for command in (Command(0, SECURITY, 99), security_command(Function.CLOSE), query_teds(0, 99)):
+    for command in (Command(0, SECURITY_CLASS, 99), security_command(Function.CLOSE), query_teds(0, 99)):
         reply = probe.plain(command)
         form = not reply.ok and len(reply.payload) == 1
         holds(
@@ -139,7 +139,11 @@ def refusal_form(probe: Probe) -> str:
 @rule("unknown-command", "Which command when", Stage.PLAIN)
 def unknown_command(probe: Probe) -> str:
     """Check that unknown functions of class 128, and class 128 on another channel than 0, get 1."""
-    for command in (Command(0, SECURITY, 6), Command(0, SECURITY, 99), Command(1, SECURITY, Function.IDENTIFY)):
+    for command in (
+        Command(0, SECURITY_CLASS, 6),
+        Command(0, SECURITY_CLASS, 99),
+        Command(1, SECURITY_CLASS, Function.IDENTIFY),
+    ):
         seen = probe.refused(command, Reason.UNKNOWN_COMMAND, f"channel {command.channel}")
     return seen
 
@@ -161,7 +165,7 @@ def close_needs_session(probe: Probe) -> str:
 def operation_needs_session(probe: Probe) -> str:
     """Check that other classes, unknown functions of class 1, and 128.12 to 128.20 get 3 outside a session."""
     outside = [Command(1, 3, 1, b"\0"), Command(0, 5, 1), Command(0, COMMON, 99)]
-    for command in outside + [Command(0, SECURITY, function) for function in _MEASURING]:
+    for command in outside + [Command(0, SECURITY_CLASS, function) for function in _MEASURING]:
         seen = probe.refused(command, Reason.NOT_PERMITTED)
     return seen
 

@@ -17,7 +17,7 @@ from teds_provision.protocol.keys import CHALLENGE_OCTETS, POINT_OCTETS, Softwar
 from teds_provision.protocol.messages.frames import (
     COMMON,
     IDENTIFY,
-    SECURITY,
+    SECURITY_CLASS,
     Command,
     Function,
     Reason,
@@ -231,7 +231,7 @@ def sealed_only_sealed(probe: Probe) -> str:
     """Open and Sealed inside a session get 3; unknown functions 1."""
     for function in (Function.OPEN, Function.SEALED):
         probe.sealed_refused(security_command(function), Reason.NOT_PERMITTED)
-    probe.sealed_refused(Command(0, SECURITY, 99), Reason.UNKNOWN_COMMAND)
+    probe.sealed_refused(Command(0, SECURITY_CLASS, 99), Reason.UNKNOWN_COMMAND)
     return probe.sealed_refused(Command(0, COMMON, 99), Reason.UNKNOWN_COMMAND)
 
 

@@ -13,7 +13,7 @@ from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey
 from teds_provision.protocol.messages.frames import (
     COMMON,
     IDENTIFY,
-    SECURITY,
+    SECURITY_CLASS,
     Attribute,
     Function,
     Reason,
@@ -143,7 +143,7 @@ class FaultyBus(FaultyLink):
         return b"\x30\x10\0" if self.lines[0xF1].half_sent == 1 else self.one_buffer
 
 
-def _is(octets: bytes, function: int, command_class: int = SECURITY) -> bool:
+def _is(octets: bytes, function: int, command_class: int = SECURITY_CLASS) -> bool:
     return octets[2:4] == bytes([command_class, function])
 
 

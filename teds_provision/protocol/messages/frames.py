@@ -11,7 +11,7 @@ from teds_provision.errors import GarbledError
 
 COMMAND_HEADER: Final = 6
 REPLY_HEADER: Final = 3
-COMMON, OPERATE, EITHER, SECURITY = 1, 3, 4, 128
+COMMON, OPERATE, EITHER, SECURITY_CLASS = 1, 3, 4, 128
 """Command classes: CommonCmd, XdcrOperate and XdcrEither of the standard, and the profile's own."""
 
 
@@ -142,7 +142,7 @@ LIST_OVERHEAD: Final = 42
 
 def security_command(function: Function, payload: bytes = b"") -> Command:
     """Return a command of class 128; they all go to channel 0."""
-    return Command(0, SECURITY, function, payload)
+    return Command(0, SECURITY_CLASS, function, payload)
 
 
 IDENTIFY: Final = security_command(Function.IDENTIFY)

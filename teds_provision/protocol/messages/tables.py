@@ -13,7 +13,15 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from teds_provision.protocol.messages.frames import COMMON, SECURITY, Command, Function, Reason, Reply, TedsFunction
+from teds_provision.protocol.messages.frames import (
+    COMMON,
+    SECURITY_CLASS,
+    Command,
+    Function,
+    Reason,
+    Reply,
+    TedsFunction,
+)
 
 
 class Spec(NamedTuple):
@@ -36,7 +44,7 @@ CLASSES: Final = {
     5: "TIMsleep",
     6: "TIMActive",
     7: "AnyState",
-    SECURITY: "Security profile",
+    SECURITY_CLASS: "Security profile",
 }
 
 STATUS = "attributes:u8 status:u8 size:u32 checksum:u16 max_size:u32"
@@ -158,7 +166,7 @@ COMMANDS: Final[dict[tuple[int, int], Spec]] = {
         (5, {1: Spec("Wake-up")}),
         (6, _ACTIVE),
         (7, {1: Spec("Reset")}),
-        (SECURITY, _PROFILE),
+        (SECURITY_CLASS, _PROFILE),
     )
     for number, spec in functions.items()
 }
@@ -328,8 +336,8 @@ _NUMBERS: Final = {kind: frozenset(map(int, kind)) for kind in (Function, TedsFu
 def describe_command(command: Command) -> str:
     """Describe a command: name, class and function, payload octets; "Prove (128.8), 31 octets"."""
     number = f"{command.command_class}.{command.function}"
-    kind = Function if command.command_class == SECURITY else TedsFunction
-    if command.command_class in (COMMON, SECURITY) and command.function in _NUMBERS[kind]:
+    kind = Function if command.command_class == SECURITY_CLASS else TedsFunction
+    if command.command_class in (COMMON, SECURITY_CLASS) and command.function in _NUMBERS[kind]:
         number = f"{kind(command.function).name.replace('_', ' ').capitalize()} ({number})"
     elif (spec := COMMANDS.get((command.command_class, command.function))) is not None:
         number = f"{spec.name} ({number})"

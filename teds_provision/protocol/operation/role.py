@@ -16,7 +16,7 @@ from teds_provision.protocol.messages.frames import (
     EITHER,
     OPERATE,
     READ_OVERHEAD,
-    SECURITY,
+    SECURITY_CLASS,
     Command,
     CommandRefusedError,
     Function,
@@ -92,17 +92,17 @@ class OperationRole:
             (OPERATE, READ_FUNCTION): self._read,
             (OPERATE, WRITE_FUNCTION): self._write,
             (COMMON, SELF_TEST_FUNCTION): self._self_test,
-            (SECURITY, Function.SAMPLE): self._sample,
-            (SECURITY, Function.SET): self._set,
-            (SECURITY, Function.SUBSCRIBE): lambda inner: self.streams.subscribe(_payload(inner), *inner[1:3]),
-            (SECURITY, Function.STOP): lambda inner: self.streams.stop(_payload(inner), inner.session),
-            (SECURITY, Function.CLOCK): lambda inner: self.streams.clock(
+            (SECURITY_CLASS, Function.SAMPLE): self._sample,
+            (SECURITY_CLASS, Function.SET): self._set,
+            (SECURITY_CLASS, Function.SUBSCRIBE): lambda inner: self.streams.subscribe(_payload(inner), *inner[1:3]),
+            (SECURITY_CLASS, Function.STOP): lambda inner: self.streams.stop(_payload(inner), inner.session),
+            (SECURITY_CLASS, Function.CLOCK): lambda inner: self.streams.clock(
                 _payload(inner), inner.session, inner.received
             ),
-            (SECURITY, Function.ARM): lambda inner: self.streams.arm(_payload(inner), *inner[1:3]),
-            (SECURITY, Function.POWER): self._power,
-            (SECURITY, Function.OPERATION): self._operation,
-            (SECURITY, Function.DRIVE): lambda inner: self.streams.drive(_payload(inner), *inner[1:3]),
+            (SECURITY_CLASS, Function.ARM): lambda inner: self.streams.arm(_payload(inner), *inner[1:3]),
+            (SECURITY_CLASS, Function.POWER): self._power,
+            (SECURITY_CLASS, Function.OPERATION): self._operation,
+            (SECURITY_CLASS, Function.DRIVE): lambda inner: self.streams.drive(_payload(inner), *inner[1:3]),
         }
 
     # -- what Tim asks ---------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from teds_provision.protocol.keys import (
 from teds_provision.protocol.messages.firmware import LOCATE_SECONDS, Firmware, FirmwareFlag, FirmwareReport
 from teds_provision.protocol.messages.frames import (
     COMMAND_HEADER,
-    SECURITY,
+    SECURITY_CLASS,
     Command,
     CommandRefusedError,
     Function,
@@ -290,7 +290,7 @@ class Tim:
         """Run a command that is permitted and whose length is right."""
         if of_teds(command):
             return self._common(command, origin)
-        security = self._security.get(command.function) if command.command_class == SECURITY else None
+        security = self._security.get(command.function) if command.command_class == SECURITY_CLASS else None
         if security is not None:
             return Reply(True, security(command.payload, origin))
         if self._role is None or origin.session is None or not self._role.knows(command):

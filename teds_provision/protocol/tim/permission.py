@@ -12,7 +12,7 @@ from typing import Final
 from teds_provision.protocol.messages.frames import (
     COMMON,
     EITHER,
-    SECURITY,
+    SECURITY_CLASS,
     Command,
     CommandRefusedError,
     Function,
@@ -50,9 +50,11 @@ _IN_FACTORY: Final = frozenset({Function.RESET, Function.LOCATE})
 """Plain commands that only a node without a key runs."""
 _PLAIN_ALONE: Final = frozenset({Function.OPEN, Function.SEALED})
 _CHANGES: Final = frozenset(
-    {(COMMON, TedsFunction.WRITE), (COMMON, TedsFunction.UPDATE), (SECURITY, Function.SET_CAN_ADDRESS)}
+    {(COMMON, TedsFunction.WRITE), (COMMON, TedsFunction.UPDATE), (SECURITY_CLASS, Function.SET_CAN_ADDRESS)}
 )
-_STORED: Final = _CHANGES | {(SECURITY, function) for function in (Function.REQUEST, Function.CONFIRM, Function.RESET)}
+_STORED: Final = _CHANGES | {
+    (SECURITY_CLASS, function) for function in (Function.REQUEST, Function.CONFIRM, Function.RESET)
+}
 """Commands that change what is stored: refused while the running image is on trial."""
 _DURING_UPLOAD: Final = frozenset({(COMMON, TedsFunction.WRITE), (EITHER, OPERATE_FUNCTION)})
 """Commands that an upload of any session delays."""
@@ -80,7 +82,7 @@ class Permission:
 
     def check(self, command: Command, origin: Origin) -> None:
         """Raise CommandRefusedError if the command may not be run now, or is not known."""
-        if command.command_class == SECURITY:
+        if command.command_class == SECURITY_CLASS:
             # class 128 goes to channel 0; an unknown function gets 1 in every state
             unknown = (
                 command.function not in _FUNCTIONS
