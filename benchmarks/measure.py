@@ -73,7 +73,7 @@ class Stream:
         at, span = self.base + SECOND, self.plan.span
         for number, message in enumerate(self.messages, 1):
             at += span
-            self.heard.whole(message, at)
+            self.heard.queue_message(message, at)
             if number % together == 0:
                 self.heard.finish()
         used = time.thread_time() - began

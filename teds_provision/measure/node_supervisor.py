@@ -241,7 +241,7 @@ class NodeSupervisor:
     def _failure(self) -> TedsProvisionError | None:
         """Measure until the end or an error: what ended it, None for the end in order."""
         try:
-            self._once()
+            self._try_once()
         except SessionLostError as lost:
             return lost.cause
         except TedsProvisionError as error:
@@ -276,7 +276,7 @@ class NodeSupervisor:
                     self._set_state("waiting", locked)
             self._stop.wait(UNLOCKED)
 
-    def _once(self) -> None:
+    def _try_once(self) -> None:
         self._let_others_finish()
         self._wait_for_vault()
         if self._stop.is_set():
@@ -516,7 +516,7 @@ class NodeSupervisor:
                 with self.turn:
                     rest = rest if rest.step() else None
                 if rest is None:
-                    self._events.read(self.uuid)
+                    self._events.reread_done(self.uuid)
             if self.streams.clock.lie and not lied:
                 lied = True
                 self._set_state("running", why=f"its clock is inconsistent: {self.streams.clock.lie}")

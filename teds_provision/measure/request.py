@@ -102,4 +102,4 @@ class Events:
     block: Callable[[Block], None]
     facts: Callable[[Sequence[ChannelFacts]], None]
     report: Callable[[NodeReport], None]
-    read: Callable[[bytes], None] = lambda _uuid: None  # the rest of its datasheet, behind the measurement
+    reread_done: Callable[[bytes], None] = lambda _uuid: None  # the rest of its datasheet was read in the background

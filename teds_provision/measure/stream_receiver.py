@@ -33,7 +33,7 @@ class ReceivedStream:
     """A running stream: what opens its messages, and the receiver of its blocks.
 
     ``pieces`` counts what the link could not put together. ``mapping`` guards the clock map, which the node's own
-    thread feeds. ``heard`` is when the last good message came.
+    thread feeds. ``last_good_at`` is when the last good message came.
     """
 
     receiver: Receiver
@@ -42,7 +42,7 @@ class ReceivedStream:
     clock: ClockMap
     mapping: threading.Lock
     deliver: Callable[[Block], None]
-    heard: float = field(default_factory=time.monotonic)
+    last_good_at: float = field(default_factory=time.monotonic)
     wrong_pattern: int = 0
     samples: int = 0
     bound: float | None = None
@@ -60,7 +60,7 @@ class ReceivedStream:
         self._last_instant = 0 if plan.subscribe.kind == StreamKind.FREE else plan.span - plan.subscribe.period
         self._test_pattern = plan.subscribe.test_pattern
 
-    def whole(self, octets: bytes, at: int) -> None:
+    def queue_message(self, octets: bytes, at: int) -> None:
         """Handle a message of this stream, which came at ``at`` (monotonic ns).
 
         It waits for others that come soon.
@@ -92,7 +92,7 @@ class ReceivedStream:
         """Begin a triggered stream, as its first instant is known: from now on its silence counts."""
         with self._order:
             self.finish()
-            self.heard = time.monotonic()
+            self.last_good_at = time.monotonic()
             with self.mapping:
                 messages = self.receiver.begin(start)
                 blocks = self.interpreter.blocks(messages)
@@ -136,7 +136,7 @@ class ReceivedStream:
     def _hand_on(self, messages: list[StreamMessage], blocks: list[Block]) -> None:
         """Pass on messages whose tag and time are right."""
         if messages:
-            self.heard = time.monotonic()
+            self.last_good_at = time.monotonic()
         if self._test_pattern:
             self.wrong_pattern += sum(message.data != self.receiver.expected(message) for message in messages)
         for block in blocks:
@@ -266,7 +266,7 @@ class StreamReceiver:
         early = self._early.get(key)  # first: one that is registered meanwhile is found below, and takes what waits
         heard = self._streams.get(key)
         if heard is not None:
-            heard.whole(message.octets, message.at)
+            heard.queue_message(message.octets, message.at)
         elif early is not None and message.at >= early.since:
             early.messages.append(message)
         return heard

@@ -1081,11 +1081,11 @@ class MeasurementSupervisor:
         def note(text: str) -> None:
             self._live.event("measurement", state="note", id=running.kept.id, why=text)
 
-        def read(uuid: bytes) -> None:
+        def reread_done(uuid: bytes) -> None:
             self._directory.refresh([uuid.hex()])
             self._directory.note(uuid.hex(), "verified", looked=time.time())
 
-        return Watcher(self._live.block, facts, report, sink, note, read)
+        return Watcher(self._live.block, facts, report, sink, note, reread_done)
 
     def _report(self, running: RunningMeasurement, said: NodeReport) -> None:
         names = ("uuid", "state", "why", "samples", "lost", "late", "bad", "invalid", "clock_error")

@@ -101,7 +101,7 @@ def test_together_or_one_by_one_the_same_samples(
         if number % 5 == bent:
             octets = octets[:-1] + bytes([octets[-1] ^ 1])
         for scene in (one_by_one, together):
-            scene.heard.whole(octets, scene.arrival(counter))
+            scene.heard.queue_message(octets, scene.arrival(counter))
         one_by_one.heard.finish()
         if ends:
             together.heard.finish()
@@ -122,7 +122,7 @@ def test_a_stream_that_runs_free_has_the_period_that_its_ticks_say(real: int) ->
     """
     scene = Scene(StreamKind.FREE, real=real)
     for counter in range(50):
-        scene.heard.whole(scene.message(counter), scene.base + (counter * 3 + 2) * real + 1000)
+        scene.heard.queue_message(scene.message(counter), scene.base + (counter * 3 + 2) * real + 1000)
         scene.heard.finish()
     samples = scene.samples()
     true = [SECOND + 17 + k * real for k in range(150)]
@@ -137,20 +137,20 @@ def test_a_stream_that_waited_for_its_trigger_was_not_silent_meanwhile() -> None
     """A trigger that waited for a missing node had all others lost as soon as it went out."""
     scene = Scene()
     scene.heard.receiver.start = None
-    scene.heard.heard -= 15.0
+    scene.heard.last_good_at -= 15.0
     began = time.monotonic()
     scene.heard.begin(SECOND)
-    assert scene.heard.heard >= began
+    assert scene.heard.last_good_at >= began
 
 
 def test_what_waited_for_12_ms_is_handed_on_and_not_before() -> None:
     scene = Scene()
     before = time.monotonic()
-    scene.heard.whole(scene.message(0), scene.arrival(0))
+    scene.heard.queue_message(scene.message(0), scene.arrival(0))
     after = time.monotonic()
     scene.heard.flush(before + GATHER * 0.99)
     assert not scene.blocks
-    scene.heard.whole(scene.message(1), scene.arrival(1))
+    scene.heard.queue_message(scene.message(1), scene.arrival(1))
     scene.heard.flush(after + GATHER)
     (block,) = scene.blocks
     assert (block.index, len(block.time)) == (0, 6)
@@ -160,10 +160,10 @@ def test_a_message_that_no_other_will_join_is_handed_on_at_once() -> None:
     """At 100 Hz the next message of two instants comes in 20 ms: to wait for it would only be late."""
     scene = Scene(period=10 * MS)
     assert not scene.heard.due
-    scene.heard.whole(scene.message(0), scene.arrival(0))
+    scene.heard.queue_message(scene.message(0), scene.arrival(0))
     assert scene.heard.due
     quick = Scene()
-    quick.heard.whole(quick.message(0), quick.arrival(0))
+    quick.heard.queue_message(quick.message(0), quick.arrival(0))
     assert not quick.heard.due
 
 
@@ -171,7 +171,7 @@ def test_a_period_of_the_block_is_one_of_the_nodes_clock_mapped() -> None:
     """What the clock's map says of each tick, to the microsecond that the numbers of the wall clock hold."""
     scene = Scene()
     for counter in range(400):
-        scene.heard.whole(scene.message(counter), scene.arrival(counter))
+        scene.heard.queue_message(scene.message(counter), scene.arrival(counter))
         if counter % 7 == 6:
             scene.heard.finish()
     for block in scene.blocks:
@@ -323,7 +323,7 @@ def test_two_threads_that_take_what_came_take_it_in_order() -> None:
     scene = Scene()
     scene.heard._came = beside = Beside(scene.heard.finish)
     for counter in range(4):
-        scene.heard.whole(scene.message(counter), scene.arrival(counter))
+        scene.heard.queue_message(scene.message(counter), scene.arrival(counter))
     scene.heard.finish()
     beside.other.join()
     counts = scene.heard.receiver.counts
@@ -359,6 +359,6 @@ def test_all_values_are_calibrated_beforehand_only_for_a_stream_of_many_messages
     scene = Scene(period=period)
     monkeypatch.setattr(ManyChannels, "calibrate_all", lambda _many: made.append(len(scene.blocks)))
     for counter in range(BLOCKS + 5):
-        scene.heard.whole(scene.message(counter), scene.arrival(counter))
+        scene.heard.queue_message(scene.message(counter), scene.arrival(counter))
         scene.heard.finish()
     assert made == ([BLOCKS - 1] if quick else [])

@@ -27,7 +27,7 @@ def test_a_foreign_exception_ends_the_node_with_an_error(monkeypatch: pytest.Mon
     def broken() -> None:
         raise ValueError("cannot convert float NaN to integer")
 
-    monkeypatch.setattr(keeper, "_once", broken)
+    monkeypatch.setattr(keeper, "_try_once", broken)
     keeper.start()
     keeper.join(60)
     assert keeper.done.is_set()

@@ -53,7 +53,7 @@ class Watcher:
     report: Callable[[NodeReport], None] = lambda _report: None
     sink: Callable[[Sink], None] = lambda _sink: None
     note: Callable[[str], None] = lambda _text: None
-    read: Callable[[bytes], None] = lambda _uuid: None  # a node's datasheet was read whole behind its measurement
+    reread_done: Callable[[bytes], None] = lambda _uuid: None  # a node's datasheet was read whole while it is measured
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Measurement:
         self.buses.expect(self.uuids)
         if self.request.requirements is not None:
             self.request.requirements.expect(self.uuids)
-        events = self._events = Events(self._block, self._describe, self._report, self._read)
+        events = self._events = Events(self._block, self._describe, self._report, self._reread_done)
         self.supervisors = [
             NodeSupervisor(self.station, self.buses, uuid, self.request, self._host, events, self._common_start)
             for uuid in self.uuids
@@ -357,8 +357,8 @@ class Measurement:
             sink.report(report)
         self.watcher.report(report)
 
-    def _read(self, uuid: bytes) -> None:
-        self.watcher.read(uuid)
+    def _reread_done(self, uuid: bytes) -> None:
+        self.watcher.reread_done(uuid)
 
     # -- the end -------------------------------------------------------------------------------------------------------
 

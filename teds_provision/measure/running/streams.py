@@ -88,7 +88,7 @@ class NodeStreams:
         self.mapping = threading.Lock()
         self.running: dict[int, ReceivedStream] = {}
         self.totals: dict[int, StreamTotals] = {}
-        self._host, self._hand_on = host, deliver
+        self._host, self._on_block = host, deliver
         self._held: list[Block] | None = None  # what comes before its channels were described
         self._gate = threading.Lock()
         self._run = 0  # the session's last
@@ -114,12 +114,12 @@ class NodeStreams:
         with self._gate:
             held, self._held = self._held or [], None
             for block in held:
-                self._hand_on(block)
+                self._on_block(block)
 
     def _deliver(self, block: Block) -> None:
         with self._gate:
             if self._held is None:
-                self._hand_on(block)
+                self._on_block(block)
             else:
                 self._held.append(block)
 
@@ -163,7 +163,7 @@ class NodeStreams:
             raw_only=UNSIGNED if trusted.unsigned else "",
         )
         stream = ReceivedStream(receiver, pieces, interpreter, self.clock, self.mapping, self._deliver)
-        stream.heard += ahead
+        stream.last_good_at += ahead
         self.running[number] = stream
         self.totals.setdefault(number, StreamTotals(plan.layout.channels, plan.subscribe.period / 1e9))
         bus.receiver.register(address, number, stream)
@@ -216,11 +216,11 @@ class NodeStreams:
 
     def heard_since(self, moment: float) -> bool:
         """Return True if a good message came after ``moment`` (time.monotonic)."""
-        return any(stream.heard > moment for stream in self.running.values())
+        return any(stream.last_good_at > moment for stream in self.running.values())
 
     def silent(self, now: float) -> float:
         """Return seconds of silence if that is too long, else 0.0."""
         for stream in self._steady():
-            if now - stream.heard > SILENT + 3 * stream.receiver.plan.span / 1e9:
-                return now - stream.heard
+            if now - stream.last_good_at > SILENT + 3 * stream.receiver.plan.span / 1e9:
+                return now - stream.last_good_at
         return 0.0

@@ -174,15 +174,15 @@ class ThreadedSink(ABC):
     def _process_item(self, item: Item) -> None:
         """Write one item."""
 
-    def _first(self) -> None:
-        """Call ``_begin``; a sink that can outlive its failure does so here, in ``_one`` and in ``_beat``."""
+    def _guarded_begin(self) -> None:
+        """Call ``_begin``; a sink that can outlive its failure does so here, and in the two below."""
         self._begin()
 
-    def _one(self, item: Item) -> None:
+    def _guarded_item(self, item: Item) -> None:
         """Call ``_process_item``."""
         self._process_item(item)
 
-    def _beat(self, now: float) -> None:
+    def _guarded_idle(self, now: float) -> None:
         """Call ``_idle``."""
         self._idle(now)
 
@@ -262,7 +262,7 @@ class ThreadedSink(ABC):
 
     def _work(self) -> None:
         try:
-            self._first()
+            self._guarded_begin()
             if self.stats.state == "starting":  # a sink that waits for consumers has reported it by now
                 self._set_state("running")
             self._run()
@@ -279,12 +279,12 @@ class ThreadedSink(ABC):
         while not done:
             items, done = self._next()
             for item in items:
-                self._one(item)
+                self._guarded_item(item)
             if items and not self.recorder and not self._items and not self._closing:
                 time.sleep(LIVE_REST)
             now = time.monotonic()
             if not items or now - looked >= TICK:
-                self._beat(now)
+                self._guarded_idle(now)
                 looked = now
 
     def _end(self) -> None:

@@ -198,13 +198,13 @@ class FileSink(ThreadedSink):
         """Write what was counted of a node by now, as the beginning of a part needs it (summary.py)."""
         self._process_item(report)
 
-    def _first(self) -> None:
+    def _guarded_begin(self) -> None:
         try:
             self._begin()
         except OSError as error:
             self._wait_for_room(error)
 
-    def _one(self, item: Item) -> None:
+    def _guarded_item(self, item: Item) -> None:
         if isinstance(item, NodeReport):
             self.reports[item.uuid] = item
         if self._full is not None:
@@ -222,7 +222,7 @@ class FileSink(ThreadedSink):
         except OSError as error:
             self._wait_for_room(error)
 
-    def _beat(self, now: float) -> None:
+    def _guarded_idle(self, now: float) -> None:
         if self._full is not None:
             if now - self._tried >= AGAIN:
                 self._tried = now
