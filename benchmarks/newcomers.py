@@ -410,7 +410,7 @@ def many(on: Scene, count: int, seconds: float, kind: str) -> None:
         return verdict is not None and verdict["from"] == "session"
 
     until(lambda: all(map(read_whole, on.uuids.values())), 900)
-    on.rows.add("  read whole behind the measurement after", time.monotonic() - announced, "s")
+    on.rows.add("  read whole in the background after", time.monotonic() - announced, "s")
     before, since = on.lost_until_now(names), time.monotonic()
     time.sleep(seconds)
     talk, data = on.wire.seconds(since, since + seconds)

@@ -27,7 +27,7 @@ class MeasuredBus:
         self.share = BusShare(BusTime(port.airtime()))
         self.discovery = port.discover(sightings, poll=poll)
         self.reading = threading.Lock()
-        """Held while a datasheet is read behind a measurement: one node at a time."""
+        """Held while a datasheet is read in the background of a measurement: one node at a time."""
         self.beginning: set[bytes] = set()
         """Nodes that are on their way from Open to their first stream; each is put in and taken out by its thread."""
 

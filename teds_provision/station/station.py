@@ -78,7 +78,7 @@ __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", 
 
 @dataclass
 class _DurableRun:
-    """A run of steps: who takes some of them behind its back, and the number of its ``last`` commit not waited for."""
+    """A run of steps: who takes some in the background, and the number of its ``last`` commit not waited for."""
 
     background: BackgroundWriter
     last: int = 0
@@ -366,7 +366,7 @@ class Station:
         run: _DurableRun | None = getattr(self._runs, "now", None) if more_follows else None
         with self.lock(command), self._store.transaction(later=run is not None):
             if run is not None:
-                run.last = self._store.later + 1  # this one, when it is committed
+                run.last = self._store.commits_not_waited_for + 1  # this one, when it is committed
             yield
 
     @contextmanager

@@ -38,7 +38,7 @@ def test_a_foreign_exception_ends_the_node_with_an_error(monkeypatch: pytest.Mon
 
 
 def test_a_node_is_among_those_that_begin_until_it_runs_or_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is read behind a measurement waits for these; one that stayed among them would hold it up for a minute."""
+    """What is read in the background waits for these; one that stayed among them would hold it up for a minute."""
     bus, seen = SimpleNamespace(beginning=set()), list[set[bytes]]()
 
     def fails(*_: object) -> None:

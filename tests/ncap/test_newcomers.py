@@ -135,7 +135,7 @@ def test_what_is_there_is_measured_and_what_goes_comes_back(lab: Lab) -> None:
     lab.comes(right, 2)
     lab.flows(right)
     assert lab.states(left) == ["joined"]
-    with lab.service.client() as asked:  # the rest of its datasheet is read behind the measurement, and shown as read
+    with lab.service.client() as asked:  # the rest of its datasheet is read in the background, and shown as read
         until(lambda: asked.node(right.uuid)["verdict"]["from"] == "session")
     with lab.service.client() as asked:
         [measurement] = asked.measurements()

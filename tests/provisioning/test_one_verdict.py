@@ -276,7 +276,7 @@ def test_a_board_that_was_replaced_under_its_uuid_has_no_reading(station: Statio
     assert station.datasheets.reading(board.uuid) is None
 
 
-# -- behind a measurement --------------------------------------------------------------------------------------------
+# -- in the background of a measurement ----------------------------------------------------------------------
 
 
 def read_behind(station: Station, board: Board) -> list[str]:

@@ -148,7 +148,7 @@ class Guard:
             headers = _headers(scope)
             scope[CALLER] = await self._caller(scope, headers)
             ACTOR.set(scope[CALLER].actor)
-            _require_form(scope, headers, scope[CALLER])
+            _require_may_change(scope, headers, scope[CALLER])
             await self.app(
                 scope, _limited(receive, _largest(scope)) if scope["type"] == "http" else receive, with_headers
             )
@@ -249,8 +249,8 @@ def _require_origin(named: ServedNames, headers: Mapping[str, str]) -> None:
         raise RequestRefusedError(403, "foreign-origin", "Requests from another site are not allowed.")
 
 
-def _require_form(scope: Scope, headers: Mapping[str, str], caller: Caller) -> None:
-    """Require JSON of limited size, and no read-only token, for a change."""
+def _require_may_change(scope: Scope, headers: Mapping[str, str], caller: Caller) -> None:
+    """Require, for a change, a token that may write, and JSON of limited size."""
     if scope["type"] != "http":
         return
     length, most = headers.get("content-length", ""), _largest(scope)

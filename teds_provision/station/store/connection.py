@@ -105,7 +105,7 @@ def too_old(what: str, version: int) -> StoreError:
 
 QUIET_SECONDS: Final = 0.3
 """Seconds that SQLite waits silently for another process; then there is a notice, and another try."""
-WAITING: Final = "synchronous=FULL"
+SYNC_ON_COMMIT: Final = "synchronous=FULL"
 _Given = TypeVar("_Given")
 
 
@@ -122,11 +122,11 @@ class Connection:
         self._taken_back = 0
         self._added = False
         self._spoilt = False
-        self.later = 0
+        self.commits_not_waited_for = 0
         """How many commits did not wait for the disk."""
         self._settled = 0
         self.background: dict[int, BackgroundWriter] = {}
-        """By thread: the run that has a step taken behind its back, for which its next statement waits."""
+        """By thread: the run that has a step taken in the background, for which its next statement waits."""
         self.notice: Callable[[str], object] | None = None
         """Receives a sentence about what a change of the store waits for."""
         self._frozen: StoreError | None = None
@@ -145,10 +145,10 @@ class Connection:
             return self._wait_for(lambda: self._connection.execute(statement, values).fetchall())
 
     def drain(self) -> None:
-        """Wait until what this thread had done behind its back is done; raises what that raised."""
-        behind = self.background.get(threading.get_ident())
-        if behind is not None:
-            behind.wait()
+        """Wait until what this thread has had taken in the background is done; raises what that raised."""
+        steps = self.background.get(threading.get_ident())
+        if steps is not None:
+            steps.wait()
 
     def add(self, statement: str, values: Sequence[Any] = ()) -> None:
         """Run an INSERT of one new row: the transaction around it is sure to write to the disk; raises StoreError."""
@@ -259,7 +259,7 @@ class Connection:
         """
         self.drain()
         with self._lock:
-            if (self.later if through is None else through) <= self._settled:
+            if (self.commits_not_waited_for if through is None else through) <= self._settled:
                 return
             try:
                 log = os.open(self.path.with_name(self.path.name + "-wal"), os.O_RDWR | NOFOLLOW | CLOSING)
@@ -269,7 +269,7 @@ class Connection:
                     os.close(log)
             except OSError as error:
                 raise as_store_failure(error, self.path) from error
-            self._settled = self.later
+            self._settled = self.commits_not_waited_for
 
     def enter(self, block: Transaction) -> None:
         """Begin a block; for :class:`Transaction` alone."""
@@ -302,7 +302,7 @@ class Connection:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
             if later:
-                self.execute(f"PRAGMA {WAITING}")
+                self.execute(f"PRAGMA {SYNC_ON_COMMIT}")
             raise
         self._steady, self._added = None, False
 
@@ -322,18 +322,19 @@ class Connection:
             self._steady = self._steady if block.level else None
             try:
                 if block.later and block.level == 0:
-                    self.later += 1
-                    self.execute(f"PRAGMA {WAITING}")
+                    self.commits_not_waited_for += 1
+                    self.execute(f"PRAGMA {SYNC_ON_COMMIT}")
             finally:
                 self._lock.release()
 
     def _conclude(self, block: Transaction) -> None:
+        """Run COMMIT; with SYNC_ON_COMMIT it is on the disk when this returns."""
         if self._spoilt and not block.spoilt and (block.apart or block.level == 0):
             raise StoreError("Part of this change failed, so all of it was undone.", hint="Run it again.")
         if block.level == 0:
             self.execute("COMMIT")
             if self._added and not block.later:  # the log, and all that was written to it before, is on the disk
-                self._settled = self.later
+                self._settled = self.commits_not_waited_for
         elif block.apart:
             self.execute(f"RELEASE s{block.level}")
 

@@ -22,7 +22,7 @@ from teds_provision.portable import NOFOLLOW, is_mine, is_open_to
 from teds_provision.station.store.connection import (
     BUSY_SECONDS,
     QUIET_SECONDS,
-    WAITING,
+    SYNC_ON_COMMIT,
     Connection,
     as_store_failure,
     is_no_place_to_write,
@@ -235,7 +235,7 @@ class Database(Connection):
         return version
 
     def _bring_in_order(self, *, create: bool) -> None:
-        for pragma in ("trusted_schema=OFF", "foreign_keys=ON", "secure_delete=ON", WAITING):
+        for pragma in ("trusted_schema=OFF", "foreign_keys=ON", "secure_delete=ON", SYNC_ON_COMMIT):
             self.execute(f"PRAGMA {pragma}")
         version = self._check_version(create=create)
         if version < SCHEMA_VERSION:
