@@ -75,7 +75,7 @@ def serve(can: str, folders: Sequence[str]) -> None:
             board=lambda file: Board(Sheet.from_image(Image(file.load().uuid, file.hardware)), source="ramp:2"),
             pulse=pulse,
         )
-        server.add(node, measuring=node)
+        server.add(node, measuring_handler=node)
         node.streams_over(_sender(server, node))
         assert node.board is not None
         boards[node.tim.flash.uuid.hex()] = node.board

@@ -96,7 +96,7 @@ class Power:
                 board=lambda file: Board(Sheet.from_image(Image(file.load().uuid, file.hardware)), source="ramp:2"),
                 pulse=self._pulse,
             )
-            server.add(node, measuring=node)
+            server.add(node, measuring_handler=node)
             node.streams_over(partial(_send, server, node))
             assert node.board is not None
             node.board.start()

@@ -403,7 +403,7 @@ class LinkSettings:
     via_chosen: bool = False
 
     @property
-    def is_open(self) -> bool:
+    def names_no_link(self) -> bool:
         """True if neither a link nor a reader was given: any that the node may be on will do."""
         return self.via == "nfc" and self.nfc is None and not self.via_chosen
 

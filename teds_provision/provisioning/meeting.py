@@ -83,7 +83,7 @@ def _met_at(
     try:
         port = open_port(links)
     except NoReaderError as error:
-        if not links.is_open:
+        if not links.names_no_link:
             raise
         raise _no_link(station, uuid, error) from error
     try:
@@ -147,7 +147,7 @@ def likely_places(station: Station, links: LinkSettings, uuids: Sequence[bytes])
 
     Places are ``LINK:PORT``; empty if a link was chosen, or if none is known.
     """
-    if not links.is_open:
+    if not links.names_no_link:
         return ()
     return links.buses or tuple(dict.fromkeys(station.nodes.last_places(uuids).values()))
 

@@ -99,7 +99,7 @@ class MemoryServer(CanServer):
         tapped: Callable[[], bool] = lambda: bus.board.tim.identity().state == NodeState.FACTORY  # noqa: E731
         self._endpoints = [CanEndpoint(self._handler, tapped, self._workers, self._out, self._handler)]  # type: ignore[arg-type]
         self._endpoint_of = {id(self._handler): self._endpoints[0]}
-        self._addresses = self._seated()
+        self._addresses = self._new_table()
         self.own, self.fd = bus.source, False
 
     def send(self, identifier: int, octets: bytes, *, fd: bool = False) -> None:

@@ -277,7 +277,7 @@ def main() -> None:
         fault, _, folder = word.partition("=")
         node = FaultyNode(Path(folder), pulse)
         FAULTS[fault](node) if FAULTS[fault] in SPOILING else None
-        server.add(node, measuring=node)
+        server.add(node, measuring_handler=node)
         node.streams_over(_sender(server, node, FAULTS[fault] if FAULTS[fault] in BENDING else None))
         boards.append(node.board)
     stop = IdleStop(None)

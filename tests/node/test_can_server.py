@@ -349,7 +349,7 @@ def test_a_trigger_is_timed_while_a_data_frame_of_the_node_is_still_on_the_wire(
     """The tick of a trigger is that of its end within 100 µs (operation.md section 5), whatever the node sends."""
     node = TriggerListener(0x21)
     server = CanServer(f"{hub.spec}&pace=1&bitrate=200")  # a frame of 8 octets takes 0.65 s
-    server.add(node, measuring=node)
+    server.add(node, measuring_handler=node)
     server.start()
     stranger = RawStation(hub.spec)
     try:

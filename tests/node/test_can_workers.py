@@ -119,7 +119,7 @@ def test_a_stored_reply_is_kept_from_its_end_however_long_the_command_ran(monkey
         return b"\x80"
 
     handler = SimpleNamespace(request=slow)
-    node = SimpleNamespace(measuring=None, handler=handler, counts_as_tapped=lambda: False)
+    node = SimpleNamespace(measuring_handler=None, handler=handler, counts_as_tapped=lambda: False)
     line = endpoint.StationState(node, 0xF1, SimpleNamespace(put=lambda job: job()))  # type: ignore[arg-type]
     request = endpoint.EndpointRequest(bytes.fromhex("01 8010 0000".replace(" ", "")), fd=False, received=0)
     first = line.answer(request)

@@ -501,7 +501,7 @@ def _servers(
         bus = node_room.CanServer(can, notify=app.warn)
         for node in nodes:
             tapped = node.in_factory_state if nfc is None else lambda: False
-            bus.add(node, counts_as_tapped=tapped, measuring=node)
+            bus.add(node, counts_as_tapped=tapped, measuring_handler=node)
             node.announces_presses_over(functools.partial(bus.announce_press, node))
             node.when_restarted(functools.partial(bus.restarted, node))
             node.streams_over(functools.partial(_send, bus, node))

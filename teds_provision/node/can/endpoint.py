@@ -77,9 +77,9 @@ class StationState:
 
         def run(frame: bytes) -> bytes:
             tapped = endpoint.counts_as_tapped()
-            if endpoint.measuring is None:
+            if endpoint.measuring_handler is None:
                 return endpoint.handler.request(self.name, frame, tapped=tapped)
-            return endpoint.measuring.request_received(
+            return endpoint.measuring_handler.request_received(
                 self.name, frame, tapped=tapped, fd=request.fd, received=request.received
             )
 
@@ -95,11 +95,11 @@ class CanEndpoint:
         counts_as_tapped: Callable[[], bool],
         workers: WorkerPool,
         send: Callable[[CanEndpoint, Frame], None],
-        measuring: MeasuringHandler | None = None,
+        measuring_handler: MeasuringHandler | None = None,
     ) -> None:
         self.handler, self.counts_as_tapped, self._workers = handler, counts_as_tapped, workers
         self._send = send
-        self.measuring = measuring
+        self.measuring_handler = measuring_handler
         self.address = handler.can_address()
         identity = Identity.decode(handler.identify())
         self.uuid, self.max_message = identity.uuid, identity.max_message
@@ -139,8 +139,8 @@ class CanEndpoint:
     def reply_left(self, state: StationState) -> None:
         """Handle that the reply on this link is sent, or was abandoned: data may follow."""
         state.reply_left()
-        if self.measuring is not None:
-            self.measuring.reply_left(state.name)
+        if self.measuring_handler is not None:
+            self.measuring_handler.reply_left(state.name)
 
     def move(self, address: int) -> None:
         """Have another address from now on, because another node claimed this one: sessions of the old one end."""

@@ -181,7 +181,7 @@ class CanServer:
         self._workers: WorkerPool | None = None
         self._endpoints: list[CanEndpoint] = []
         self._endpoint_of: dict[int, CanEndpoint] = {}
-        self._addresses = self._seated()
+        self._addresses = self._new_table()
         self._active: set[tuple[CanEndpoint, Pair]] = set()
         self._pushing: set[tuple[CanEndpoint, Pair]] = set()
         self._looked = 0.0
@@ -201,10 +201,10 @@ class CanServer:
         handler: NodeHandler,
         *,
         counts_as_tapped: Callable[[], bool] = _never,
-        measuring: MeasuringHandler | None = None,
+        measuring_handler: MeasuringHandler | None = None,
     ) -> None:
-        """Add one more node to this bus, before :meth:`start`; ``measuring`` if it offers operation.md."""
-        self._nodes.append((handler, counts_as_tapped, measuring))
+        """Add one more node to this bus, before :meth:`start`; ``measuring_handler`` if it offers operation.md."""
+        self._nodes.append((handler, counts_as_tapped, measuring_handler))
 
     def start(self) -> None:
         """Open the bus and listen; raises NoReaderError or UsageError if it cannot."""
@@ -216,7 +216,7 @@ class CanServer:
             CanEndpoint(node, tapped, self._workers, self._out, more) for node, tapped, more in self._nodes
         ]
         self._endpoint_of = {id(endpoint.handler): endpoint for endpoint in self._endpoints}
-        self._addresses = self._seated()
+        self._addresses = self._new_table()
         self._addresses.announce_all()
         self._wake, woken = socket.socketpair()
         self._thread = threading.Thread(target=self._serve, args=(woken,), name="can", daemon=True)
@@ -236,12 +236,12 @@ class CanServer:
             for state in endpoint.stations.values():
                 state.begin_anew()
         self._endpoints = []
-        self._addresses = self._seated()
+        self._addresses = self._new_table()
         if self._bus is not None:
             self._bus.close()
             self._bus = None
 
-    def _seated(self) -> EndpointTable:
+    def _new_table(self) -> EndpointTable:
         echoes = bool(dict(self._spec.options).get("receive_own_messages"))
         return EndpointTable(self._endpoints, self._at_time, self._moves, self._notify, echoes=echoes)
 
@@ -327,9 +327,9 @@ class CanServer:
         for endpoint, pair in list(self._active if look_round else self._pushing):
             if look_round or pair.due_in(1.0) <= 0:
                 pair.run()
-                self._note(endpoint, pair)
+                self._schedule(endpoint, pair)
 
-    def _note(self, endpoint: CanEndpoint, pair: Pair) -> None:
+    def _schedule(self, endpoint: CanEndpoint, pair: Pair) -> None:
         """Look after a pair while a message of either side is under way, and closely while we send."""
         for pairs, belongs in (
             (self._active, pair.sending or pair.receiving),
@@ -379,15 +379,15 @@ class CanServer:
         own = ends[0]
         for endpoint in self._addresses.at(own):
             state, pair = endpoint.pair(station, own)
-            self._request(endpoint, state, pair, frame)
+            self._command_frame(endpoint, state, pair, frame)
         if frame.data and frame.data[0] >> 4 == _FLOW_CONTROL:
             # A reply that is still leaving from the address before 128.10 needs its flow control.
             for endpoint, pair in list(self._active):
                 if pair.own == own and pair.peer == station and endpoint.address != own and pair.sending:
                     pair.handle_frame(frame)
-                    self._note(endpoint, pair)
+                    self._schedule(endpoint, pair)
 
-    def _request(self, endpoint: CanEndpoint, state: StationState, pair: Pair, frame: Frame) -> None:
+    def _command_frame(self, endpoint: CanEndpoint, state: StationState, pair: Pair, frame: Frame) -> None:
         begun = Reassembly.begin(pair.peer, frame)
         if begun is not None and begun.length > endpoint.max_message + 1:  # refused in place of a flow control
             answer = single(bytes(begun.octets[:1]) + refusal(Reason.TOO_LARGE).encode(), fd=frame.fd)
@@ -397,23 +397,28 @@ class CanServer:
         while (body := pair.received()) is not None:
             if pair.waits_for_flow:
                 pair.stop_sending()  # a station that repeats its request has not taken that answer
-            received = endpoint.measuring.tick(frame.at) if endpoint.measuring is not None else 0
+            received = endpoint.measuring_handler.tick(frame.at) if endpoint.measuring_handler is not None else 0
             state.put(functools.partial(self._run_request, state, pair, EndpointRequest(body, frame.fd, received)))
-        self._note(endpoint, pair)
+        self._schedule(endpoint, pair)
 
     def _measuring_frame(self, station: int, frame: Frame) -> None:
         """Handle a trigger, whose tick is that of its arrival for every node, or a Drive frame."""
         if trigger_station(frame.identifier) == station:
-            nodes = [endpoint.measuring for endpoint in self._endpoints if endpoint.measuring is not None]
+            nodes = [
+                endpoint.measuring_handler for endpoint in self._endpoints if endpoint.measuring_handler is not None
+            ]
             for node, tick in [(node, node.tick(frame.at)) for node in nodes]:
                 node.trigger(link_name(station), frame.data, tick)
         elif (address := drive_address(frame.identifier)) is not None:
             for endpoint in self._addresses.at(address.node):
-                if endpoint.measuring is not None:
-                    endpoint.measuring.drive(link_name(station), frame.data)
+                if endpoint.measuring_handler is not None:
+                    endpoint.measuring_handler.drive(link_name(station), frame.data)
 
     def _run_request(self, state: StationState, pair: Pair, request: EndpointRequest) -> None:
-        """Run one request in the turn of its node and send the reply from the address that was asked."""
+        """Run one request in its station's queue; VirtualNode lets one command run at a time.
+
+        The reply goes out from the address that was asked.
+        """
         try:
             reply = state.answer(request)
         except TedsProvisionError:
@@ -434,7 +439,7 @@ class CanServer:
             except LinkError:
                 return  # the reading thread meets the same failure and deals with it
             state.replying = pair
-            self._note(state.endpoint, pair)
+            self._schedule(state.endpoint, pair)
 
     # -- everyone --------------------------------------------------------------------------------------------------
 
@@ -467,7 +472,7 @@ class CanServer:
         self._end_answer_to_everyone(state, pair)
         pair.speak(fd=fd)
         pair.send(transaction + Reply(True, endpoint.handler.identify()).encode())
-        self._note(endpoint, pair)
+        self._schedule(endpoint, pair)
 
     def _end_answer_to_everyone(self, state: StationState, pair: Pair) -> None:
         """Abandon a broadcast answer without flow control; a reply to this station alone is kept."""

@@ -72,7 +72,7 @@ def test_a_node_dates_requests_and_triggers_by_their_arrival_not_by_when_its_thr
 
     monkeypatch.setattr(Bus, "receive", late)
     node, server = TimedEchoNode(0x21), CanServer(group)
-    server.add(node, measuring=node)  # type: ignore[arg-type]  # what a request asks of a measuring node
+    server.add(node, measuring_handler=node)  # type: ignore[arg-type]  # what a request asks of a measuring node
     server.start()
     try:
         with opened(group) as port:
