@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import signal
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -71,6 +72,7 @@ def pull_at_each(home: Path, field: Field, path: str, lying: list[tuple[str, str
                 done = next(came)
                 if isinstance(done.failure, NoReaderError):  # the simulated reader's process had no time to answer
                     field.lift()
+                    time.sleep(2 * port.RETURN_WITHIN)  # put back sooner, it is the same visit, which is over
                     field.put(next_path)
                     done = next(came)
                 assert (done.uuid.hex(), done.result) == (next_uuid, "passed"), (point, done, done.failure)
