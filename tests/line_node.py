@@ -60,7 +60,7 @@ def serve(node: VirtualNode, line: socket.socket) -> None:
             if head[2] == COMMAND:
                 reply = node.request_received(LINK, octets, tapped=False, received=node.tick(), mtu=MTU)
                 send(COMMAND, reply)
-                node.reply_left(LINK)
+                node.reply_sent(LINK)
             else:
                 node.drive(LINK, octets[1:])
                 print("driven", flush=True)

@@ -56,7 +56,7 @@ class MeasuringHandler(Protocol):
         ``mtu`` and ``hears`` are those of a BLE connection; see SessionPort.
         """
 
-    def reply_left(self, link: str) -> None:
+    def reply_sent(self, link: str) -> None:
         """Let data follow: the last reply on this link has left (or will not any more)."""
 
     def trigger(self, link: str, token: bytes, tick: int) -> None:

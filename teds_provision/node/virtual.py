@@ -258,7 +258,7 @@ class VirtualNode:
         """Run one command frame; see NodeHandler."""
         reply = self.request_received(link, frame, tapped=tapped, received=self.tick())
         if self.tim.restarts_after(link):  # a reader takes the reply by itself: nothing reports that it has left
-            timer = threading.Timer(_READER_SECONDS, self.reply_left, (link,))
+            timer = threading.Timer(_READER_SECONDS, self.reply_sent, (link,))
             timer.daemon = True
             timer.start()
         return reply
@@ -287,10 +287,10 @@ class VirtualNode:
         self._wake()
         return reply
 
-    def reply_left(self, link: str) -> None:
+    def reply_sent(self, link: str) -> None:
         """Let data follow; see MeasuringHandler."""
         with self._core.interrupt():
-            self.tim.reply_left(link)
+            self.tim.reply_sent(link)
         self._wake()
 
     def lost(self, link: str) -> None:

@@ -71,7 +71,7 @@ class FaultyLink(MemoryLink):
             return self.reference(octets) if self.fault is None else self.fault(self.board, octets, self.reference)
 
         reply = self.repetition.answer(self.count, frame, run, now=self.board.seconds)
-        self.board.tim.reply_left(self.name)
+        self.board.tim.reply_sent(self.name)
         return reply
 
 

@@ -78,8 +78,8 @@ class _Handler:
         hardware = self._board.tim.hardware
         return 0 if hardware is None else hardware.now()
 
-    def reply_left(self, link: str) -> None:
-        self._board.tim.reply_left(link)
+    def reply_sent(self, link: str) -> None:
+        self._board.tim.reply_sent(link)
 
     def trigger(self, link: str, token: bytes, tick: int) -> None:
         self._board.tim.trigger(link, token, tick)

@@ -92,7 +92,7 @@ class CDesk(Desk):
 
     def raw(self, octets: bytes, *, link: str = "nfc", tapped: bool = True) -> Reply:
         reply = super().raw(octets, link=link, tapped=tapped)
-        self.node.reply_left(link)
+        self.node.reply_sent(link)
         return reply
 
     def restart(self) -> None:

@@ -307,7 +307,7 @@ class MemoryNode:
         self._now()
         assert self._library.memory_by_hand(self._board) == 0
 
-    def reply_left(self, link: str) -> None:
+    def reply_sent(self, link: str) -> None:
         """The last reply of this link has left."""
         self._now()
         self._library.memory_reply_left(self._board, ctypes.c_uint8(link_number(link)[0]))

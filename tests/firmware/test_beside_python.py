@@ -146,8 +146,8 @@ class Twins:
             print("C:", self.peek(link, theirs), "Python:", self.peek(link, mine))
         assert theirs.hex() == mine.hex(), f"{frame.hex()} on {link} at {self.hardware.tick}"
         self.compared += 1
-        self.py.reply_left(link)
-        self.c.reply_left(link)
+        self.py.reply_sent(link)
+        self.c.reply_sent(link)
         self.frames()
         return mine
 

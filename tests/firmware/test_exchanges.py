@@ -36,7 +36,7 @@ class CLink:
 
     def exchange(self, frame: bytes) -> bytes:
         reply = self.node.handle(frame, link="can:f1", tapped=True)
-        self.node.reply_left("can:f1")
+        self.node.reply_sent("can:f1")
         return reply
 
     def close(self) -> None:

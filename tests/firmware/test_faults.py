@@ -68,7 +68,7 @@ class AnsweringNode(MemoryNode):
 
     def handle(self, frame: bytes, *, link: str, **more: Any) -> bytes:
         reply = super().handle(frame, link=link, **more)
-        self.reply_left(link)
+        self.reply_sent(link)
         return reply
 
     @property

@@ -415,7 +415,7 @@ def test_a_restart_waits_until_its_reply_has_left() -> None:
     assert reply.payload == packet((0x0B, 0, 5))
     assert desk.firmware.asked == []
     assert desk.firmware.restarts == 1, "the desk takes each reply at once"
-    desk.node.reply_left("nfc")
+    desk.node.reply_sent("nfc")
     assert desk.firmware.restarts == 1
 
 
@@ -426,7 +426,7 @@ def test_a_restart_comes_also_if_its_reply_is_never_taken() -> None:
     frame = desk.session.seal(Command(0, 128, MANAGE, packet(smp.RESTART))).encode()
     desk.node.handle(frame, link="can:f1", tapped=False)
     assert desk.firmware.restarts == 0
-    desk.node.reply_left("can:f2")
+    desk.node.reply_sent("can:f2")
     desk.node.link_lost("can:f2")
     assert desk.firmware.restarts == 0
     desk.node.link_lost("can:f1")

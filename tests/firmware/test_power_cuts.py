@@ -52,7 +52,7 @@ def reset(desk: CDesk) -> Reply:
 def address(desk: CDesk) -> Reply:
     desk.now += 11
     done = desk.plain(security_command(Function.SET_CAN_ADDRESS, bytes([desk.flash.can_address % 239 + 1])))
-    desk.node.reply_left("nfc")
+    desk.node.reply_sent("nfc")
     return done
 
 

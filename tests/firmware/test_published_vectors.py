@@ -41,7 +41,7 @@ class Replay(vn.Replay):
             return None
         reply = super().run(step)
         if reply is not None:
-            self.node.reply_left(step["link"])
+            self.node.reply_sent(step["link"])
         return reply
 
 

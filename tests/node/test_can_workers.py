@@ -124,7 +124,7 @@ def test_a_stored_reply_is_kept_from_its_end_however_long_the_command_ran(monkey
     request = endpoint.EndpointRequest(bytes.fromhex("01 8010 0000".replace(" ", "")), fd=False, received=0)
     first = line.answer(request)
     now[0] += 4  # its last frame is taken
-    line.reply_left()
+    line.reply_sent()
     now[0] += KEEP_SECONDS - 0.1
     assert (line.answer(request), len(ran)) == (first, 1)
     now[0] += KEEP_SECONDS

@@ -266,10 +266,10 @@ def test_a_restart_comes_when_its_reply_has_left_and_from_nowhere_else() -> None
     assert decode_packet(reply.payload) == packet(RESTART).reply(b"\xa0")
     assert not desk.manager.got, "the manager is not asked"
     assert desk.manager.restarts == 0
-    desk.tim.reply_left("can:f2")
+    desk.tim.reply_sent("can:f2")
     assert desk.manager.restarts == 0
-    desk.tim.reply_left("can:f1")
-    desk.tim.reply_left("can:f1")
+    desk.tim.reply_sent("can:f1")
+    desk.tim.reply_sent("can:f1")
     assert desk.manager.restarts == 1
 
 

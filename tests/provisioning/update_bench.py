@@ -193,7 +193,7 @@ class BenchLink:
         restarting = threading.Event()
         node.when_restarted(restarting.set)
         asked = node.tim._manage is not None and node.tim._manage.restart_link == link
-        node.reply_left(link)
+        node.reply_sent(link)
         if asked:
             assert restarting.wait(60), "the board did not restart"
         bench.answered(number)

@@ -265,7 +265,7 @@ class Peripheral:
             with suppress(Exception):  # the connection is gone
                 sent.result()
             line.repetition.reply_sent(time.monotonic())
-            self._node.reply_left(line.name)
+            self._node.reply_sent(line.name)
 
         return job
 

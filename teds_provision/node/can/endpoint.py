@@ -66,7 +66,7 @@ class StationState:
         self._repetition.forget()
         self.endpoint.handler.lost(self.name)
 
-    def reply_left(self) -> None:
+    def reply_sent(self) -> None:
         """Handle that the reply is sent, or was abandoned: from now on it is kept for a repeated request."""
         self.replying = None
         self._repetition.reply_sent(time.monotonic())
@@ -136,11 +136,11 @@ class CanEndpoint:
             pair = state.pairs[own] = Pair(own, station, lambda frame: self._send(self, frame))
         return state, pair
 
-    def reply_left(self, state: StationState) -> None:
+    def reply_sent(self, state: StationState) -> None:
         """Handle that the reply on this link is sent, or was abandoned: data may follow."""
-        state.reply_left()
+        state.reply_sent()
         if self.measuring_handler is not None:
-            self.measuring_handler.reply_left(state.name)
+            self.measuring_handler.reply_sent(state.name)
 
     def move(self, address: int) -> None:
         """Have another address from now on, because another node claimed this one: sessions of the old one end."""

@@ -341,7 +341,7 @@ class CanServer:
                 pairs.discard((endpoint, pair))
         state = endpoint.stations.get(pair.peer)
         if state is not None and state.replying is pair and not pair.sending:
-            endpoint.reply_left(state)
+            endpoint.reply_sent(state)
 
     def _at_time(self, due: float, job: Callable[[], None]) -> None:
         heapq.heappush(self._later, (due, next(self._number), job))

@@ -38,7 +38,7 @@ A node
 ------
 ``Tim(..., hardware=...)``; the link reports what only a link knows:
 
-* ``tim.handle(frame, link=…, tapped=…)`` as before; then, when the reply has left, ``tim.reply_left(link)``;
+* ``tim.handle(frame, link=…, tapped=…)`` as before; then, when the reply has left, ``tim.reply_sent(link)``;
 * ``tim.poll()`` again and again: takes samples, runs leases and dead-men; gives the seconds until it wants to be
   called again. ``tim.event(channel, tick, data_set, valid)`` whenever an event sensor has seen one;
 * ``tim.next_frame_in()`` and ``tim.next_frame(bus)`` for a link that streams: when the next data frame may begin, and

@@ -285,7 +285,7 @@ class StreamRole:
 
     # -- time ------------------------------------------------------------------------------------------------------
 
-    def reply_left(self, session: NodeSession) -> None:
+    def reply_sent(self, session: NodeSession) -> None:
         """Let the session's streams send: the reply to its last command has left."""
         for stream in self._streams:
             if stream.session is session:

@@ -113,7 +113,7 @@ class ManageFilter:
         if self._upload is not None and self._upload.session is session:
             self._upload = None
 
-    def reply_left(self, link: str) -> None:
+    def reply_sent(self, link: str) -> None:
         """Restart the node if that was the reply to a restart."""
         if self.restart_link == link:
             self.restart_link = None

@@ -165,7 +165,7 @@ class Tim:
         """Run one whole command frame and return the whole reply frame. Never raises on any octets.
 
         ``port`` adds to the link's name (CAN FD, MTU); ``received`` is the tick at the frame's last octet, by default
-        now. When the reply has left, call :meth:`reply_left`.
+        now. When the reply has left, call :meth:`reply_sent`.
         """
         tick = received if received is not None else self._role.now() if self._role is not None else 0
         self.poll()  # what ran out before this frame is over, and is reported: it revives no lease, hides no dead-man
@@ -186,13 +186,13 @@ class Tim:
 
     # -- what links that measure call as well ----------------------------------------------------------------------
 
-    def reply_left(self, link: str) -> None:
+    def reply_sent(self, link: str) -> None:
         """Handle that the reply to the last command of this link has left: its session's streams may follow."""
         session = self._sessions.on(link)
         if self._role is not None and session is not None:
-            self._role.streams.reply_left(session)
+            self._role.streams.reply_sent(session)
         if self._manage is not None:
-            self._manage.reply_left(link)
+            self._manage.reply_sent(link)
 
     def poll(self) -> float | None:
         """Take samples, run leases and dead-men; gives seconds until one is due again, None: none is known.

@@ -38,7 +38,7 @@ class TimedEchoNode(EchoNode):
         self.received = received
         return self.request(link, frame, tapped=tapped)
 
-    def reply_left(self, link: str) -> None: ...
+    def reply_sent(self, link: str) -> None: ...
 
     def trigger(self, link: str, token: bytes, tick: int) -> None:
         self.received = tick

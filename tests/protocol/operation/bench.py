@@ -143,7 +143,7 @@ class Bench:
         """A plain command; ``left``: its reply has left at once."""
         reply = self.tim.handle(command.encode(), link=link, tapped=link == "nfc", port=self.ports.get(link))
         if left:
-            self.tim.reply_left(link)
+            self.tim.reply_sent(link)
         return decode_reply(reply)
 
     def open(self, link: str = "can:f1", port: SessionPort | None = None) -> Bench:

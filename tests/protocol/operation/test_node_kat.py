@@ -81,7 +81,7 @@ def test_the_node_answers_and_streams_as_published(fd: bool) -> None:
         drive(bench, entry["name"], fd=fd)
         frame = bytes.fromhex(entry["frame"])
         reply = bench.tim.handle(frame, link="can:f1", tapped=False, port=bench.ports["can:f1"])
-        bench.tim.reply_left("can:f1")
+        bench.tim.reply_sent("can:f1")
         if entry["name"].startswith("Stop 0: self-test"):
             bench.hardware.tests.clear()
         assert reply.hex() == entry["reply"], entry["name"]

@@ -55,7 +55,7 @@ def test_nothing_leaves_before_the_reply_and_nothing_after_stop() -> None:
     consumer = Consumer(bench, start=bench.hardware.tick + 1, left=False)
     bench.later(100 * MS)
     assert not bench.frames, "the reply has not left yet"
-    bench.tim.reply_left("can:f1")
+    bench.tim.reply_sent("can:f1")
     bench.later(50 * MS)
     assert consumer.messages()
     before = len(bench.frames)
