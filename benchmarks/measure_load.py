@@ -36,7 +36,7 @@ from teds_provision.measure.grid import Grid
 from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.measure.running.measurement import BEAT
 from teds_provision.measure.sinks import Sink, open_sink
-from teds_provision.measure.stream_receiver import ReceivedStream, StreamReceiver
+from teds_provision.measure.stream_receiver import HearingThread, ReceivedStream
 from teds_provision.measure.verified_session import facts_of
 from teds_provision.protocol.operation.can_frames import DataAddress, StreamAssembly, cut
 from teds_provision.protocol.operation.datagram import DatagramSealer, stream_key
@@ -240,7 +240,7 @@ def run(nodes: int, seconds: float, folder: Path, targets: Sequence[str] = TARGE
     began, messages = time.monotonic_ns() + 8 * SECOND, int(seconds * RATE / N)
     machine = Machine(nodes, began, sinks, load)
     ports = [CanPort(spec) for spec in specs]
-    hearings = [StreamReceiver(port) for port in ports]
+    hearings = [HearingThread(port) for port in ports]
     for (node, stream), heard in machine.heard.items():
         hearing = hearings[node % len(hearings)]
         heard.pieces = hearing.expect(node_address(node), stream, heard.receiver.plan.length)

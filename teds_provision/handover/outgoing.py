@@ -7,13 +7,13 @@ whatever happens; the same command then seals the same move again, under the sam
 from __future__ import annotations
 
 import hashlib
-import uuid as uuids
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
+from uuid import uuid4
 
 from teds_provision.errors import NotFoundError, PolicyError, UsageError
 from teds_provision.files import new_file, require_new
@@ -308,7 +308,7 @@ class _SharedFields:
         if expires is None or expires <= self.now:
             expires = self.now.replace(microsecond=0) + timedelta(days=self.order.days)
         return ExportPlan(
-            earlier.id if earlier else str(uuids.uuid4()),
+            earlier.id if earlier else str(uuid4()),
             mode,
             self.receivers,
             self.ca,
@@ -325,9 +325,9 @@ class _SharedFields:
 
 @gc_pause.pause_gc()
 def export_bundle(station: Station, plan: ExportPlan, output: Path, now: datetime | None = None) -> ExportResult:
-    """Seal the bundle into a new file of mode 0600; a move's keys rest before the file can be opened.
+    """Seal the bundle into a new file of mode 0600; the store has it, and a move's keys rest, before it has its name.
 
-    Until the store has it, the file is a draft without signature and tag, under a temporary name. The same
+    Until then the file is a draft without signature and tag, under a temporary name. The same
     command over its own file finds nothing to do. Raises UsageError (the path holds another file), StoreError,
     VaultError.
     """

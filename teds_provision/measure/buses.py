@@ -15,7 +15,7 @@ from teds_provision.links.discovery import Sighting, SightingSink
 from teds_provision.links.streaming import MeasuringLink
 from teds_provision.measure.planning import BusShare, BusTime
 from teds_provision.measure.presence import Presence
-from teds_provision.measure.stream_receiver import StreamReceiver
+from teds_provision.measure.stream_receiver import HearingThread
 
 
 class MeasuredBus:
@@ -23,7 +23,7 @@ class MeasuredBus:
 
     def __init__(self, port: MeasuringLink, sightings: SightingSink, *, poll: float | None) -> None:
         self.port = port
-        self.receiver = StreamReceiver(port)
+        self.hearing = HearingThread(port)
         self.share = BusShare(BusTime(port.airtime()))
         self.discovery = port.discover(sightings, poll=poll)
         self.reading = threading.Lock()
@@ -39,7 +39,7 @@ class MeasuredBus:
     def close(self) -> None:
         """End its threads; the port stays open."""
         self.discovery.close()
-        self.receiver.close()
+        self.hearing.close()
 
     def time_for(self, time: BusTime, node: int) -> BusTime:
         """Return the time of this link as a node has it: over the air its connection has an MTU."""

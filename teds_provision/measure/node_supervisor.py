@@ -521,7 +521,7 @@ class NodeSupervisor:
                 lied = True
                 self._set_state("running", why=f"its clock is inconsistent: {self.streams.clock.lie}")
             silent = self.streams.silent(now)
-            if silent and (failure := bus.receiver.failure) is not None:  # the adapter was pulled: it is not the node
+            if silent and (failure := bus.hearing.failure) is not None:  # the adapter was pulled: it is not the node
                 raise failure
             if silent:
                 raise LinkError(f"No message from the node for {silent:.1f} s.", hint="Check its power and the bus.")

@@ -158,7 +158,7 @@ class EarlyMessages:
     messages: deque[DataMessage] = field(default_factory=lambda: deque(maxlen=MOST_EARLY))
 
 
-class StreamReceiver:
+class HearingThread:
     """The listening thread of one link that carries data."""
 
     def __init__(self, port: MeasuringLink) -> None:

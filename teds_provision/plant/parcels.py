@@ -8,13 +8,13 @@ taken in gives its receipt once more (contract/plant.md section 4).
 
 from __future__ import annotations
 
-import uuid as uuids
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from itertools import chain
 from typing import Final
+from uuid import uuid4
 
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, TedsProvisionError
 from teds_provision.handover import incoming, outgoing, pending
@@ -364,7 +364,7 @@ def _put_out(
     about: str,
     expires: datetime | None = None,
 ) -> str:
-    parcel = str(uuids.uuid4())
+    parcel = str(uuid4())
     until = time_text(expires or datetime.now(UTC) + timedelta(days=DAYS))
     station.plant.parcels.put(ParcelRow(parcel, "out", to, kind, "ready", until, about), document)
     return parcel

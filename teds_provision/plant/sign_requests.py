@@ -6,7 +6,6 @@ import hashlib
 import os
 import threading
 import time
-import uuid as uuids
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
+from uuid import UUID, uuid4
 
 from teds_provision.errors import (
     BadDataError,
@@ -187,7 +187,7 @@ class Inbox:
 
 def name_of(hash: str) -> str:
     """Return the id of the parcel that carries the document of this H: a UUIDv4 made from it."""
-    return str(uuids.UUID(bytes=bytes.fromhex(hash)[:16], version=4))
+    return str(UUID(bytes=bytes.fromhex(hash)[:16], version=4))
 
 
 def receivers(station: Station, job: Job) -> list[str]:
@@ -433,7 +433,7 @@ def _new_request(station: Station, node: Conversation, keys: SignedNodeKey, want
     if not verify(keys.key, prove_message(keys.uuid, asked), proof):
         raise NotAuthenticError("The node's signature of the request does not match the key it presented.")
     unsigned = SignRequest(
-        str(uuids.uuid4()),
+        str(uuid4()),
         wanted.office,
         datetime.now(UTC).replace(microsecond=0),
         wanted.job,

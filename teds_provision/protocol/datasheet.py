@@ -97,10 +97,10 @@ def signature_good(teds: SecurityTeds, octets: bytes, uuid: bytes, check: Verify
     if teds.station_key is None or teds.signature is None:
         return False
     message = security.tbs(uuid, octets)
-    return signs(teds, message) if check is None else check(teds.station_key, message, teds.signature)
+    return message_signature_good(teds, message) if check is None else check(teds.station_key, message, teds.signature)
 
 
-def signs(teds: SecurityTeds, message: bytes) -> bool:
+def message_signature_good(teds: SecurityTeds, message: bytes) -> bool:
     """Return True if 100 verifies under 103 over ``message``, which :func:`security.tbs` cut from the octets."""
     if teds.station_key is None or teds.signature is None:
         return False

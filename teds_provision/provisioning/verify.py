@@ -231,7 +231,7 @@ def _all_proofs(images: Sequence[Image]) -> list[_SecurityFields]:
         for image, shown in zip(images, read, strict=True)
     ]
     datasheets = [
-        message is not None and isinstance(shown, SecurityTeds) and datasheet.signs(shown, message)
+        message is not None and isinstance(shown, SecurityTeds) and datasheet.message_signature_good(shown, message)
         for shown, message in zip(read, signed, strict=True)
     ]
     return list(map(_SecurityFields, read, node_keys, datasheets))

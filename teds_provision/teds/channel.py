@@ -268,7 +268,12 @@ def read_channel(number: int, name: str, teds: DecodedTeds | None) -> Channel:
         sample=None if model is None or octets is None else SampleForm(model, octets, integer_of(teds, "SigBits") or 0),
         sampling=Sampling(integer_of(teds, "SampMode"), integer_of(teds, "SDefault")),
         timing=Timing(
-            *(number_of(teds, name) for name in ("SPeriod", "UpdateT", "WSetupT", "RSetupT", "RDelayT", "WarmUpT"))
+            period=number_of(teds, "SPeriod"),
+            update=number_of(teds, "UpdateT"),
+            write_setup=number_of(teds, "WSetupT"),
+            read_setup=number_of(teds, "RSetupT"),
+            read_delay=number_of(teds, "RDelayT"),
+            warm_up=number_of(teds, "WarmUpT"),
         ),
         halt=integer_of(teds, "ActHalt"),
         calibration_key=integer_of(teds, "CalKey"),

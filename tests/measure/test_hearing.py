@@ -22,7 +22,7 @@ from teds_provision.links.streaming import DataMessage, MeasuringLink
 from teds_provision.measure.blocks import Block
 from teds_provision.measure.clock import ClockMap, Exchange, HostClock, MonotonicStamps, WallClock
 from teds_provision.measure.interpreter import BLOCKS, StreamInterpreter
-from teds_provision.measure.stream_receiver import GATHER, HEARD_OUT, ReceivedStream, StreamReceiver
+from teds_provision.measure.stream_receiver import GATHER, HEARD_OUT, HearingThread, ReceivedStream
 from teds_provision.protocol.operation.can_frames import DataAddress, StreamAssembly, cut
 from teds_provision.protocol.operation.datagram import DatagramSealer, stream_key
 from teds_provision.protocol.operation.stream_commands import StreamKind, SubscribeReply
@@ -206,7 +206,7 @@ class SilentBus:
 def test_what_comes_before_its_stream_is_registered_is_no_loss() -> None:
     """On a busy machine the first message comes before the reply to Subscribe is looked at."""
     scene, port = Scene(ago=-60, fd=False), SilentBus()
-    with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
+    with closing(HearingThread(cast(MeasuringLink, port))) as hearing:
         frames = frames_of(scene, 3)
         old = replace(frames[0], at=time.monotonic() - 1.0)  # of a stream of the session before
         half = len(frames) // 2
@@ -237,7 +237,7 @@ class Meanwhile(dict[tuple[int, int], Any]):
 def test_what_comes_while_its_stream_is_registered_is_no_loss(table: str) -> None:
     """It was looked for among the streams before that was one, and among those to come when it was none any more."""
     scene, port = Scene(ago=-60, fd=False), SilentBus()
-    with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
+    with closing(HearingThread(cast(MeasuringLink, port))) as hearing:
         scene.heard.pieces = hearing.expect(0x21, 0, scene.plan.length)
 
         def register() -> None:
@@ -274,7 +274,7 @@ class Held(SilentBus):
 def test_what_came_before_the_end_is_no_loss_however_late_it_is_looked_at() -> None:
     """A measurement of 100 Hz lost its last three messages on a busy machine: they waited to be looked at."""
     scene, port = Scene(ago=-60, fd=False), Held()
-    with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
+    with closing(HearingThread(cast(MeasuringLink, port))) as hearing:
         scene.heard.pieces = hearing.expect(0x21, 0, scene.plan.length)
         hearing.register(0x21, 0, scene.heard)
         port.frames = frames_of(scene, 3)
@@ -289,7 +289,7 @@ def test_what_came_before_the_end_is_no_loss_however_late_it_is_looked_at() -> N
 
 def test_a_message_that_never_came_is_waited_for_no_longer_than_it_may_take() -> None:
     scene, port = Scene(ago=-60, fd=False), SilentBus()
-    with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
+    with closing(HearingThread(cast(MeasuringLink, port))) as hearing:
         hearing.register(0x21, 0, scene.heard)
         best_of(3, 2 * HEARD_OUT, lambda: timed(lambda: hearing.hear_out(scene.heard, 1)))
     best_of(3, 2 * HEARD_OUT, lambda: timed(lambda: hearing.hear_out(scene.heard, 1)))
@@ -333,7 +333,7 @@ def test_two_threads_that_take_what_came_take_it_in_order() -> None:
 def test_a_message_of_before_its_stream_was_asked_for_is_not_kept_for_it() -> None:
     """It is one of the session before, which waited in the queue of the link."""
     scene, port = Scene(ago=-60, fd=False), SilentBus()
-    with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
+    with closing(HearingThread(cast(MeasuringLink, port))) as hearing:
         hearing.expect(0x21, 0, scene.plan.length)
         since = hearing._early[0x21, 0].since
         for at in (since - 1, since):
@@ -343,7 +343,7 @@ def test_a_message_of_before_its_stream_was_asked_for_is_not_kept_for_it() -> No
 
 def test_a_stream_that_is_forgotten_is_taken_no_more_by_its_link() -> None:
     scene, port = Scene(ago=-60, fd=False), SilentBus()
-    with closing(StreamReceiver(cast(MeasuringLink, port))) as hearing:
+    with closing(HearingThread(cast(MeasuringLink, port))) as hearing:
         scene.heard.pieces = hearing.expect(0x21, 0, scene.plan.length)
         hearing.register(0x21, 0, scene.heard)
         assert hearing.forget(0x21, 0) is scene.heard

@@ -873,7 +873,7 @@ PATTERNS = (
     ),
     Pattern(
         "a message of before its Subscribe is none of its stream",
-        "StreamReceiver._dispatch",
+        "HearingThread._dispatch",
         "early is not None and message.at >= early.since",
         "early is not None",
         "tests/measure/test_hearing.py",

@@ -141,7 +141,7 @@ def export_keys(
     shown = plan_exports(station, order)
     outputs = outputs_of(output, len(shown)) if output is not None else []
     if dry_run:
-        result = _exported(shown, outputs, station)
+        result = _result_of(shown, outputs, station)
         id_ = None if shown[0].earlier is None else shown[0].id
         app.emit({**result, "id": id_, "plan": True}, _plan_text(shown, station))
         return
@@ -151,7 +151,7 @@ def export_keys(
         # A person may have taken minutes to answer. What they said yes to is done, or nothing is.
         plans = shown if station.version() == state else plan_exports(station, order)
         require_same([plan.content for plan in plans] == [plan.content for plan in shown])
-        result = _exported(plans, outputs, station)
+        result = _result_of(plans, outputs, station)
         if carrier is not None:
             more, when = carrier.send(station, plans)
             app.emit({**result, **more}, f"{_count(plans)} will leave with {when}.")
@@ -178,7 +178,7 @@ def _count(plans: Sequence[ExportPlan]) -> str:
     return count_of(sum(len(plan.nodes) for plan in plans))
 
 
-def _exported(plans: Sequence[ExportPlan], outputs: Sequence[Path], station: Station) -> dict[str, Any]:
+def _result_of(plans: Sequence[ExportPlan], outputs: Sequence[Path], station: Station) -> dict[str, Any]:
     plan = plans[0]
     return {
         "bundle": str(outputs[0]) if outputs else None,

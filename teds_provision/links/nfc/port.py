@@ -191,7 +191,7 @@ class NfcPort:
                 link = NfcLink(self, seen, notice)
                 yield _contact(seen, link, self.trace)
                 link.close()
-                seen = link.visit
+                seen = link.seen
             if link is not None and link.lost:  # the next tag is a new visit, the same node too
                 notice(_left(seen.identity.uuid))
                 notice(waiting)
@@ -297,7 +297,7 @@ class NfcLink:
         self._port = port
         self._notice = notice
         self._poller: Poller | None = Poller(visit.tag, visit.service)
-        self.visit = visit
+        self.seen = visit
         self._last = 0
         self.lost = False
         """True if the node left in the middle of an exchange and did not come back in time."""
@@ -315,7 +315,7 @@ class NfcLink:
     @property
     def announced(self) -> dict[str, int]:
         """Content of the node's service record; see ``AnnouncingLink``."""
-        service = self.visit.service
+        service = self.seen.service
         return {"WT_INT": service.wt_int, "N_wait": service.n_wait, "maxNdef": service.max_ndef}
 
     def exchange(self, frame: bytes) -> bytes:
@@ -345,7 +345,7 @@ class NfcLink:
                     return poller.transact(transaction, frame)
                 except (NodeSilentError, GarbledError) as error:
                     # choose how to go on: in the same activation while the tag still answers, else from a new one
-                    if self._poller is not None and not isinstance(error, FieldLostError) and self.visit.tag.is_present:
+                    if self._poller is not None and not isinstance(error, FieldLostError) and self.seen.tag.is_present:
                         self._poller.restart()
                     else:
                         self._poller = None
@@ -377,9 +377,9 @@ class NfcLink:
     def _ready_poller(self) -> Poller:
         if self._poller is None:
             self.lost = True
-            self.visit = self._port.back(self.visit.identity.uuid, RETURN_WITHIN)
+            self.seen = self._port.back(self.seen.identity.uuid, RETURN_WITHIN)
             self.lost = False
-            self._poller = Poller(self.visit.tag, self.visit.service)
+            self._poller = Poller(self.seen.tag, self.seen.service)
         return self._poller
 
 

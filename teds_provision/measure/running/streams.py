@@ -139,14 +139,14 @@ class NodeStreams:
         """Ask for a stream and hear it; its first sample is taken ``ahead`` seconds from now."""
         number = plan.subscribe.stream
         before = self.running.get(number)
-        pieces = bus.receiver.expect(address, number, plan.length)
+        pieces = bus.hearing.expect(address, number, plan.length)
         try:
             payload = trusted.node.request(plan.command(), "to stream")
             with self.mapping:
                 reply = plan.accept(payload, self.clock.ticks_at(time.monotonic_ns()), after=self._run)
         except BaseException:
             if before is None:
-                bus.receiver.forget(address, number)
+                bus.hearing.forget(address, number)
             raise
         self._run = reply.run
         receiver = Receiver(
@@ -166,7 +166,7 @@ class NodeStreams:
         stream.last_good_at += ahead
         self.running[number] = stream
         self.totals.setdefault(number, StreamTotals(plan.layout.channels, plan.subscribe.period / 1e9))
-        bus.receiver.register(address, number, stream)
+        bus.hearing.register(address, number, stream)
 
     def stop(self, bus: MeasuredBus, trusted: VerifiedSession | None, address: int) -> None:
         """Stop each in order, so that its counter shows what was lost at the end.
@@ -178,15 +178,15 @@ class NodeStreams:
         """
         wanted = {number: heard.ending() for number, heard in self.running.items()} if trusted is not None else {}
         for number, due in wanted.items():
-            bus.receiver.hear_out(self.running[number], due)
+            bus.hearing.hear_out(self.running[number], due)
         for number, heard in list(self.running.items()):
             if trusted is not None:
                 with suppress(TedsProvisionError, SessionLostError):
                     counter = decode_stopped(trusted.node.request(stop(number), "to stop a stream"))
                     due = min(counter, wanted[number]) if wanted[number] else counter
-                    bus.receiver.hear_out(heard, due)
+                    bus.hearing.hear_out(heard, due)
                     heard.receiver.finish(counter, due)
-            bus.receiver.forget(address, number)
+            bus.hearing.forget(address, number)
             self.totals[number].add(heard)
         self.running.clear()
 

@@ -30,7 +30,7 @@ from teds_provision.teds.profile.keys import (
     PHY_KEYS,
     SAMPLE_KEYS,
     Key,
-    Kind,
+    KeyKind,
 )
 from teds_provision.teds.profile.load import load_profile, parse_profile
 from teds_provision.teds.profile.model import Profile
@@ -180,9 +180,9 @@ def _value(key: Key, value: object) -> str | None:
     """Return TOML of a value in SI units; None if there is none, or none that the key takes."""
     if isinstance(value, tuple):
         return f"[{', '.join(_number(part) for part in value)}]" if all(map(_finite, value)) else None
-    if key.kind is Kind.FLAG:
+    if key.kind is KeyKind.FLAG:
         return {0: "false", 1: "true"}.get(value) if isinstance(value, int) else None
-    if key.kind is Kind.CHOICE:
+    if key.kind is KeyKind.CHOICE:
         return _word_or_number(key.choices, value) if isinstance(value, int) else None
     return _number(value) if _finite(value) else None
 

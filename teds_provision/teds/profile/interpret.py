@@ -21,7 +21,7 @@ from teds_provision.teds.profile.keys import (
     PHY_KEYS,
     SAMPLE_KEYS,
     Key,
-    Kind,
+    KeyKind,
 )
 from teds_provision.teds.profile.model import CalibrationDemand, ChannelProfile, Pairs, Profile, TextProfile
 from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM, Problems, Section, TomlTable
@@ -33,7 +33,7 @@ MAXIMUM_CHANNEL: Final = 255
 _RANGE: Final = re.compile(r"(\d+)(?:-(\d+))?\Z")
 _FRAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*\Z")
 _KEY_CHOICES: Final = {"auto": -1, **CALIBRATION_KEYS}
-_KEY: Final = Key("calibration-key", "CalKey", Kind.CHOICE, "who applies the calibration", choices=_KEY_CHOICES)
+_KEY: Final = Key("calibration-key", "CalKey", KeyKind.CHOICE, "who applies the calibration", choices=_KEY_CHOICES)
 
 
 def channels_of(top: Section, abstract: bool) -> tuple[ChannelProfile, ...]:
@@ -215,10 +215,10 @@ def _demand(section: Section, unit: WrittenUnit | None) -> CalibrationDemand:
     method = part.text("method") or None
     if method and method not in METHODS:
         part.error("method", f'"{method}" is no method; {", ".join(METHODS)} are.')
-    degree = part.read(Key("degree", "", Kind.U8, "degree of the polynomial"))
+    degree = part.read(Key("degree", "", KeyKind.U8, "degree of the polynomial"))
     seconds = _interval(part)
     part.unit = unit
-    deviation = part.read(Key("standard-deviation", "", Kind.NUMBER, "standard deviation in the channel's unit"))
+    deviation = part.read(Key("standard-deviation", "", KeyKind.NUMBER, "standard deviation in the channel's unit"))
     demand = CalibrationDemand(
         required=part.flag("required"),
         method=method,
@@ -376,7 +376,7 @@ def _meta(top: Section, channels: tuple[int, ...], abstract: bool) -> Pairs:
 
 def _text(part: Section, channels: tuple[int, ...]) -> TextProfile | None:
     kind = part.text("kind")
-    channel = part.read(Key("channel", "", Kind.U16, "channel, 0 for the whole node"))
+    channel = part.read(Key("channel", "", KeyKind.U16, "channel, 0 for the whole node"))
     text, language = part.text("xml"), part.text("language", "en")
     part.finish()
     if kind not in TEXT_CLASSES:

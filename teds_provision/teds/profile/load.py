@@ -27,7 +27,7 @@ from teds_provision.teds.profile.keys import (
     MODES,
     PHY_KEYS,
     Key,
-    Need,
+    KeyNeed,
 )
 from teds_provision.teds.profile.model import ChannelProfile, Profile
 from teds_provision.teds.profile.reader import Problems, ProfileProblem, SourcePlace, TomlTable, parse, read_text
@@ -378,7 +378,7 @@ def template(name: str) -> str:
 
 
 def _lines(keys: Iterable[Key], *, comment: bool = False) -> list[str]:
-    return [_line(key, comment or key.need is Need.OPTIONAL) for key in keys]
+    return [_line(key, comment or key.need is KeyNeed.OPTIONAL) for key in keys]
 
 
 def _line(key: Key, comment: bool) -> str:

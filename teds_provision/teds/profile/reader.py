@@ -15,7 +15,7 @@ from typing import Final
 from teds_provision import files
 from teds_provision.errors import BadDataError, StoreError
 from teds_provision.limits import LIMITS, check_depth, check_toml
-from teds_provision.teds.profile.keys import Key, Kind, Need
+from teds_provision.teds.profile.keys import Key, KeyKind, KeyNeed
 from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
 # TOML read with the place of every key: a profile's error names file, line and field.
@@ -173,7 +173,7 @@ def walk(table: TomlTable) -> Iterator[tuple[str, PlacedValue]]:
             yield path, entry
 
 
-_LIMITS = {Kind.U8: 0xFF, Kind.U16: 0xFFFF, Kind.U32: 0xFFFF_FFFF}
+_LIMITS = {KeyKind.U8: 0xFF, KeyKind.U16: 0xFFFF, KeyKind.U32: 0xFFFF_FFFF}
 _SHOWN = 60  # characters of a wrong value that a message shows
 FLOAT32_MAXIMUM = 3.4028234663852886e38
 NAME_OCTETS = 120
@@ -359,34 +359,34 @@ class Section:
                 self.error(key, f"there is no such key.{guess}")
 
     def _missing(self, key: Key) -> None:
-        if key.need is Need.OPTIONAL:
+        if key.need is KeyNeed.OPTIONAL:
             return
         example = f" Write for example: {key.key} = {key.example}" if key.example else ""
         message = f"missing ({key.help}).{example}"
-        report = self.error if key.need is Need.REQUIRED else self.warning
+        report = self.error if key.need is KeyNeed.REQUIRED else self.warning
         report(key.key, message)
 
     def _convert(self, key: Key, value: object) -> object:
         match key.kind:
-            case Kind.TIME:
+            case KeyKind.TIME:
                 return _not_negative(finite(parse_seconds(value)))
-            case Kind.VALUE:
+            case KeyKind.VALUE:
                 return finite(self._quantity(value, difference=False))
-            case Kind.DIFFERENCE:
+            case KeyKind.DIFFERENCE:
                 return _not_negative(finite(self._quantity(value, difference=True)))
-            case Kind.ANGLE:
+            case KeyKind.ANGLE:
                 return finite(_angle(value))
-            case Kind.NUMBER:
+            case KeyKind.NUMBER:
                 return finite(_number(value))
-            case Kind.FLAG:
+            case KeyKind.FLAG:
                 if not isinstance(value, bool):
                     raise _BadValueError(f"true or false is expected, not {_shown(value)}.")
                 return int(value)
-            case Kind.CHOICE:
+            case KeyKind.CHOICE:
                 return _choice(key, value)
-            case Kind.CHOICES:
+            case KeyKind.CHOICES:
                 return _list(key, value)
-            case Kind.U8 | Kind.U16 | Kind.U32:
+            case KeyKind.U8 | KeyKind.U16 | KeyKind.U32:
                 return _integer(value, _LIMITS[key.kind])
 
     def _quantity(self, value: object, *, difference: bool) -> float:
