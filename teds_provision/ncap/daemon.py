@@ -76,7 +76,7 @@ class Daemon:
             foxglove=foxglove,
             scalars=settings.scalars,
         )
-        self.measurements = MeasurementSupervisor(
+        self.measuring = MeasurementSupervisor(
             station,
             self.directory,
             self.live,
@@ -90,16 +90,14 @@ class Daemon:
         )
         self.node_locks.given = self._free_again
         self._takes_set_points = sinks.take_set_points
-        self.names = Names(
-            station, self.directory, self.live, self.measurements.is_measured, self.measurements.facts_of
-        )
-        self.sheets = Sheets(station, self.directory, self.node_jobs, self.measurements.sheet)
+        self.names = Names(station, self.directory, self.live, self.measuring.is_measured, self.measuring.facts_of)
+        self.sheets = Sheets(station, self.directory, self.node_jobs, self.measuring.sheet)
         self.provisioning = Provisioning(
             station,
             self.directory,
             self.live,
             self.node_jobs,
-            self.measurements.unmeasured,
+            self.measuring.unmeasured,
             trusted=settings.trust_dcc,
         )
         self.leases = ActuatorLeases(
@@ -107,9 +105,9 @@ class Daemon:
             self.live,
             self.node_jobs,
             self.node_locks,
-            self.measurements.session,
-            self.measurements.is_measured,
-            self.measurements.lent_for,
+            self.measuring.session,
+            self.measuring.is_measured,
+            self.measuring.lent_for,
             dead_man=settings.dead_man,
         )
         self.updates = Updates(
@@ -118,8 +116,8 @@ class Daemon:
             self.live,
             self.node_locks,
             bus_of=self.node_jobs.bus_of,
-            measured=lambda uuid: self.measurements.session(uuid, streaming=True),
-            lent=self.measurements.lent,
+            measured=lambda uuid: self.measuring.session(uuid, streaming=True),
+            lent=self.measuring.lent,
             held=self.leases.held,
         )
         self.virtuals = Virtuals(station, self.live)
@@ -158,13 +156,13 @@ class Daemon:
             watch.start()
         if self.virtuals.all():
             self._start_virtuals()
-        self.measurements.start()
+        self.measuring.start()
         if self.settings.unverified:
-            self.measurements.unverified(rate=self.settings.rate)
+            self.measuring.unverified(rate=self.settings.rate)
         for name in self.settings.parts:
             self.parts[name].start()
         if self.settings.measure is not None:
-            self.measurements.match(self.settings.measure, rate=self.settings.rate, frozen=self.settings.frozen)
+            self.measuring.match(self.settings.measure, rate=self.settings.rate, frozen=self.settings.frozen)
         self.updates.start()
         try:
             yield
@@ -178,7 +176,7 @@ class Daemon:
         for part in self.parts.values():
             part.stop()
         self.leases.end()
-        self.measurements.stop()
+        self.measuring.stop()
         for watch in self.watches:
             watch.stop()
         self.buses.close()
@@ -276,7 +274,7 @@ class Daemon:
             self.live.event("vault", state="locked", why=problem["message"], hint=problem["hint"])
             return
         self.live.event("vault", state="open")
-        self.measurements.look_who_is_meant()
+        self.measuring.look_who_is_meant()
         for watch in self.watches:
             watch.look_at_all()
 
@@ -286,7 +284,7 @@ class Daemon:
         return next((watch.port for watch in self.watches if watch.place == place), None)
 
     def _saw(self, sighting: Sighting) -> None:
-        self.measurements.on_sighting(sighting.uuid.hex())
+        self.measuring.on_sighting(sighting.uuid.hex())
         for watch in self.watches:
             if watch.port is sighting.port:
                 watch.on_sighting(sighting)
@@ -294,14 +292,14 @@ class Daemon:
     def _free_again(self, uuid: str) -> None:
         """Report a node that was inspected, or provisioned: now it may be measured."""
         if self.directory.seen(uuid).present:
-            self.measurements.on_sighting(uuid)
+            self.measuring.on_sighting(uuid)
 
     def serve_node(self, node: Conversation) -> bool:
         """Do what was requested for this node, or take it up; False if there was nothing to do."""
         before = node.identity.state
         served = self.node_jobs.serve(node) or self.adopting.serve(node)
         if served or node.identity.state != before:  # what a measurement refused it for may be gone
-            self.measurements.look_who_is_meant()
+            self.measuring.look_who_is_meant()
         return served
 
     @property
@@ -327,11 +325,11 @@ class Daemon:
             "nodes": sum(link["nodes"] for link in links),
             "strangers": sum(link["strangers"] for link in links),
             "clients": self.live.listeners,
-            "measurements": self.measurements.all(),
-            "sinks": self.measurements.sinks(),
+            "measurements": self.measuring.all(),
+            "sinks": self.measuring.sinks(),
             "foxglove": self.foxglove.url if self.foxglove is not None else None,
-            "clock_error": self.measurements.clock_error(),
-            "budget": self.measurements.budget(),
+            "clock_error": self.measuring.clock_error(),
+            "budget": self.measuring.budget(),
             "plant": "plant" in self._views and self._views["plant"](),
             "vault": {"state": "open" if self._vault_problem is None else "locked", "problem": self._vault_problem},
         }
@@ -374,7 +372,7 @@ class Daemon:
         with self.station.durable("detection"):
             self.station.measurements.detection = mode  # type: ignore[assignment]
             self.station.audit("detection", None, "set", mode=mode)
-        self.measurements.look_who_is_meant()
+        self.measuring.look_who_is_meant()
         self.live.event("detection", state=mode)
         for watch in self.watches:
             if changes:
@@ -394,7 +392,7 @@ class Daemon:
         Raises FrozenError if it is measured, but no values come of it now.
         """
         station = self.station
-        with self.measurements.session(uuid, streaming=True) as trusted:
+        with self.measuring.session(uuid, streaming=True) as trusted:
             if trusted is not None and trusted.node.sealed:
                 locate_measured(trusted.node, seconds)
                 return
@@ -436,7 +434,7 @@ class Daemon:
             {
                 "name": group.name,
                 "uuids": [uuid.hex() for uuid in group.uuids],
-                "measuring": bool(self.measurements.measured_as(group.name)),
+                "measuring": bool(self.measuring.measured_as(group.name)),
             }
             for group in self.station.groups.all()
         ]
@@ -468,7 +466,7 @@ class Daemon:
         self._group_changed(name)
 
     def _require_thawed(self, name: str) -> None:
-        measured = self.measurements.measured_as(name)
+        measured = self.measuring.measured_as(name)
         if measured:
             raise FrozenError(
                 f"Group {name!r} is being measured ({', '.join(measured)}) and cannot be changed now.",
@@ -477,7 +475,7 @@ class Daemon:
 
     def _group_changed(self, name: str) -> None:
         self.directory.refresh()
-        self.measurements.look_who_is_meant()
+        self.measuring.look_who_is_meant()
         self.live.event("group", state="changed", name=name)
 
     # -- virtual transducers -----------------------------------------------------------------------------------------
@@ -508,7 +506,7 @@ class Daemon:
         """
         with self.node_locks.hold(uuid, "it is removed"):
             with self.station.lock("virtual"):  # no measurement begins with it meanwhile
-                if self.measurements.measurement_of(uuid) is not None:
+                if self.measuring.measurement_of(uuid) is not None:
                     raise FrozenError(f"Node {uuid} is being measured.", hint="End the measurement first.")
                 one = self.virtuals.forget(uuid)
             self.virtuals.end(one)

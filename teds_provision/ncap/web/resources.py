@@ -203,7 +203,7 @@ class Resources:
         if caller.kind != "socket":
             raise PolicyError("A measured node is only let go to a command on the station's own machine.")
         uuid = request.path_params["uuid"].lower()
-        measuring, until = self._daemon.measurements, time.monotonic() + LONGEST_LOAN
+        measuring, until = self._daemon.measuring, time.monotonic() + LONGEST_LOAN
         why = f"let go for {request.query_params.get('for', 'a command')[:40]}"
         loan = NodeLoan(uuid, why)
 
@@ -386,7 +386,7 @@ class Resources:
 
     async def measurements(self, request: Request) -> Response:
         """GET, POST /measurements."""
-        measuring = self._daemon.measurements
+        measuring = self._daemon.measuring
         if request.method == "GET":
             return _shown(request, {"measurements": await asyncio.to_thread(measuring.all)})
         body = await body_of(request, bodies.NewMeasurement)
@@ -398,13 +398,13 @@ class Resources:
         """GET /measurements/rate: of a group, or of nodes."""
         group, named = request.query_params.get("group"), request.query_params.get("uuids", "")
         uuids = await self._nodes_of([text for text in named.split(",") if text][:MOST_NODES])
-        found = await reading(lambda: self._daemon.measurements.proposed_rate(group=group, uuids=uuids))
+        found = await reading(lambda: self._daemon.measuring.proposed_rate(group=group, uuids=uuids))
         return JSONResponse({"proposal": None if found is None else asdict(found)})
 
     async def measurement(self, request: Request) -> Response:
         """DELETE /measurements/ID."""
-        await changing(self._daemon.measurements.delete, request.path_params["id"])
-        return JSONResponse({"measurements": await asyncio.to_thread(self._daemon.measurements.all)})
+        await changing(self._daemon.measuring.delete, request.path_params["id"])
+        return JSONResponse({"measurements": await asyncio.to_thread(self._daemon.measuring.all)})
 
     # -- names, virtual transducers ----------------------------------------------------------------------------------
 
