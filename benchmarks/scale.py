@@ -38,7 +38,7 @@ PASSPHRASE = "correct horse battery"
 RECEIVER = "receiver"
 NODE_PORT = 28653
 SIZES = (10, 1000, 10_000, 100_000)
-_PAGE = 2000
+_CHUNK = 2000
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ def fill(home: Path, count: int) -> None:
     station, _ = initialise(home, name="n", keystore="file", ask=lambda p, c: PASSPHRASE, costs=costs)
     points = [SoftwareKey(number).point for number in range(1, 98)]
     octets = load_profile("temperature-sensor").build(bytes(10)).blocks
-    for first in range(0, count, _PAGE):
-        numbers = range(first, min(count, first + _PAGE))
+    for first in range(0, count, _CHUNK):
+        numbers = range(first, min(count, first + _CHUNK))
         entries = [WhitelistEntry(_uuid(n), fingerprint(points[n % 97]), name=f"node-{n}") for n in numbers]
         with station.transaction():
             station.bulk.put(

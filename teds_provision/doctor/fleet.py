@@ -97,9 +97,9 @@ def _firmware(station: Station, sample: RowSample) -> tuple[list[bytes], list[by
     """Return the nodes whose firmware their type does not accept, and those that another image runs on than before."""
     demands = FirmwareDemands(station.home)
     odd, changed = [], []
-    for page in chunks(station.firmware_reports.all(sample)):
-        nodes = station.nodes.get_many([record.uuid for record in page])
-        for record in page:
+    for chunk in chunks(station.firmware_reports.all(sample)):
+        nodes = station.nodes.get_many([record.uuid for record in chunk])
+        for record in chunk:
             node = nodes.get(record.uuid)
             known = known_firmware(record, partial(demands.demand_of, node.profile if node is not None else None))
             if known is not None and known.state not in ("good", "unjudged", "on-trial", "pending"):

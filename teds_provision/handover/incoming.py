@@ -57,7 +57,7 @@ class PlannedNode:
 
 
 class ImportedRows:
-    """The rows of the nodes that are taken in, made and written a page at a time; the caller holds the transaction."""
+    """The rows of the nodes that are taken in, made and written a chunk at a time; the caller holds the transaction."""
 
     def __init__(self, station: Station, bundle: Bundle) -> None:
         self.station, self.bundle = station, bundle
@@ -101,7 +101,7 @@ class ImportedRows:
         return groups
 
     def _turn_to(self, uuids: Sequence[bytes]) -> None:
-        """Read what is known here of a page of nodes."""
+        """Read what is known here of a chunk of nodes."""
         station = self.station
         self.known = station.nodes.get_many(uuids)
         self.pins = station.pins.get_many(uuids)
@@ -342,7 +342,7 @@ def _check_certified(station: Station, opened: OpenedBundle) -> None:
 
 
 class _Judge:
-    """Holds a bundle's nodes against the store, whose tables are read a page at a time."""
+    """Holds a bundle's nodes against the store, whose tables are read a chunk at a time."""
 
     def __init__(self, station: Station, denied: Iterable[Statement], bundle: Bundle) -> None:
         policy = station.policy
@@ -357,18 +357,18 @@ class _Judge:
 
     def judge_nodes(self, nodes: Iterable[BundledNode]) -> Iterator[PlannedNode]:
         """Decide for each node of the bundle whether its key is taken, and why not."""
-        for page in chunks(nodes):
-            self._turn_to(page)
-            for node in page:
+        for chunk in chunks(nodes):
+            self._turn_to(chunk)
+            for node in chunk:
                 why = self._obstacle(node) or self._stale_key(node)
                 yield PlannedNode(node, "refused", why) if why else self._taken(node)
 
-    def _turn_to(self, page: Sequence[BundledNode]) -> None:
-        """Read what is known here of a page of nodes, and who has their names."""
-        station, uuids = self.station, [node.uuid for node in page]
+    def _turn_to(self, chunk: Sequence[BundledNode]) -> None:
+        """Read what is known here of a chunk of nodes, and who has their names."""
+        station, uuids = self.station, [node.uuid for node in chunk]
         self.nodes = station.nodes.get_many(uuids)
         self.pins = station.pins.pinned_among(self.nodes.values(), station.pins.get_many(uuids).values())
-        self.bearers = station.nodes.bearers_of([node.name for node in page if node.name])
+        self.bearers = station.nodes.bearers_of([node.name for node in chunk if node.name])
         self.held: dict[bytes, dict[str, tuple[str, int]]] = {}
         for key in station.keys.get_many(uuids):
             self.held.setdefault(key.uuid, {})[key.key_id] = (key.state, key.epoch)
@@ -487,9 +487,9 @@ def prove_node(station: Station, node: Conversation) -> NodeProof:
 def proven_of(station: Station, uuids: Iterable[bytes]) -> set[bytes]:
     """Return those of many nodes whose held key opened a session and has no rotation due."""
     proven: set[bytes] = set()
-    for page in chunks(uuids):
-        active = {key.uuid for key in station.keys.get_many(page) if key.state == "active"}
-        proven |= active - station.keys.due_among(page)
+    for chunk in chunks(uuids):
+        active = {key.uuid for key in station.keys.get_many(chunk) if key.state == "active"}
+        proven |= active - station.keys.due_among(chunk)
     return proven
 
 

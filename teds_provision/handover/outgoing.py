@@ -69,7 +69,7 @@ Chosen = list[LeavingNode]
 
 
 class Selection:
-    """Which nodes go, by the tables as they are now (read once, a page at a time: there may be ten thousand)."""
+    """Which nodes go, by the tables as they are now (read once, a chunk at a time: there may be ten thousand)."""
 
     def __init__(self, station: Station, order: ExportOrder, receivers: set[str]) -> None:
         self.order, self.receivers = order, receivers
@@ -178,7 +178,7 @@ def _keys(station: Station, wanted: tuple[bytes, ...] | None) -> Iterator[tuple[
     """Return UUID, key id, epoch and state of the keys of the wanted nodes, or of all."""
     if wanted is None:
         return station.keys.all_key_names()
-    records = (key for page in chunks(wanted) for key in station.keys.get_many(page))
+    records = (key for chunk in chunks(wanted) for key in station.keys.get_many(chunk))
     return ((key.uuid, key.key_id, key.epoch, key.state) for key in records)
 
 
@@ -187,13 +187,13 @@ def _why_nodes_stay(station: Station, wanted: tuple[bytes, ...] | None) -> dict[
     known: Iterable[Sequence[NodeRecord | ExportEligibility]] = (
         chunks(station.nodes.all_shown_keys())
         if wanted is None
-        else (list(station.nodes.get_many(page).values()) for page in chunks(wanted))
+        else (list(station.nodes.get_many(chunk).values()) for chunk in chunks(wanted))
     )
     stays: dict[bytes, str] = {}
-    for page in known:
-        entries = station.pins.get_many([node.uuid for node in page])
-        pins = station.pins.pinned_among(page, entries.values())
-        stays |= {node.uuid: _why_node_stays(node, pins.get(node.uuid, "")) for node in page}
+    for chunk in known:
+        entries = station.pins.get_many([node.uuid for node in chunk])
+        pins = station.pins.pinned_among(chunk, entries.values())
+        stays |= {node.uuid: _why_node_stays(node, pins.get(node.uuid, "")) for node in chunk}
     return stays
 
 
@@ -437,9 +437,9 @@ def _one_ca(station: Station, order: ExportOrder, nodes: Chosen) -> bytes:
 def _with_ca(station: Station, nodes: Chosen) -> Iterator[tuple[LeavingNode, bytes]]:
     """Return each node with the CA that it keeps."""
     own = station.ca
-    for page in chunks(nodes):
-        kept = station.keys.cas_among([node.uuid for node in page])
-        yield from ((node, kept.get(node.uuid, own)) for node in page)
+    for chunk in chunks(nodes):
+        kept = station.keys.cas_among([node.uuid for node in chunk])
+        yield from ((node, kept.get(node.uuid, own)) for node in chunk)
 
 
 def _signature(station: Station, ca: bytes, receiver: TrustRecord) -> bytes:
@@ -505,12 +505,12 @@ def _sealing(station: Station, plan: ExportPlan, now: datetime) -> EnvelopeWrite
 
 
 def _bundled(station: Station, nodes: Iterable[LeavingNode]) -> Iterator[BundledNode]:
-    """Read the nodes and unwrap their keys, a page at a time."""
-    for page in chunks(nodes):
-        uuids_of_page = [node.uuid for node in page]
-        records = station.nodes.exported_many(uuids_of_page)
-        keys = {(key.uuid, key.key_id): key for key in station.keys.get_many(uuids_of_page)}
-        for leaving in page:
+    """Read the nodes and unwrap their keys, a chunk at a time."""
+    for chunk in chunks(nodes):
+        uuids_of_chunk = [node.uuid for node in chunk]
+        records = station.nodes.exported_many(uuids_of_chunk)
+        keys = {(key.uuid, key.key_id): key for key in station.keys.get_many(uuids_of_chunk)}
+        for leaving in chunk:
             record, key = records.get(leaving.uuid), keys.get((leaving.uuid, leaving.key_id))
             if record is None or record.point is None or key is None:
                 raise PolicyError(f"Node {leaving.uuid.hex()} was changed in the meantime.", hint="Run it again.")

@@ -77,9 +77,9 @@ def content_digest(
         json.dumps([sender, sorted(to), mode, ca.hex()], separators=(",", ":")).encode()[:-1] + b",["
     )
     comma = ""
-    for page in chunks(nodes):
+    for chunk in chunks(nodes):
         # as JSON, by hand: hex digits and a number need no quoting, and there may be ten thousand
-        listed = [f'["{uuid.hex()}","{identifier}",{epoch}]' for uuid, identifier, epoch in page]
+        listed = [f'["{uuid.hex()}","{identifier}",{epoch}]' for uuid, identifier, epoch in chunk]
         digest.update(f"{comma}{','.join(listed)}".encode())
         comma = ","
     digest.update(b"]]")

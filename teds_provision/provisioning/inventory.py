@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 else:  # cryptography: a list of unverified nodes needs none
     readings, firmware = late("teds_provision.provisioning.readings"), late("teds_provision.station.firmware")
 
-PAGE = 256
+CHUNK = 256
 """Nodes that are judged together."""
 
 STATES = ("factory", "keyed", "provisioned", "moved", "revoked", "retired", "unseen")
@@ -60,7 +60,7 @@ def _exact(station: Station, text: str) -> bytes | None:
 
 
 def inventory(station: Station, uuids: Sequence[bytes]) -> Iterator[KnownNode]:
-    """Describe nodes, in their order, a page at a time; ``verdict`` is judged now, from each one's row of reading."""
+    """Describe nodes, in their order, a chunk at a time; ``verdict`` is judged now, from each one's row of reading."""
     return (node for node, _ in with_verdicts(station, uuids))
 
 
@@ -68,13 +68,13 @@ def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[Kn
     """Yield the nodes of :func:`inventory`, each with the whole verdict; None if no datasheet of the node was read."""
     known = station.overview.nodes(uuids)
     demands = firmware.FirmwareDemands(station.home)
-    while page := list(islice(known, PAGE)):
-        listed = [overview.uuid for overview in page]
+    while chunk := list(islice(known, CHUNK)):
+        listed = [overview.uuid for overview in chunk]
         judged = readings.verdicts_of(
-            station, listed, [overview.uuid for overview in page if overview.keys and overview.moved is None]
+            station, listed, [overview.uuid for overview in chunk if overview.keys and overview.moved is None]
         )
         reported = station.firmware_reports.get_many(listed)
-        for overview in page:
+        for overview in chunk:
             found, record = judged.get(overview.uuid), reported.get(overview.uuid)
             profile = (overview.node or {}).get("profile")
             runs = firmware.known_firmware(record, partial(demands.demand_of, profile)) if record is not None else None

@@ -410,11 +410,11 @@ def plan_addition(station: Station, listed: Sequence[ListedNode]) -> WhitelistPl
     write: list[WhitelistEntry] = []
     conflicts: list[tuple[ListedNode, str]] = []
     new = 0
-    for page in chunks(listed):
-        uuids = [entry.uuid for entry in page]
+    for chunk in chunks(listed):
+        uuids = [entry.uuid for entry in chunk]
         present = station.pins.get_many(uuids)
         pinned = station.pins.pinned_among(station.nodes.get_many(uuids).values(), present.values())
-        for entry in page:
+        for entry in chunk:
             known, pin = present.get(entry.uuid), pinned.get(entry.uuid)
             if pin is not None and entry.fingerprint is not None and not same_key(pin, entry.fingerprint):
                 conflicts.append((entry, pin))

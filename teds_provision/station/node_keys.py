@@ -358,7 +358,9 @@ class NodeKeys:
 
     def set_flags(self, changes: Mapping[bytes, Mapping[str, Any]]) -> None:
         """Change flags of many nodes at once, by the names of :class:`KeyFlags`; the owner's CA is none."""
-        self._set_all_flags(changes, {uuid: m for page in chunks(changes) for uuid, m in self._flags_of(page).items()})
+        self._set_all_flags(
+            changes, {uuid: m for chunk in chunks(changes) for uuid, m in self._flags_of(chunk).items()}
+        )
 
     def _set_all_flags(self, changes: Mapping[bytes, Mapping[str, Any]], present: Mapping[bytes, KeyFlags]) -> None:
         own = self._identity.ca

@@ -16,7 +16,7 @@ from teds_provision.errors import KeyMismatchError, NotFoundError, StoreError, U
 from teds_provision.lazy import late
 from teds_provision.station.plant.plant import Plant
 from teds_provision.station.row_macs import MacRow, RowMacs, changed
-from teds_provision.station.store.database import PAGE, chunks, places
+from teds_provision.station.store.database import CHUNK, chunks, places
 from teds_provision.station.store.records import UUID_OCTETS, ExportedNode, ExportEligibility, NodeRecord
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
@@ -72,9 +72,9 @@ class Nodes:
         """Give identity key and retirement of all nodes, by UUID, a chunk at a time."""
         after = b""
         statement = "SELECT uuid, point, point_mac, retired FROM nodes WHERE uuid > ? ORDER BY uuid LIMIT ?"
-        while page := self._store.read(ExportEligibility, statement, (after, PAGE)):
-            yield from page
-            after = page[-1].uuid
+        while chunk := self._store.read(ExportEligibility, statement, (after, CHUNK)):
+            yield from chunk
+            after = chunk[-1].uuid
 
     def exported_many(self, uuids: Sequence[bytes]) -> dict[bytes, ExportedNode]:
         """Return a bundle's facts about a chunk of nodes, by UUID."""

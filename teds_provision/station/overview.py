@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from teds_provision.station.datasheets import unpacked
-from teds_provision.station.store.database import PAGE, places
+from teds_provision.station.store.database import CHUNK, places
 from teds_provision.station.store.records import UUID_OCTETS
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
@@ -97,8 +97,8 @@ class Overview:
 
     def nodes(self, uuids: Sequence[bytes]) -> Iterator[NodeOverview]:
         """Give what is known of these nodes, in their order, a chunk at a time; holds no lock between chunks."""
-        for first in range(0, len(uuids), PAGE):
-            yield from self._page(uuids[first : first + PAGE])
+        for first in range(0, len(uuids), CHUNK):
+            yield from self._chunk(uuids[first : first + CHUNK])
 
     def waiting(self, today: str, sample: RowSample) -> WaitingNodes:
         """Return the nodes that wait for an operator; ``today`` is a day, ISO 8601.
@@ -126,7 +126,7 @@ class Overview:
         row = self._store.first_row(f"SELECT {_IS_KNOWN}", (uuid,))
         return row is not None and bool(row[0])
 
-    def _page(self, uuids: Sequence[bytes]) -> Iterator[NodeOverview]:
+    def _chunk(self, uuids: Sequence[bytes]) -> Iterator[NodeOverview]:
         nodes = self._rows("nodes", _NODE, uuids)
         whitelist = self._rows("whitelist", ("fingerprint", "assurance", "name", "added"), uuids)
         moved = self._rows("tombstones", ("to_fingerprint", "handover_id"), uuids)

@@ -15,7 +15,7 @@ from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.nodes import Nodes
 from teds_provision.station.plant.plant import Plant
 from teds_provision.station.row_macs import MacRow, RowMacs, Values, changed
-from teds_provision.station.store.database import PAGE, places
+from teds_provision.station.store.database import CHUNK, places
 from teds_provision.station.store.records import ExportEligibility, NodeRecord, WhitelistEntry
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
@@ -113,11 +113,11 @@ class Pins:
     def all_entries(self) -> Iterator[WhitelistEntry]:
         """Give all entries, by UUID, a chunk at a time, for lists; holds no lock between chunks."""
         after = b""
-        while page := self._store.read(
-            WhitelistEntry, "SELECT * FROM whitelist WHERE uuid > ? ORDER BY uuid LIMIT ?", (after, PAGE)
+        while chunk := self._store.read(
+            WhitelistEntry, "SELECT * FROM whitelist WHERE uuid > ? ORDER BY uuid LIMIT ?", (after, CHUNK)
         ):
-            yield from map(self._checked, page)
-            after = page[-1].uuid
+            yield from map(self._checked, chunk)
+            after = chunk[-1].uuid
 
     def _checked(self, entry: WhitelistEntry) -> WhitelistEntry:
         """Return an entry; raise StoreChangedError if its MAC does not hold. Unchecked with a closed vault."""

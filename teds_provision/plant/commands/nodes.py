@@ -13,7 +13,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.extending import add_options, callback_of
 from teds_provision.cli.rendering import local_time, print_json_list, shown
 from teds_provision.errors import NotFoundError
-from teds_provision.provisioning.inventory import PAGE
+from teds_provision.provisioning.inventory import CHUNK
 from teds_provision.station.station import Station
 
 
@@ -62,10 +62,10 @@ class PlantView:
         found: dict[str, list[dict[str, str]]] = {}
         for uuid, name, why in station.plant.claims.conflicts():
             found.setdefault(uuid.hex(), []).append({"name": name, "why": why})
-        while page := list(islice(nodes, PAGE)):
-            nameless = [bytes.fromhex(node["uuid"]) for node in page if not node["name"]]
+        while chunk := list(islice(nodes, CHUNK)):
+            nameless = [bytes.fromhex(node["uuid"]) for node in chunk if not node["name"]]
             names = plant.status.names(station, roster, nameless)
-            for node in page:
+            for node in chunk:
                 named = node["name"] or names.get(bytes.fromhex(node["uuid"]))
                 yield {**node, "name": named, "conflicts": found.get(node["uuid"], [])}
 

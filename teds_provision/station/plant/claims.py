@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from teds_provision.station.plant.pages import Chain
 from teds_provision.station.row_macs import MacRow, RowMacs
-from teds_provision.station.store.database import PAGE, places
+from teds_provision.station.store.database import CHUNK, places
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 
@@ -27,8 +27,8 @@ class Claims:
     def known_ids(self, chain: int, ids: Sequence[int]) -> set[int]:
         """Return those of these event ids that the chain contained before."""
         known: set[int] = set()
-        for start in range(0, len(ids), PAGE):
-            part = ids[start : start + PAGE]
+        for start in range(0, len(ids), CHUNK):
+            part = ids[start : start + CHUNK]
             rows = self._store.execute(
                 f"SELECT id FROM event_ids WHERE chain = ? AND id IN ({places(part)})", (chain, *part)
             )
@@ -44,8 +44,8 @@ class Claims:
     def of_station(self, chain: int, uuids: Sequence[bytes]) -> dict[bytes, str]:
         """Return what a station claims of these nodes, JSON."""
         found: dict[bytes, str] = {}
-        for start in range(0, len(uuids), PAGE):
-            part = uuids[start : start + PAGE]
+        for start in range(0, len(uuids), CHUNK):
+            part = uuids[start : start + CHUNK]
             found.update(
                 self._store.execute(
                     f"SELECT uuid, claim FROM claims WHERE chain = ? AND uuid IN ({places(part)})", (chain, *part)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from teds_provision.station.store.database import PAGE, places
+from teds_provision.station.store.database import CHUNK, places
 from teds_provision.station.store.records import utc_now
 from teds_provision.station.store.store import Store
 
@@ -153,11 +153,11 @@ class Line:
             rows = self._store.read(
                 EvidenceRow,
                 f"SELECT {_EVIDENCE} FROM evidence WHERE (uuid, attempt, sha256) > (?, ?, ?){where}"
-                f" ORDER BY uuid, attempt, sha256 LIMIT {PAGE}",
+                f" ORDER BY uuid, attempt, sha256 LIMIT {CHUNK}",
                 (*after, *values),
             )
             yield from rows
-            if len(rows) < PAGE:
+            if len(rows) < CHUNK:
                 return
             after = (rows[-1].uuid, rows[-1].attempt, rows[-1].sha256)
 

@@ -82,7 +82,7 @@ def _require_own(file: Path) -> None:
         raise StoreError(f"{file} is {what}.", hint="Another program put it there: check it and move it away.")
 
 
-PAGE = 500
+CHUNK = 500
 """Rows that are looked up, read or written at once."""
 _REMEMBERED = 100
 _Record = TypeVar("_Record")
@@ -94,11 +94,11 @@ def places(values: Sized) -> str:
     return ", ".join("?" * len(values))
 
 
-def chunks(values: Iterable[_Value], length: int = PAGE) -> Iterator[list[_Value]]:
-    """Divide many values into batches, as many as one statement looks up at once."""
+def chunks(values: Iterable[_Value], length: int = CHUNK) -> Iterator[list[_Value]]:
+    """Divide many values into chunks, as many as one statement looks up at once."""
     rest = iter(values)
-    while batch := list(islice(rest, length)):
-        yield batch
+    while chunk := list(islice(rest, length)):
+        yield chunk
 
 
 class Database(Connection):
@@ -206,12 +206,12 @@ class Database(Connection):
             return records
 
     def stream(self, make: Callable[..., _Record], statement: str, after: int = 0) -> Iterator[_Record]:
-        """Make records a page at a time, holding no lock between pages; raises StoreError.
+        """Make records a chunk at a time, holding no lock between chunks; raises StoreError.
 
         The statement has two marks, for the number to go on after and for the page's length, and its first column is
         that number, growing.
         """
-        while rows := self.execute(statement, (after, PAGE)):
+        while rows := self.execute(statement, (after, CHUNK)):
             for row in rows:
                 if not isinstance(row[0], int) or row[0] <= after:
                     raise self._damaged()

@@ -16,7 +16,7 @@ from typing import Any, Final, Protocol
 
 from teds_provision.errors import BadDataError, StoreError
 from teds_provision.station.store.connection import too_old
-from teds_provision.station.store.database import PAGE, places
+from teds_provision.station.store.database import CHUNK, places
 from teds_provision.station.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, statements
 from teds_provision.station.store.sqlite import sqlite3
 from teds_provision.station.store.store import Store
@@ -56,8 +56,8 @@ def dump(store: Store) -> Iterator[bytes]:
             yield json.dumps({"schema": version, "tables": tables}, separators=(",", ":")).encode() + b"\n"
             for number, (table, columns) in enumerate(tables.items()):
                 rows = connection.execute(f"SELECT {', '.join(columns)} FROM {table}")
-                while page := rows.fetchmany(PAGE):
-                    yield b"".join(_record(number, row) for row in page)
+                while chunk := rows.fetchmany(CHUNK):
+                    yield b"".join(_record(number, row) for row in chunk)
             yield _HEAD.pack(_END, 0)
         finally:
             with suppress(sqlite3.Error):
@@ -110,8 +110,8 @@ def _fill(connection: sqlite3.Connection, source: RowSource) -> None:
         connection.execute(f"DELETE FROM {table}")  # what a schema begins with; the dump brings it as it became
     inserts = [f"INSERT INTO {table} VALUES({places(columns)})" for table, columns in tables.items()]
     widths = [len(columns) for columns in tables.values()]
-    for number, page in _pages(source, widths):
-        connection.executemany(inserts[number], page)
+    for number, chunk in _chunks(source, widths):
+        connection.executemany(inserts[number], chunk)
     connection.execute("COMMIT")
     connection.execute(f"PRAGMA application_id={APPLICATION_ID}")
     connection.execute(f"PRAGMA user_version={version}")
@@ -140,20 +140,20 @@ def _is_table(name: str, columns: list[str]) -> bool:
     return bool(columns) and all(_NAME.fullmatch(word) for word in (name, *columns))
 
 
-def _pages(source: RowSource, widths: list[int]) -> Iterator[tuple[int, list[tuple[Any, ...]]]]:
-    """Yield the rows of a table in pages."""
-    current, page = 0, list[tuple[Any, ...]]()
+def _chunks(source: RowSource, widths: list[int]) -> Iterator[tuple[int, list[tuple[Any, ...]]]]:
+    """Yield the rows of a table in chunks."""
+    current, chunk = 0, list[tuple[Any, ...]]()
     while True:
         number, length = _HEAD.unpack(source.read(_HEAD.size))
-        if page and (number != current or len(page) >= PAGE):
-            yield current, page
-            page = []
+        if chunk and (number != current or len(chunk) >= CHUNK):
+            yield current, chunk
+            chunk = []
         if number == _END and length == 0:
             return
         if number >= len(widths) or length > MAX_RECORD_OCTETS:
             raise BadDataError("A row of the store in the backup is damaged.")
         current = number
-        page.append(_row(source.read(length), widths[number]))
+        chunk.append(_row(source.read(length), widths[number]))
 
 
 def _record(number: int, row: tuple[Any, ...]) -> bytes:
