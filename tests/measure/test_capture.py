@@ -67,6 +67,7 @@ def test_a_restless_sensor_and_one_at_the_wrap_of_its_raw_values_give_no_point(
     file = tmp_path / "joint.csv"
     for far, message in ((5, "wrap of its raw values"), (4000, "not steady")):
         about = 0 if far == 5 else 20_000
+        angle.turn("angle", about + far)  # before the capture begins, or it may begin with where the shaft was
         running = hall.station.start(
             *("--json", "calibrate", "capture", "angle", 1, "--reference", 0, "--to", file, "--can", hall.can)
         )

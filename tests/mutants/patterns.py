@@ -623,7 +623,7 @@ PATTERNS = (
         "Costs.bounded",
         "self.memory_kib * self.iterations <= _MAX_WORK_KIB",
         "True",
-        "tests/vault/test_file_vault.py",
+        "tests/vault/test_costs.py",
     ),
     Pattern("a secret is wiped before its line ends", "_answer", "page.wipe()", "None", "tests/vault/test_agent.py"),
     Pattern(

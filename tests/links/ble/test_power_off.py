@@ -84,6 +84,7 @@ async def switched_off(node: Node, folder: Path) -> None:
     assert not peripheral._device.is_advertising
 
 
+@pytest.mark.timeout(60)  # a peripheral that goes on to look cannot be cancelled
 def test_a_node_that_is_switched_off_has_lost_its_connections_and_their_sessions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
