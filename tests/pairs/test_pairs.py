@@ -1,4 +1,4 @@
-"""Cells of the pair bench at the gate: each change, each long run, each time.
+"""Cells of the pair bench at the gate: of each time, and of most changes and long runs.
 
 `make pairs` runs all cells; bench.py says what it leaves out.
 """
