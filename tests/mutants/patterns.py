@@ -203,10 +203,10 @@ PATTERNS = (
         "tests/protocol/test_announce.py",
     ),
     Pattern(
-        "a question to everyone costs no reply",
-        "CanServer._end_answer_to_everyone",
-        "state.replying is not pair",
-        "True",
+        "of the questions to everyone during a reply the newest is answered",
+        "CanServer._everyone",
+        "state.replying is not None",
+        "False",
         "tests/node/test_can_server.py",
     ),
     # verdicts

@@ -430,6 +430,39 @@ def test_a_question_to_everyone_in_a_station_s_own_name_costs_its_reply_nothing(
     assert messages == [b"\x05" + bytes(30)]
 
 
+def test_of_the_questions_to_everyone_during_a_reply_the_newest_is_answered(
+    station: RawStation, server: CanServer
+) -> None:
+    """Answers queued behind the reply would each wait for the one before, and answer what was asked long ago."""
+
+    def first_frame() -> Frame:
+        until = time.monotonic() + PATIENCE
+        while time.monotonic() < until:
+            frame = station.bus.receive(0.05)
+            if frame is None or frame.identifier != 0x18DAF121:
+                continue
+            if frame.data[0] >> 4 == 1:
+                return frame
+            pair.handle_frame(frame)
+        raise AssertionError("no reply")
+
+    for transaction in (0x05, 0x06, 0x07, 0x08, 0x09):
+        pair = Pair(0xF1, 0x21, station.bus.send)
+        pair.send(bytes((transaction,)) + b"\x00\x00\x01\x03\x00\x1e" + bytes(30))
+        assert first_frame().data[2] == transaction
+        began = time.monotonic()
+        for question in ("41", "42", "43"):
+            station.everyone(f"07{question}000080070000")
+            time.sleep(0.1)  # its answer is due after 50 ms
+        prompt = time.monotonic() - began < 0.8  # the reply has a second for its flow control
+        answered = first_frame().data[2]
+        if prompt:
+            break
+        while (frame := station.bus.receive(1.5)) is not None:  # a busy machine: once more, when all is silent
+            assert frame
+    assert answered == 0x43
+
+
 def test_forged_announces_move_it_three_times_at_once_and_then_later(
     station: RawStation, hub: Hub, node: EchoNode, server: CanServer
 ) -> None:
