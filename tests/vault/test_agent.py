@@ -150,7 +150,8 @@ def test_the_process_keeps_its_secret(home: Path) -> None:
     assert int(locked.split()[1]) >= 4
     assert PASSPHRASE.encode() not in (proc / "cmdline").read_bytes()
     with suppress(PermissionError):  # other users than root do not even see that
-        assert {os.readlink(proc / "fd" / str(number)) for number in (0, 1, 2)} == {"/dev/null"}
+        # once the command has its answer: it lets its streams go after that
+        wait_until(lambda: {os.readlink(proc / "fd" / str(number)) for number in (0, 1, 2)} == {"/dev/null"})
 
 
 def test_a_killed_one_is_none_and_is_replaced(home: Path) -> None:
