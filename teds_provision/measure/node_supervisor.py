@@ -498,7 +498,8 @@ class NodeSupervisor:
         lied, mark = False, ""
         while not self._stop.is_set():
             if self._anew.wait(LOOK if rest is not None or self._announced or self._elsewhere else CALM):
-                self._anew.clear()  # it announced itself; the end of the measurement has an event of its own
+                self._anew.clear()  # something announced itself; the end sets _stop as well
+                self._stop.wait(LOOK)  # any device can announce, as often as it likes: that hurries nothing else
             standing.require()
             if standing.mark != mark:
                 mark = standing.mark
