@@ -7,7 +7,7 @@ the conversation with the first node until the last node has its verdict, or fro
 value, to the wire time of all frames until then. Beside it: the processor time of the station and of the nodes' one
 process meanwhile.
 
-``--alone``: the store lies in memory and the station has the first core to itself; nodes, broker and this process have
+``--alone``: the store is in memory and the station has the first core to itself; nodes, broker and this process have
 the others. What is left above the wire's time is then the station's own: one interpreter, on one core.
 """
 
@@ -168,7 +168,7 @@ def main(words: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--nodes", type=int, default=200)
     parser.add_argument("--only", default="", help="500 (kbit/s) or FD")
-    parser.add_argument("--alone", action="store_true", help="store in memory, the station on a core of its own")
+    parser.add_argument("--alone", action="store_true", help="store in memory, the station alone on one core")
     options = parser.parse_args(words)
     if MOSQUITTO is None:
         raise SystemExit("mosquitto is not installed: apt-get install mosquitto")

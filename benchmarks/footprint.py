@@ -45,7 +45,7 @@ def threads(pid: int) -> int:
 
 
 def provision_all(home: Path, link: str, nodes: Nodes) -> None:
-    """Provision the nodes of one bus, each with a name and a calibration of its own."""
+    """Provision the nodes of one bus, each with its name and calibration."""
     listed, calibrations = home.parent / "list.csv", home.parent / "calibrations"
     calibrations.mkdir(exist_ok=True)
     rows = ["uuid,name,profile,calibration"]

@@ -6,8 +6,8 @@ machine now, times four (envelope, fields 100 and 102, the board's proof). The o
 and proven by as many boards, in memory and on one core: build, guard, compare, sign, durable. A line builds boards in
 memory with and without a job and evidence, in turn.
 
-No Python program comes near the bare checks: beside ours stands what the libraries alone need for one file, in turns in
-one process (file by the system's calls, both JSON texts and the base64 read, the form that the board signed written,
+No Python program comes near the bare checks: it also prints what the libraries alone need for one file, in turns in one
+process (file by the system's calls, both JSON texts and the base64 read, the form that the board signed written,
 the board's key loaded, four checks).
 """
 
@@ -23,13 +23,20 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
-from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, encode_dss_signature
-
 import teds_provision
+from benchmarks.bare_checks import (
+    PREHASHED,
+    ROW,
+    FileCost,
+    SignedDigest,
+    cost_of_a_file,
+    load_key,
+    octets_of,
+    signed_digest,
+)
 from benchmarks.machine import checks_a_second
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
@@ -40,7 +47,6 @@ from teds_provision.protocol.keys import (
     from_pem,
     node_key_message,
     prove_message,
-    public_key,
     to_pem,
 )
 from teds_provision.protocol.plant.evidence import EvidenceClaim, pae, read, ready, seal
@@ -59,8 +65,6 @@ CHECKS = 4
 FINISHED = "2026-03-01T11:31:00Z"
 AIM, OFFICE_AIM, LINE_AIM = 1.4, 50.0, 0.93
 REQUESTS, BOARDS = 200, 40
-ROW = 64
-PREHASHED = ec.ECDSA(Prehashed(hashes.SHA256()))
 
 
 def evidence(folder: Path, count: int) -> Path:
@@ -109,64 +113,43 @@ def _used() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def least(files: Path, ca: Path, rows: int = 60) -> tuple[float, float, float]:
-    """Return processor seconds a file, in turns: ours, the libraries alone, the four checks alone with keys loaded."""
+def cost(files: Path, ca: Path, count: int = 60 * ROW) -> FileCost:
+    """Return what a document costs; its four bare checks have their keys loaded."""
     anchors = EvidenceAnchors(from_pem(ca.read_bytes()))
-    names = sorted(files.iterdir())[: rows * ROW]
-    spent = [0.0, 0.0, 0.0]
-    for at in range(0, len(names), ROW):
-        row = names[at : at + ROW]
-        signed = [_signed(path) for path in row]
-        public_key.cache_clear()
-        used = time.process_time()
-        judge_files(anchors, row)
-        spent[0] += time.process_time() - used
-        used = time.process_time()
-        _libraries(row, signed)
-        spent[1] += time.process_time() - used
-        loaded = [(public_key(point), der, digest) for checks in signed for point, der, digest in checks]
-        used = time.process_time()
-        for key, der, digest in loaded:
-            key.verify(der, digest, PREHASHED)
-        spent[2] += time.process_time() - used
-    return spent[0] / len(names), spent[1] / len(names), spent[2] / len(names)
+    return cost_of_a_file(
+        sorted(files.iterdir())[:count], signed=_signed, ours=partial(judge_files, anchors), libraries=_libraries
+    )
 
 
-def _signed(path: Path) -> list[tuple[bytes, bytes, bytes]]:
-    """Return key, signature in DER and digest of the four checks of a document."""
+def _signed(path: Path) -> list[SignedDigest]:
+    """Return the four checks of a document."""
     signed = ready(read(path.read_bytes()))
     document, shown = signed.evidence, signed.shown
     assert shown is not None
     assert shown.station_key is not None
     assert shown.signature is not None
-    raw = (
-        (shown.node_key, node_key_message(document.uuid, shown.node_key), shown.node_key_signature),
-        (shown.station_key, signed.datasheet, shown.signature),
-        (document.node, signed.board, document.proof),
-    )
-    checks = [(document.station, document.signature, hashlib.sha256(pae(document.payload)).digest())]
-    for point, message, octets in raw:
-        der = encode_dss_signature(int.from_bytes(octets[:32], "big"), int.from_bytes(octets[32:], "big"))
-        checks.append((point, der, hashlib.sha256(message).digest()))
-    return checks
+    envelope = SignedDigest(document.station, document.signature, hashlib.sha256(pae(document.payload)).digest())
+    return [
+        envelope,
+        signed_digest(shown.node_key, node_key_message(document.uuid, shown.node_key), shown.node_key_signature),
+        signed_digest(shown.station_key, signed.datasheet, shown.signature),
+        signed_digest(document.node, signed.board, document.proof),
+    ]
 
 
-def _libraries(row: list[Path], signed: list[list[tuple[bytes, bytes, bytes]]]) -> None:
+def _libraries(row: list[Path], signed: list[list[SignedDigest]]) -> None:
     """Read and check a row of documents, and look at nothing else."""
     for path in row:
-        file = os.open(path, os.O_RDONLY)
-        text = os.read(file, 1 << 16)
-        os.close(file)
-        payload = binascii.a2b_base64(json.loads(text)["payload"], strict_mode=True)
+        payload = binascii.a2b_base64(json.loads(octets_of(path))["payload"], strict_mode=True)
         statement = json.loads(payload)
         bound = {"facts": statement["predicate"]["facts"], "subject": statement["subject"]}
         json.dumps(bound, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()
         hashlib.sha256(payload).digest()
-    station = public_key(signed[0][0][0])
+    station = load_key(signed[0][0].point)
     for envelope, node_key, datasheet, board in signed:
-        node = ec.EllipticCurvePublicKey.from_encoded_point(ec.SECP256R1(), board[0])
-        for key, (_, der, digest) in ((station, envelope), (node, node_key), (station, datasheet), (node, board)):
-            key.verify(der, digest, PREHASHED)
+        node = load_key(board.point)
+        for key, check in ((station, envelope), (node, node_key), (station, datasheet), (node, board)):
+            key.verify(check.der, check.digest, PREHASHED)
 
 
 def office(folder: Path, count: int) -> tuple[float, float]:
@@ -230,12 +213,7 @@ def main(count: int) -> None:
         print(f"{last}  {wall:.2f} s, {cpu:.2f} s of the processor; load {os.getloadavg()[0]:.1f}")
         print(f"  {CHECKS} bare checks a file on {cores} cores {floor:.2f} s: {wall / floor:.2f} ×, aim {AIM} ×")
         print(f"  by processor time {cpu / alone_floor:.2f} ×")
-        ours, libraries, checks = least(files, Path(name, "ca.pem"))
-        print(
-            f"  a file in one process, in turns: ours {1e6 * ours:.0f} µs, libraries alone {1e6 * libraries:.0f},",
-            end="",
-        )
-        print(f" checks alone {1e6 * checks:.0f}: {ours / checks:.2f} × and {libraries / checks:.2f} × the checks")
+        print(f"  a file in one process, in turns: {cost(files, Path(name, 'ca.pem')).text}")
         a_second, by_processor = office(Path(name), REQUESTS)
         print(f"office: {a_second:.0f} signatures/s, {by_processor:.0f} by processor time; aim {OFFICE_AIM:.0f}")
         without, with_line = boards(Path(name), BOARDS)

@@ -29,7 +29,7 @@ def checks_a_second(cores: int) -> float:
         output = speed.communicate()[0]
         found = re.search(r"nistp256\).*\s(\d+\.\d)\s*$", output, re.MULTILINE)
         if found is None:
-            raise SystemExit(f"openssl said something else:\n{output}")
+            raise SystemExit(f"openssl printed something else:\n{output}")
         total += float(found[1])
     return total
 

@@ -147,7 +147,7 @@ def main(words: list[str] | None = None) -> None:
         token = json.loads(finished(started(home, "ncap", "token", "add", "load")))["token"]
         stop = threading.Event()
         quiet = asked(here, 3.0, lambda: None)
-        rows.add("GET /nodes, nobody listens: p50", statistics.median(quiet) * 1e3, "ms")
+        rows.add("GET /nodes, no event stream open: p50", statistics.median(quiet) * 1e3, "ms")
         deaf = [stack.enter_context(deaf_client(url, token)) for _ in range(options.deaf)]
         heard = listen(url, token, stack, options.clients - len(deaf), stop)
         script = stack.enter_context(client.connect(url, token=token))

@@ -185,7 +185,7 @@ class Wire:
 
 
 class Topics:
-    """Times at which the first value of each node came on a topic since :meth:`anew`."""
+    """Times at which the first value of each node came on a topic since :meth:`reset`."""
 
     def __init__(self, port: int) -> None:
         import paho.mqtt.client as paho
@@ -213,7 +213,7 @@ class Topics:
         if not message.retain and len(parts) == 2:
             self.first.setdefault(parts[1], time.monotonic())
 
-    def anew(self) -> None:
+    def reset(self) -> None:
         """Count from now on."""
         self.first = {}
 
@@ -284,7 +284,7 @@ class Scene:
 
     def joins(self, names: Sequence[str]) -> tuple[float, float, float]:
         """Switch them on; when the first of them announced itself, when the last had a value, and since when it was."""
-        self.topics.anew()
+        self.topics.reset()
         began = time.monotonic()
         self.power("on", *names)
         until(lambda: self.topics.first.keys() >= set(names), why=f"{len(names)} nodes: {len(self.topics.first)} came")

@@ -107,7 +107,7 @@ def one_after_the_other_in_c(options: argparse.Namespace, place: Path) -> None:
 
 
 def ended(process: subprocess.Popen[str]) -> dict[str, float]:
-    """End a node in C and return the report of its own part."""
+    """End a node in C and return its report of the part that it took."""
     process.terminate()
     output: dict[str, float] = json.loads(process.communicate(timeout=20)[0])
     return output

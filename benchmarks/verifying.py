@@ -5,7 +5,7 @@ start to its last line, compiled as an installer leaves it, its files in the pag
 ecdsap256`` on all cores at once measures on this machine now, times three. Two cores that work at once are each slower
 than one alone: what one alone does is printed beside. So is processor time of both, which a busy machine spoils less.
 
-Beside them stands what the libraries alone need for one file, in turns with ours in one process: the file by the
+It also prints what the libraries alone need for one file, in turns with ours in one process: the file by the
 system's calls, its JSON, the node's key loaded, the two checks that ours makes (a certificate vouches for all files).
 """
 
@@ -20,18 +20,25 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
-from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, encode_dss_signature
-
 import teds_provision
+from benchmarks.bare_checks import (
+    PREHASHED,
+    ROW,
+    FileCost,
+    SignedDigest,
+    cost_of_a_file,
+    load_key,
+    octets_of,
+    signed_digest,
+)
 from benchmarks.machine import checks_a_second
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
 from teds_provision.protocol.datasheet import SignedNodeKey, digests, sign_datasheet, unsigned_datasheet
-from teds_provision.protocol.keys import SoftwareKey, fingerprint, node_key_message, public_key
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, node_key_message
 from teds_provision.provisioning.verify import snapshot_trust, verify_images
 from teds_provision.station.station import Station, initialise
 from teds_provision.teds.codec import security
@@ -42,8 +49,6 @@ from teds_provision.vault import passphrase
 AIM = 1.4
 CHECKS = 3
 PROFILE = "magnetic-angular-position-sensor"
-ROW = 64
-PREHASHED = ec.ECDSA(Prehashed(hashes.SHA256()))
 
 
 def fill(folder: Path, home: Path, count: int) -> None:
@@ -79,60 +84,46 @@ def _used() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def least(folder: Path, home: Path, rows: int = 60) -> tuple[float, float, float]:
-    """Return processor seconds a file, in turns: ours without its line, the libraries alone, three bare checks."""
-    names = sorted(str(path) for path in folder.iterdir())[: rows * ROW]
-    spent = [0.0, 0.0, 0.0]
+def cost(folder: Path, home: Path, files: int = 60 * ROW) -> FileCost:
+    """Return what a file costs, ours without its line; its bare checks are three, though ours makes two."""
     with Station.open(home, ask=lambda p, c: "correct horse battery") as station:
         trust = snapshot_trust(station)
-        for at in range(0, len(names), ROW):
-            row = names[at : at + ROW]
-            signed = [_signed(Path(name)) for name in row]
-            public_key.cache_clear()
-            security.decode.cache_clear()
-            used = time.process_time()
-            images = [Image.from_json(read_limited(Path(name), LIMITS.teds_file, "image")) for name in row]
+
+        def judge(row: list[Path]) -> None:
+            images = [Image.from_json(read_limited(path, LIMITS.teds_file, "image")) for path in row]
             assert len(verify_images(trust, images)) == len(row)
-            spent[0] += time.process_time() - used
-            used = time.process_time()
-            _libraries(row, signed)
-            spent[1] += time.process_time() - used
-            loaded = [(public_key(point), der, digest) for checks in signed for point, der, digest in checks]
-            used = time.process_time()
-            for key, der, digest in loaded:
-                key.verify(der, digest, PREHASHED)
-            spent[2] += (time.process_time() - used) * CHECKS / 2
-    return spent[0] / len(names), spent[1] / len(names), spent[2] / len(names)
+
+        made = cost_of_a_file(
+            sorted(folder.iterdir())[:files],
+            signed=_signed,
+            ours=judge,
+            libraries=_libraries,
+            forget=security.decode.cache_clear,
+        )
+    return replace(made, checks=made.checks * CHECKS / 2)
 
 
-def _signed(path: Path) -> list[tuple[bytes, bytes, bytes]]:
-    """Return key, signature in DER and digest of fields 102 and 100."""
+def _signed(path: Path) -> list[SignedDigest]:
+    """Return the checks of fields 102 and 100."""
     image = Image.from_json(path.read_bytes())
     shown = security.decode(image.blocks[SECURITY])
     assert shown.station_key is not None
     assert shown.signature is not None
-    found = []
-    for point, message, octets in (
-        (shown.node_key, node_key_message(image.uuid, shown.node_key), shown.node_key_signature),
-        (shown.station_key, security.tbs(image.uuid, image.blocks[SECURITY]), shown.signature),
-    ):
-        der = encode_dss_signature(int.from_bytes(octets[:32], "big"), int.from_bytes(octets[32:], "big"))
-        found.append((point, der, hashlib.sha256(message).digest()))
-    return found
+    return [
+        signed_digest(shown.node_key, node_key_message(image.uuid, shown.node_key), shown.node_key_signature),
+        signed_digest(shown.station_key, security.tbs(image.uuid, image.blocks[SECURITY]), shown.signature),
+    ]
 
 
-def _libraries(row: list[str], signed: list[list[tuple[bytes, bytes, bytes]]]) -> None:
+def _libraries(row: list[Path], signed: list[list[SignedDigest]]) -> None:
     """Read and check a row of images, and look at nothing else."""
-    for name in row:
-        file = os.open(name, os.O_RDONLY)
-        text = os.read(file, 1 << 16)
-        os.close(file)
-        for block in json.loads(text)["blocks"]:
+    for path in row:
+        for block in json.loads(octets_of(path))["blocks"]:
             hashlib.sha256(bytes.fromhex(block["teds"])).digest()
-    station = public_key(signed[0][1][0])
-    for (point, der, digest), (_, other, message) in signed:
-        ec.EllipticCurvePublicKey.from_encoded_point(ec.SECP256R1(), point).verify(der, digest, PREHASHED)
-        station.verify(other, message, PREHASHED)
+    station = load_key(signed[0][1].point)
+    for node, datasheet in signed:
+        load_key(node.point).verify(node.der, node.digest, PREHASHED)
+        station.verify(datasheet.der, datasheet.digest, PREHASHED)
 
 
 def main(count: int) -> None:
@@ -143,7 +134,7 @@ def main(count: int) -> None:
         folder, home = Path(name, "images"), Path(name, "home")
         fill(folder, home, count)
         runs = [ours(folder, home) for _ in range(3)]
-        own, libraries, checks = least(folder, home)
+        a_file = cost(folder, home)
     wall, cpu, last = min(runs)
     alone, together = checks_a_second(1), checks_a_second(cores)
     floor = CHECKS * count / together
@@ -153,8 +144,7 @@ def main(count: int) -> None:
         f" {CHECKS} × {count:,} in {floor:.2f} s"
     )
     ratio = wall / floor
-    print(f"a file in one process, in turns: ours {1e6 * own:.0f} µs, the libraries {1e6 * libraries:.0f} µs, ", end="")
-    print(f"three checks {1e6 * checks:.0f} µs: {own / checks:.2f} × and {libraries / checks:.2f} × the checks")
+    print(f"a file in one process, in turns: {a_file.text}")
     print(f"verify DIR against that: {ratio:.2f} × (processor {cpu / cores / floor:.2f} ×); aim {AIM}: {_met(ratio)}")
 
 

@@ -53,7 +53,7 @@ _ABOVE = ("rate", "channels", "kind", "trigger", "test_pattern", "unsigned", "ac
 """Settings whose options stand above others in the help; one that is added is the last."""
 
 CONTINUED_WITH = {"test_pattern": "test pattern", "unsigned": "including unsigned nodes", "require": "with --require"}
-"""What is said of a measurement that goes on, beside its rate and sinks, for each setting that it has."""
+"""Words for each setting of a measurement that goes on, printed beside its rate and sinks."""
 
 
 @command(

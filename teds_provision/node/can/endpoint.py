@@ -1,7 +1,7 @@
 """One node on a CAN bus: a StationState for each base station, its answer to everyone, its Announces.
 
 Nothing here is thread-safe: the server of the bus calls it under its lock; only :meth:`StationState.answer` and
-:meth:`StationState.begin_anew` run in the jobs of its station.
+:meth:`StationState.restart` run in the jobs of its station.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class StationState:
             self.waiting += 1
             self.jobs.put(job)
 
-    def begin_anew(self) -> None:
+    def restart(self) -> None:
         """Start over: the pair of addresses is another one, or the bus was lost; session and stored reply are gone."""
         self._repetition.forget()
         self.endpoint.handler.lost(self.name)
@@ -131,7 +131,7 @@ class CanEndpoint:
         pair = state.pairs.get(own)
         if pair is None:
             if state.pairs:
-                state.jobs.put(state.begin_anew)
+                state.jobs.put(state.restart)
             state.pairs = {at: old for at, old in state.pairs.items() if old.sending}
             pair = state.pairs[own] = Pair(own, station, lambda frame: self._send(self, frame))
         return state, pair
@@ -149,7 +149,7 @@ class CanEndpoint:
         for state in self.stations.values():
             if state.pairs:
                 state.pairs.clear()
-                state.jobs.put(state.begin_anew)
+                state.jobs.put(state.restart)
 
     def restart(self) -> None:
         """Begin again as after a start of the board: at the durable address, without sessions."""
@@ -163,4 +163,4 @@ class CanEndpoint:
         stations, self.stations = self.stations, {}
         for state in stations.values():
             state.gone = True
-            state.jobs.put(state.begin_anew)
+            state.jobs.put(state.restart)

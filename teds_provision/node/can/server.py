@@ -234,7 +234,7 @@ class CanServer:
             self._workers = None
         for endpoint in self._endpoints:
             for state in endpoint.stations.values():
-                state.begin_anew()
+                state.restart()
         self._endpoints = []
         self._addresses = self._new_table()
         if self._bus is not None:
