@@ -19,8 +19,8 @@ from tests.parsed import parsed
 PACKAGE = Path(__file__).parent.parent / "teds_provision"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
-# Room: the rooms that it may import. All may import those of _FOR_ALL and itself; all but protocol also files and
-# portable.
+# Room: the rooms that it may import. All may import those of _FOR_ALL and itself; all but protocol also files,
+# portable and one_core.
 _FOR_ALL = {"errors", "sanitize", "lazy", "arrays", "limits", "json_decoder", "optional_rooms"}
 WITHOUT_FILES = {
     "errors",
@@ -29,6 +29,7 @@ WITHOUT_FILES = {
     "arrays",
     "limits",
     "portable",
+    "one_core",
     "protocol",
     "json_decoder",
     "optional_rooms",
@@ -40,6 +41,7 @@ ARROWS = {
     "errors": set(),
     "files": set(),
     "portable": set(),
+    "one_core": set(),
     "sanitize": set(),
     "lazy": set(),
     "arrays": set(),
@@ -100,7 +102,7 @@ def imports(tree: ast.AST) -> Iterator[tuple[str, int]]:
 
 
 def may_import(room: str) -> set[str]:
-    files = set() if room in WITHOUT_FILES else {"files", "portable"}
+    files = set() if room in WITHOUT_FILES else {"files", "portable", "one_core"}
     return ARROWS[room] | files | {room, *_FOR_ALL, "__version__"}
 
 

@@ -23,6 +23,7 @@ from teds_provision.ncap.waits import USUAL, Waits
 from teds_provision.ncap.web.app import build
 from teds_provision.ncap.web.guard import Guard, front
 from teds_provision.ncap.web.server import Servers, listen
+from teds_provision.one_core import one_core
 from teds_provision.station.station import Station
 from teds_provision.vault.master_socket import MasterSocket
 
@@ -77,7 +78,7 @@ def run(station: Station, settings: Settings, on_event: OnEvent, waits: Waits = 
     """
     require_safe(settings)
     station.released = lambda _uuid, _command: nullcontext()  # in this process the turns of each node see to that
-    with DaemonLock(station.home) as presence:
+    with DaemonLock(station.home) as presence, one_core():
         local = presence.listen()
         tcp = listen(*settings.http) if settings.http is not None else None
         foxglove = FoxgloveServer(settings.foxglove, settings.exposure) if settings.foxglove is not None else None

@@ -7,7 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
@@ -24,6 +24,7 @@ from teds_provision.errors import (
     VaultLockedError,
 )
 from teds_provision.links import Contact, LinkSettings, Port, open_port
+from teds_provision.one_core import one_core
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning.adoption import read_factory_datasheet
 from teds_provision.provisioning.agree import require_session
@@ -320,15 +321,12 @@ class BatchRun:
                 self.stop.set()
 
     def _all_at_once(self, operator: Operator) -> Iterator[BoardResult]:
-        port = open_port(self._links)
-        try:
+        with one_core(), closing(open_port(self._links)) as port:
             everyone, contacts = self._on_the_bus(port)
             yield from self._side_by_side(port, contacts, operator)
             if not self.stop.is_asked:
                 self._all_done = True
                 refuse_duplicate_uuids(everyone)  # the others are done, and what is not done is not passed over
-        finally:
-            port.close()
 
     def _on_the_bus(self, port: Port) -> tuple[list[Contact], list[Contact]]:
         """Return the nodes that answer, and those of them that are to be provisioned."""

@@ -1004,6 +1004,15 @@ PATTERNS = (
         "held is None or held.let_go",
         "tests/ncap/test_actuator_leases.py",
     ),
+    Pattern("a core that others take is left", "OneCore.look", "others[self.core] > TAKEN", "False"),
+    Pattern("one's own work is no reason to leave a core", "OneCore.look", "(own - self._own) / seconds", "0.0"),
+    Pattern(
+        "a started process gets all cores",
+        "OneCore.on_every_core",
+        "self._kernel.place(0, self._cores)",
+        "None",
+        "tests/test_one_core.py",
+    ),
 )
 
 _C_TESTS = "tests/firmware/test_c_tests.py"

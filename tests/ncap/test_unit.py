@@ -87,6 +87,12 @@ def test_what_is_denied_gives_an_error_and_kills_no_process() -> None:
     assert {"mount", "ptrace", "reboot", "kexec_load", "init_module", "setuid"}.isdisjoint(calls)
 
 
+def test_the_service_may_keep_its_threads_on_one_core_and_see_whose_work_the_others_do() -> None:
+    assert "sched_setaffinity" in allowed()
+    assert {"sched_setscheduler", "setpriority"}.isdisjoint(allowed())
+    assert settings("ProcSubset") == [], "pid hides /proc/stat"
+
+
 @pytest.mark.system
 def test_the_filter_denies_what_it_should(filter_file: Path) -> None:
     """The bench itself: without it the next test would show nothing."""

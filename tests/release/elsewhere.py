@@ -24,9 +24,9 @@ import tempfile
 MODULES = ("fcntl", "resource", "pwd", "grp", "termios", "tty", "pty", "syslog")
 OF_OS = """
 O_NOFOLLOW O_CLOEXEC O_DIRECTORY O_NONBLOCK O_PATH O_TMPFILE O_SYNC O_DSYNC geteuid getuid getegid getgid getgroups
-pread pwrite preadv pwritev fork forkpty fchmod fchown chown lchown mkfifo mknod sched_getaffinity sched_setscheduler
-setsid getsid killpg getpgid setpgid posix_fallocate posix_fadvise sendfile statvfs fstatvfs sync fdatasync getloadavg
-memfd_create eventfd pipe2 splice copy_file_range getrandom nice set_blocking get_blocking
+pread pwrite preadv pwritev fork forkpty fchmod fchown chown lchown mkfifo mknod sched_getaffinity sched_setaffinity
+sched_setscheduler setsid getsid killpg getpgid setpgid posix_fallocate posix_fadvise sendfile statvfs fstatvfs sync
+fdatasync getloadavg memfd_create eventfd pipe2 splice copy_file_range getrandom nice set_blocking get_blocking
 """
 OF_SIGNAL = "SIGHUP SIGKILL SIGUSR1 SIGUSR2 SIGALRM SIGPIPE setitimer pthread_sigmask sigwait"
 FOLDERS = ("/proc", "/sys", "/dev", "/run")

@@ -35,6 +35,7 @@ from teds_provision.ncap.settings import own_source
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.node_template import create
 from teds_provision.node.sources.base import seconds_of
+from teds_provision.one_core import every_core
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.provisioning.build import check_name
@@ -319,7 +320,7 @@ class Virtuals:
             words = [sys.executable, "-m", "teds_provision", "--json", "node", "run", str(virtual.folder)]
             words += ["--can", self.bus]
             daemon = os.getpid()
-            with log.open("wb") as errors, opened_folder(virtual.folder) as folder:
+            with every_core(), log.open("wb") as errors, opened_folder(virtual.folder) as folder:
                 fed = virtual.source == SIMULATION
                 words += ["--source", f"{SIMULATION}:{short_path(folder)}" if fed else virtual.source]
                 process = virtual.process = subprocess.Popen(

@@ -25,6 +25,7 @@ from teds_provision.measure.sinks.base import CommandTaker, Item
 from teds_provision.measure.sinks.joints import INTERFACES
 from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, DiagnosticEntry, TopicSink
 from teds_provision.measure.sinks.vectors import FieldValue, Meaning
+from teds_provision.one_core import every_core
 
 # The Python that a ROS came with: another one than ours, with other versions of everything.
 
@@ -35,7 +36,8 @@ def imports(python: str, packages: str, environment: dict[str, str]) -> bool:
     """Return True if this Python can import these packages (``a, b.c``) in this environment."""
     try:
         probe = [python, "-s", "-c", f"import {packages}"]
-        done = subprocess.run(probe, env=environment, capture_output=True, timeout=PROBING, check=False)
+        with every_core():
+            done = subprocess.run(probe, env=environment, capture_output=True, timeout=PROBING, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return False
     return done.returncode == 0
@@ -89,14 +91,15 @@ class ChildSink(TopicSink):
         self._announced = False
         self._complaint = ""
         self._ready.clear()
-        self._child = subprocess.Popen(
-            [*self._program(), self._node + self._suffix],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,  # warnings; the last line is reported if the child dies
-            env=self._environment(),
-            start_new_session=True,  # a Ctrl-C at the terminal is for the parent, which ends its child in order
-        )
+        with every_core():
+            self._child = subprocess.Popen(
+                [*self._program(), self._node + self._suffix],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,  # warnings; the last line is reported if the child dies
+                env=self._environment(),
+                start_new_session=True,  # a Ctrl-C at the terminal is for the parent, which ends its child in order
+            )
         assert self._child.stdin is not None
         os.set_blocking(self._child.stdin.fileno(), False)
         for hear in (self._hear, self._hear_complaints):

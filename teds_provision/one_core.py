@@ -1,0 +1,250 @@
+"""All threads of a process on one processor core, and off it again when other work takes that core.
+
+One thread of an interpreter runs at a time. On several cores its threads hand the interpreter's lock from core to core,
+and each handing over wakes a core that sleeps: a station with 200 nodes then takes two to three times the processor
+time for the same work (docs/internals/speed.md).
+
+The core is one of those that the process may use (``taskset``, ``CPUAffinity=``, a cpuset), of the fastest kind. Every
+two or three seconds the others' work on each core is looked at; a core that is taken is left for a less busy one. If
+somebody else gives the process other cores meanwhile, it stays as it was put. Processes are started in ``with
+every_core():``, so that they get all cores back. Linux alone; where the kernel's figures cannot be read, nothing is
+changed.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Iterator, Mapping, Set
+from contextlib import contextmanager, nullcontext, suppress
+from pathlib import Path
+from typing import Final, Protocol
+
+_log = logging.getLogger(__name__)
+
+LOOK_SECONDS: Final = 2.0
+TAKEN: Final = 0.3
+"""The share of a core that others may take before a better one is looked for."""
+WORTH_MOVING: Final = 0.25
+"""By so much of a core another one has to be less busy."""
+
+
+class Kernel(Protocol):
+    """What the kernel knows of cores and threads; its methods raise OSError, or ValueError for unknown figures."""
+
+    def allowed(self) -> Set[int]:
+        """Return the cores that the calling thread may run on."""
+
+    def fastest(self, cores: Set[int]) -> Set[int]:
+        """Return those of the cores that are of the fastest kind."""
+
+    def current(self) -> int:
+        """Return the core on which the calling thread runs."""
+
+    def place(self, thread: int, cores: Set[int]) -> None:
+        """Let a thread (0: the calling one) run on these cores alone."""
+
+    def threads(self) -> Set[int]:
+        """Return the numbers of this process's threads."""
+
+    def busy(self) -> Mapping[int, float]:
+        """Return for how many seconds each core has worked since the machine started."""
+
+    def own(self) -> float:
+        """Return the processor time of this process so far."""
+
+    def now(self) -> float:
+        """Return a clock that never goes back, in seconds."""
+
+
+class LinuxKernel:
+    """:class:`Kernel` of this machine."""
+
+    def allowed(self) -> Set[int]:
+        """Return the cores that the calling thread may run on."""
+        return os.sched_getaffinity(0)
+
+    def fastest(self, cores: Set[int]) -> Set[int]:
+        """Return those of the cores that are of the fastest kind."""
+        speeds = {core: _capacity(core) for core in cores}
+        return {core for core in cores if speeds[core] == max(speeds.values())}
+
+    def current(self) -> int:
+        """Return the core on which the calling thread runs (proc(5), /proc/pid/stat, field 39)."""
+        return int(Path("/proc/thread-self/stat").read_text().rpartition(")")[2].split()[36])
+
+    def place(self, thread: int, cores: Set[int]) -> None:
+        """Let a thread (0: the calling one) run on these cores alone."""
+        os.sched_setaffinity(thread, cores)
+
+    def threads(self) -> Set[int]:
+        """Return the numbers of this process's threads."""
+        return {int(name) for name in os.listdir("/proc/self/task")}
+
+    def busy(self) -> Mapping[int, float]:
+        """Return for how many seconds each core has worked since the machine started (proc(5), /proc/stat)."""
+        ticks = os.sysconf("SC_CLK_TCK")
+        found: dict[int, float] = {}
+        with open("/proc/stat", encoding="ascii") as lines:
+            for line in lines:
+                name, *fields = line.split()
+                if not name.startswith("cpu"):
+                    break
+                if name != "cpu":
+                    user, nice, system, _idle, _waits, *interrupts = map(int, fields[:8])
+                    found[int(name[3:])] = (user + nice + system + sum(interrupts)) / ticks
+        return found
+
+    def own(self) -> float:
+        """Return the processor time of this process so far."""
+        return time.process_time()
+
+    def now(self) -> float:
+        """Return a clock that never goes back, in seconds."""
+        return time.monotonic()
+
+
+def _capacity(core: int) -> int:
+    """Return the speed of a core among those of its machine, 0 if all are alike."""
+    try:
+        return int(Path(f"/sys/devices/system/cpu/cpu{core}/cpu_capacity").read_text())
+    except (OSError, ValueError):
+        return 0
+
+
+class OneCore:
+    """Keeps the threads of this process on one core; raises OSError or ValueError where that cannot be done."""
+
+    def __init__(self, kernel: Kernel) -> None:
+        self._kernel = kernel
+        self._cores = frozenset(kernel.allowed())
+        self._fit = kernel.fastest(self._cores)
+        self._guard = threading.Lock()
+        self._elsewhere: set[int] = set()
+        self._left = False
+        self._end = threading.Event()
+        self._busy, self._own, self._since = kernel.busy(), kernel.own(), kernel.now()
+        if not self._busy.keys() >= self._cores:
+            raise ValueError("the kernel's figures are of other cores")
+        current = kernel.current()
+        self.core = current if current in self._fit else min(self._fit)
+        self._place_all({self.core})
+
+    @property
+    def left(self) -> bool:
+        """True once the threads may run on several cores again."""
+        return self._left
+
+    def look(self) -> None:
+        """Move to a less busy core if others take this one; stay as placed if somebody else placed the threads."""
+        kernel = self._kernel
+        with self._guard:
+            if self._left:
+                return
+            if kernel.allowed() != {self.core}:
+                self._left = True
+                _log.info("The cores of this process were changed from outside; its threads stay on them.")
+                return
+            busy, own, now = kernel.busy(), kernel.own(), kernel.now()
+            seconds = max(now - self._since, 1e-3)
+            others = {core: (busy[core] - self._busy[core]) / seconds for core in self._fit if core in busy}
+            others[self.core] = others.get(self.core, 0.0) - (own - self._own) / seconds
+            self._busy, self._own, self._since = busy, own, now
+            best = min(others, key=lambda core: (others[core], core))
+            if others[self.core] > TAKEN and others[self.core] - others[best] > WORTH_MOVING:
+                _log.info("Others take %.0f %% of core %d: on to core %d.", 100 * others[self.core], self.core, best)
+                self.core = best
+                self._place_all({best})
+
+    def leave(self) -> None:
+        """Give every thread all cores back that the process had, unless somebody else has placed it."""
+        self._end.set()
+        with self._guard:
+            if not self._left:
+                self._left = True
+                with suppress(OSError):
+                    self._place_all(self._cores)
+
+    def watch(self) -> None:
+        """Look every two or three seconds, in a thread, until :meth:`leave`."""
+        threading.Thread(target=self._run, name="core", daemon=True).start()
+
+    @contextmanager
+    def on_every_core(self) -> Iterator[None]:
+        """Let the calling thread run on every core for the length of the block: what it starts inherits them."""
+        thread = threading.get_native_id()
+        with self._guard:
+            if self._left or thread in self._elsewhere:
+                thread = 0
+            else:
+                self._elsewhere.add(thread)
+                self._kernel.place(0, self._cores)
+        try:
+            yield
+        finally:
+            if thread:
+                with self._guard:
+                    self._elsewhere.discard(thread)
+                    if not self._left:
+                        self._kernel.place(0, {self.core})
+
+    def _run(self) -> None:
+        apart = 1 + os.getpid() % 8 / 16  # two stations on one core do not leave it at the same moment
+        while not self._end.wait(LOOK_SECONDS * apart):
+            try:
+                self.look()
+            except (OSError, ValueError):  # a core was taken out
+                self.leave()
+            if self._left:
+                return
+
+    def _place_all(self, cores: Set[int]) -> None:
+        """Place every thread; those that are started meanwhile by one that was not placed yet, too."""
+        placed = set(self._elsewhere)
+        while late := self._kernel.threads() - placed:
+            for thread in late:
+                with suppress(ProcessLookupError):
+                    self._kernel.place(thread, cores)
+            placed |= late
+
+
+_IN_FORCE: Final[list[OneCore]] = []
+"""The one of this process, if there is one: what cores its threads have is a fact of the process as a whole."""
+
+
+@contextmanager
+def one_core() -> Iterator[OneCore | None]:
+    """Keep all threads of this process on one core for the length of the block, where that can be done.
+
+    Yields None where nothing is changed: one core alone, another system than Linux, a kernel that denies it or shows no
+    figures, a block inside of another one.
+    """
+    kept = None if _IN_FORCE else _keep(LinuxKernel())
+    if kept is None:
+        yield None
+        return
+    _IN_FORCE.append(kept)
+    kept.watch()
+    try:
+        yield kept
+    finally:
+        _IN_FORCE.remove(kept)
+        kept.leave()
+
+
+def _keep(kernel: Kernel) -> OneCore | None:
+    """Return the one core, None where nothing is changed."""
+    if not hasattr(os, "sched_setaffinity"):
+        return None
+    with suppress(OSError, ValueError):
+        return OneCore(kernel) if len(kernel.allowed()) > 1 else None
+    return None
+
+
+@contextmanager
+def every_core() -> Iterator[None]:
+    """Let the calling thread run on every core for the length of the block, in which it starts a process."""
+    with _IN_FORCE[0].on_every_core() if _IN_FORCE else nullcontext():
+        yield
