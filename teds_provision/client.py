@@ -49,7 +49,8 @@ if TYPE_CHECKING:
 API: Final = "/api/v1"
 SOCKET: Final = "ncap.sock"
 LETTING_GO: Final = 5.0
-"""Seconds for the base station to let a node go."""
+"""Longest silence of a base station that lets a node go; one that needs longer writes :data:`STILL_WAITING`."""
+STILL_WAITING: Final = b"waiting\n"
 
 
 class ApiError(TedsProvisionError):
@@ -437,7 +438,8 @@ class Client:
         """Have the base station release a node that it measures for the block; then it is measured again.
 
         False if no base station runs, or it does not measure the node (``uuid``: 20 hex digits). Raises PolicyError if
-        it does not answer within :data:`LETTING_GO` seconds, or cannot release the node.
+        it is silent for :data:`LETTING_GO` seconds, or cannot release the node. It is not silent while another command
+        is before this one.
         """
         connection = _UnixConnection(self._home / SOCKET, LETTING_GO)
         try:
@@ -445,6 +447,8 @@ class Client:
                 connection.request("GET", f"{API}/nodes/{uuid}/let-go?for={quote(command, safe='')}")
                 answer = connection.getresponse()
                 line = answer.readline() if answer.status == 200 else b""
+                while line == STILL_WAITING:
+                    line = answer.readline()
             except LinkError:  # no listener
                 yield False
                 return

@@ -68,7 +68,7 @@ NCAP: Final = "ncap"
 _RUN: Final = "run"
 _OF_THIS_PROCESS: Final = frozenset({_RUN, _ADOPTED, UnsignedNodes.text})
 """IDs of measurements that options of ``ncap run`` began: they end with it."""
-LETTING_GO: Final = 4.0  # seconds for a node's session to end in order; the caller waits 5
+LETTING_GO: Final = 4.0  # seconds for a node's session to end in order
 ANSWERING: Final = 1.0  # seconds for a node that has another address now
 LONGEST_END: Final = 20.0  # the same, for who waits as long as it takes
 _BEGINNING: Final = 0.2  # seconds between two looks whether a measurement that takes its nodes has begun
@@ -397,7 +397,7 @@ class MeasurementSupervisor:
         """Release a node until :meth:`return_node`, so that a writer can use it; False if it is not measured.
 
         It may be lent to several at once, who take turns at the node. Raises NodeBusyError if its session did not end
-        in order within ``seconds``; then it is measured on.
+        in order within ``seconds``; then it is measured on. Other borrowers that are served first take as long each.
         """
         with self._one_at_a_time(loan.uuid):
             with self._lock:

@@ -56,20 +56,20 @@ class Pkcs11Vault:
 
         The URI's ``object`` and ``id`` name the station key; a key of that name which is in the token already is taken,
         if it cannot leave it. ``with_ca`` False makes no CA key. ``restored`` is what :meth:`secret_material` gave to a
-        backup; it opens with the same token alone. ``ask`` is called once, for the PIN, unless the token has a pad.
+        backup; it opens with the same token alone, and a CA key that was destroyed since stays out. ``ask`` is called
+        once, for the PIN, unless the token has a pad.
         Raises UsageError (URI), WrongPassphraseError, VaultError.
         """
         if (home / FILE_NAME).exists():
             vault = cls.open(home, store_id, uri, ask)
             if restored is not None:
-                vault._join(_content_of(_parsed(restored.encode(), store_id, "The backup"), vault._session))
+                vault._join(_backed_up(restored, store_id, vault._session))
             return vault
         where = Pkcs11Uri.parse(uri)
         session = _open_session(where, ask, write=True)
         with exclusive(where.module_path):
             if restored is not None:
-                _content_of(_parsed(restored.encode(), store_id, "The backup"), session)
-                write_new(home / FILE_NAME, restored.encode(), failure=VaultError)
+                _save(home, store_id, _backed_up(restored, store_id, session), replace=False)
             elif not (home / FILE_NAME).exists():  # else another process was quicker
                 station = _find_or_make(session, store_id, where, "station")
                 ca = _find_or_make(session, store_id, where, "CA") if with_ca else None
@@ -286,9 +286,15 @@ def _load(home: Path, store_id: str, session: TokenSession) -> tuple[_Content, d
     return _content_of(members, session), members
 
 
-def _content_of(members: dict[str, Any], session: TokenSession) -> _Content:
+def _backed_up(restored: str, store_id: str, session: TokenSession) -> _Content:
+    """Open what a backup holds; a CA key that the token lacks was destroyed since (:meth:`Pkcs11Vault.drop_ca`)."""
+    return _content_of(_parsed(restored.encode(), store_id, "The backup"), session, without_lost_ca=True)
+
+
+def _content_of(members: dict[str, Any], session: TokenSession, *, without_lost_ca: bool = False) -> _Content:
     station = _held(session, members["station"], "station")
-    ca = None if members["ca"] is None else _held(session, members["ca"], "CA")
+    find_ca = _find if without_lost_ca else _held
+    ca = None if members["ca"] is None else find_ca(session, members["ca"], "CA")
     if not verify(station.point, _signed(members), _octets(members, "signature")):
         raise VaultError(f"{FILE_NAME} was changed: its signature does not verify.", hint=_DAMAGED)
     pins = members.get("pins", 0)
@@ -332,22 +338,28 @@ def _described(key: TokenKey) -> dict[str, str]:
     return {"label": key.label, "id": key.identifier.hex(), "point": key.point.hex()}
 
 
-def _held(session: TokenSession, described: Any, role: str) -> TokenKey:
-    """Return the key that the file names; it must still be the same."""
+def _find(session: TokenSession, described: Any, role: str) -> TokenKey | None:
+    """Return the key that the file names, None if the token holds none; it must still be the same."""
     try:
         label, identifier, point = str(described["label"]), bytes.fromhex(described["id"]), described["point"]
     except (KeyError, TypeError, ValueError):
         raise VaultError(f"{FILE_NAME} does not say which key is the {role} key.", hint=_DAMAGED) from None
     key = session.find(label=label, identifier=identifier)
-    if key is None:
-        raise VaultError(
-            f"The token {session.label!r} does not hold the {role} key {label!r}.",
-            hint="Plug in the token that was used at init; a key deleted there cannot be recovered.",
-        )
-    if key.point.hex() != point:
+    if key is not None and key.point.hex() != point:
         raise VaultError(
             f"The {role} key {label!r} in the token {session.label!r} is not the one from init.",
             hint="Plug in the token that was used at init.",
+        )
+    return key
+
+
+def _held(session: TokenSession, described: Any, role: str) -> TokenKey:
+    """Return the key that the file names; the token must hold it."""
+    key = _find(session, described, role)
+    if key is None:
+        raise VaultError(
+            f"The token {session.label!r} does not hold the {role} key {str(described['label'])!r}.",
+            hint="Plug in the token that was used at init; a key deleted there cannot be recovered.",
         )
     return key
 

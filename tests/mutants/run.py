@@ -6,9 +6,14 @@ until one fails; that test is then run without the mutant once, so that none die
 no test notices is printed at the end and kept in build/mutants/survivors.txt: it is a missing test, a rule that nothing
 needs, or a change that changes nothing, and only a reader can tell which.
 
+A mutant whose tests did not come to their end is no survivor: nothing is known of it. If they had the whole time of a
+mutant, they run once without it, on the machine as busy as it is, and once more with twice the time that this took.
+Those that still do not end are listed apart, and kept in build/mutants/unfinished.txt.
+
 Usage: python -m tests.mutants.run [--count N] [--room ROOM] [--only WORDS] [--minutes M] [--jobs J] [--seed S]
 [--patterns]
-Exits 1 where a pattern survived, 2 where one is not found in the code.
+Exits 1 where a pattern survived, 2 where one is not found in the code, 3 where the tests of one did not come to their
+end and none survived.
 """
 
 from __future__ import annotations
@@ -25,6 +30,7 @@ import threading
 import time
 import venv
 from collections import Counter
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -39,7 +45,9 @@ PLACE = ROOT / "build" / "mutants"
 FILES = 14
 IN_C = "firmware"
 LEAST, MOST = 20.0, 90.0
-"""Seconds that the tests of one mutant get, whatever the time that is left says."""
+"""Seconds that the tests of one mutant get at first, whatever the time that is left says."""
+LONGEST = 900.0
+"""Seconds that tests get which run without a mutant, to measure how long they take."""
 MARKS = "not slow and not nightly and not soak and not machine and not realtime"
 COMPILING = 90.0
 _FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+?(?:\[.*?\])?)(?: - .*)?$", re.MULTILINE)
@@ -47,12 +55,35 @@ _FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+?(?:\[.*?\])?)(?: - .*)?$", re.MULT
 
 @dataclass(frozen=True)
 class Fate:
-    """What became of a mutant: the test that noticed it ("" for none), and whether its time ran out before."""
+    """What became of a mutant: the test that noticed it ("" for none), and whether its tests came to their end."""
 
     mutant: Mutant
     by: str
     seconds: float
-    late: bool = False
+    finished: bool = True
+
+    @property
+    def survived(self) -> bool:
+        """True if its tests came to their end, and none noticed it."""
+        return self.finished and not self.by
+
+    def __str__(self) -> str:
+        word = f"noticed by {self.by}" if self.by else "SURVIVED" if self.survived else "its tests RAN OUT OF TIME"
+        return f"{self.seconds:5.1f} s  {self.mutant}\n         {word}"
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A run of pytest: its exit code (None: its time was over), what it printed, and how long it took."""
+
+    code: int | None
+    output: str
+    seconds: float
+
+    @property
+    def failed(self) -> bool:
+        """True if a test failed, or the run itself."""
+        return self.code not in (0, None, 5)
 
 
 class Copy:
@@ -80,10 +111,11 @@ class Copy:
         (site / "b_usual.pth").write_text(f"{usual}\n")
         self._moment = int(time.time()) - 1_000_000
 
-    def run(self, words: list[str], seconds: float) -> tuple[int | None, str]:
-        """Run pytest; its exit code (None: its time was over) and what it said."""
+    def run(self, words: list[str], seconds: float) -> Ran:
+        """Run pytest for at most so many seconds."""
+        began = time.monotonic()
         longest = "150" if any(word.startswith("tests/firmware/") for word in words) else "40"  # it compiles
-        command = [str(self.python), "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist",
+        command = [str(self.python), "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist",
                    "--hypothesis-profile", "quick", "--timeout", longest, "-m", MARKS, *words]  # fmt: skip
         running = subprocess.Popen(
             command, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -99,8 +131,8 @@ class Copy:
             except subprocess.TimeoutExpired:
                 os.killpg(running.pid, signal.SIGKILL)
                 output, _ = running.communicate()
-            return None, output
-        return running.returncode, output
+            return Ran(None, output, time.monotonic() - began)
+        return Ran(running.returncode, output, time.monotonic() - began)
 
     def put(self, name: str, source: str) -> None:
         """Write a module, so that no compiled form of another text can pass for it."""
@@ -117,57 +149,74 @@ class Copy:
 class Bench:
     """Tries mutants, each in the copy that is free."""
 
-    def __init__(self, jobs: int, until: float, sources: dict[str, str]) -> None:
+    def __init__(self, copies: Sequence[Copy], until: float, sources: dict[str, str], tests: Suite) -> None:
         """``sources`` are the texts that the mutants were cut from; the checkout may change meanwhile."""
         self._sources = sources
-        PLACE.mkdir(parents=True, exist_ok=True)
-        self._tests, self._until, self._jobs = Suite(), until, jobs
+        self._tests, self._until, self._jobs = tests, until, len(copies)
         self._copies: SimpleQueue[Copy] = SimpleQueue()
         self._good: set[str] = set()
         self._bad: set[str] = set()
+        self._needed: dict[tuple[str, ...], float] = {}
         self._told = threading.Lock()
         self.left = 0
-        for number in range(jobs):
-            self._copies.put(Copy(number))
+        for copy in copies:
+            self._copies.put(copy)
 
     def try_one(self, mutant: Mutant) -> Fate | None:
         """Whether the nearest tests notice a mutant; None where the time is over."""
         if time.monotonic() > self._until:
             return None
         copy = self._copies.get()
-        source = self._sources[mutant.path]
         began = time.monotonic()
         share = (self._until - began) * self._jobs / max(1, self.left) * 2  # half of them end at once
         try:
-            copy.put(mutant.path, mutant.applied(source))
             files = self._tests.nearest(mutant, FILES)
-            last = began + (MOST if mutant.rule else min(MOST, max(LEAST, share)))
-            last += COMPILING if mutant.test.startswith("tests/firmware/") else 0
-            by, code = "", 1
-            while not by and code not in (0, None, 5):
-                without = [word for test in self._bad for word in ("--deselect" if "::" in test else "--ignore", test)]
-                copy.put(mutant.path, mutant.applied(source))
-                code, output = copy.run([*without, *files], max(1.0, last - time.monotonic()))
-                if code in (0, None, 5):
-                    break
-                by = (_FAILED.findall(output) or ["(the run itself)"])[-1]
-                copy.put(mutant.path, source)
-                if by.startswith("tests/") and not self._is_good(copy, by):
-                    by = ""  # it fails by itself: the others shall say
+            seconds = MOST if mutant.rule else min(MOST, max(LEAST, share))
+            whole = seconds == MOST
+            seconds += COMPILING if mutant.test.startswith("tests/firmware/") else 0
+            by, finished = self._noticed(copy, mutant, files, seconds)
+            if whole and not finished and (enough := 2 * self._needed_without(copy, mutant, files)) > seconds:
+                by, finished = self._noticed(copy, mutant, files, enough)
         finally:
-            copy.put(mutant.path, source)
+            copy.put(mutant.path, self._sources[mutant.path])
             self._copies.put(copy)
-        fate = Fate(mutant, by, time.monotonic() - began, code is None)
+        fate = Fate(mutant, by, time.monotonic() - began, finished)
         with self._told:
             self.left -= 1
-            word = f"noticed by {by}" if by else "SURVIVED" + (" (its time was over)" if fate.late else "")
-            print(f"{fate.seconds:5.1f} s  {mutant}\n         {word}", flush=True)
+            print(fate, flush=True)
         return fate
+
+    def _noticed(self, copy: Copy, mutant: Mutant, files: list[str], seconds: float) -> tuple[str, bool]:
+        """Return the test that notices a mutant, "" for none, and whether the tests came to their end."""
+        source = self._sources[mutant.path]
+        last = time.monotonic() + seconds
+        while True:
+            copy.put(mutant.path, mutant.applied(source))
+            ran = copy.run(["-x", *self._without_bad(), *files], max(1.0, last - time.monotonic()))
+            if not ran.failed:
+                return "", ran.code is not None
+            by = (_FAILED.findall(ran.output) or ["(the run itself)"])[-1]
+            copy.put(mutant.path, source)
+            if by in self._bad:  # pytest knows it by another name, and cannot leave it out
+                return "", False
+            if not by.startswith("tests/") or self._is_good(copy, by):
+                return by, True
+            # it fails by itself: the others shall say
+
+    def _needed_without(self, copy: Copy, mutant: Mutant, files: list[str]) -> float:
+        """Return how many seconds the tests take without the mutant; measured once for each set of them."""
+        if tuple(files) not in self._needed:
+            copy.put(mutant.path, self._sources[mutant.path])
+            self._needed[tuple(files)] = copy.run([*self._without_bad(), *files], LONGEST).seconds
+        return self._needed[tuple(files)]
+
+    def _without_bad(self) -> list[str]:
+        return [word for test in self._bad for word in ("--deselect" if "::" in test else "--ignore", test)]
 
     def _is_good(self, copy: Copy, test: str) -> bool:
         if test in self._good:
             return True
-        good = copy.run([test], MOST)[0] == 0
+        good = copy.run(["-x", test], LONGEST).code == 0
         (self._good if good else self._bad).add(test)
         if not good:
             print(f"         without any mutant {test} fails too: left out from now on", flush=True)
@@ -224,19 +273,36 @@ def main(arguments: list[str]) -> int:
         others = [mutant for mutant in every if chosen.only in (mutant.function, mutant.function.rpartition(".")[2])]
     sources = {module.name: module.source for module in everywhere}
     sources |= {mutant.path: (ROOT / mutant.path).read_text() for mutant in named if mutant.path not in sources}
-    bench = Bench(chosen.jobs, time.monotonic() + 60 * chosen.minutes, sources)
+    PLACE.mkdir(parents=True, exist_ok=True)
+    copies = [Copy(number) for number in range(chosen.jobs)]
+    bench = Bench(copies, time.monotonic() + 60 * chosen.minutes, sources, Suite())
     bench.left = len(named) + len(others)
     print(f"{len(named)} patterns, {len(others)} random ones (--seed {seed})", flush=True)
     with ThreadPoolExecutor(chosen.jobs) as pool:
         fates = [fate for fate in pool.map(bench.try_one, [*named, *others]) if fate is not None]
-    survivors = [fate for fate in fates if not fate.by]
-    lines = [f"{fate.mutant}{' (its time was over)' if fate.late else ''}" for fate in survivors]
-    (PLACE / "survivors.txt").write_text("".join(f"{line}\n" for line in lines))
-    rooms = Counter("/".join(fate.mutant.path.split("/")[:2]) for fate in survivors)
-    print(f"\n{len(fates)} of {len(named) + len(others)} tried, {len(fates) - len(survivors)} noticed; survivors:")
+    return report(fates, len(named) + len(others), PLACE)
+
+
+def report(fates: list[Fate], wanted: int, place: Path) -> int:
+    """Print and keep what no test noticed, and apart from it what is not known; return the exit code."""
+    survivors = [fate for fate in fates if fate.survived]
+    unfinished = [fate for fate in fates if not fate.finished]
+    noticed = len(fates) - len(survivors) - len(unfinished)
+    print(f"\n{len(fates)} of {wanted} tried, {noticed} noticed, {len(unfinished)} ran out of time; survivors:")
+    _list(survivors, place / "survivors.txt")
+    print("Ran out of time, so nothing is known of them:")
+    _list(unfinished, place / "unfinished.txt")
+    if any(fate.mutant.rule for fate in survivors):
+        return 1
+    return 3 if any(fate.mutant.rule for fate in unfinished) else 0
+
+
+def _list(fates: list[Fate], file: Path) -> None:
+    lines = [str(fate.mutant) for fate in fates]
+    file.write_text("".join(f"{line}\n" for line in lines))
+    rooms = Counter("/".join(fate.mutant.path.split("/")[:2]) for fate in fates)
     print("".join(f"  {line}\n" for line in lines), end="")
     print("  by room: " + ", ".join(f"{room} {count}" for room, count in rooms.most_common()) if rooms else "  none")
-    return 1 if any(fate.mutant.rule for fate in survivors) else 0
 
 
 if __name__ == "__main__":

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import ast
 import random
+import time
+from pathlib import Path
 
 import pytest
 
 from tests.mutants.changes import ROOT, Module, Mutant, Pattern, any_of, found, found_in_c, modules
 from tests.mutants.nearest import Suite
 from tests.mutants.patterns import C_PATTERNS, PATTERNS
-from tests.mutants.run import drawn
+from tests.mutants.run import MOST, Bench, Copy, Fate, Ran, drawn, report
 
 
 @pytest.fixture(scope="module")
@@ -61,3 +63,87 @@ def test_the_nearest_tests_of_a_module_come_first(house: list[Module]) -> None:
     assert "tests/provisioning/test_agree.py" in first("provisioning/agree.py")
     assert "tests/ncap/test_guard.py" in first("ncap/web/tokens.py")
     assert any(path.startswith("tests/protocol/") for path in first("protocol/tim/teds_access.py"))
+
+
+class SlowCopy(Copy):
+    """Stands for a copy of the checkout whose tests take ``seconds``, and with ``hangs`` for ever beside a mutant."""
+
+    def __init__(self, seconds: float, code: int = 0, *, hangs: bool = False) -> None:
+        self.seconds, self.code, self.hangs = seconds, code, hangs
+        self.limits: list[float] = []
+        self.source = ""
+
+    def put(self, name: str, source: str) -> None:
+        """Note whether the mutant is in place."""
+        self.source = source
+
+    def run(self, words: list[str], seconds: float) -> Ran:
+        """Report what pytest would, without taking the time."""
+        broken = self.source != _SOURCE
+        self.limits.append(round(seconds))
+        needed = float("inf") if broken and self.hangs else self.seconds
+        if needed > seconds:
+            return Ran(None, "", seconds)
+        return Ran(self.code if broken else 0, "FAILED tests/a/test_a.py::test_it - no", needed)
+
+
+class OneFile(Suite):
+    """Stands for the tests of the house: one file, whatever the mutant."""
+
+    def __init__(self) -> None:
+        pass
+
+    def nearest(self, mutant: Mutant, most: int) -> list[str]:
+        """Return the one file."""
+        return ["tests/a/test_a.py"]
+
+
+_SOURCE = "def rule():\n    return True\n"
+
+
+def fate_of(copy: SlowCopy, until: float = 3600.0, rule: str = "a rule") -> Fate:
+    """Try the one mutant there is."""
+    (mutant,) = found(Pattern(rule, "rule", "True", "False"), [Module("rule.py", _SOURCE)])
+    fate = Bench([copy], time.monotonic() + until, {"rule.py": _SOURCE}, OneFile()).try_one(mutant)
+    assert fate is not None
+    return fate
+
+
+def test_a_mutant_whose_tests_are_slow_without_it_too_gets_their_time() -> None:
+    copy = SlowCopy(seconds=200)
+    assert fate_of(copy).survived
+    assert copy.limits == [MOST, 900, 400]
+    noticed = fate_of(SlowCopy(seconds=200, code=1))
+    assert (noticed.by, noticed.survived, noticed.finished) == ("tests/a/test_a.py::test_it", False, True)
+
+
+def test_a_mutant_whose_tests_do_not_end_is_no_survivor() -> None:
+    for copy in (SlowCopy(seconds=200, hangs=True), SlowCopy(seconds=5, hangs=True), SlowCopy(seconds=2000)):
+        fate = fate_of(copy)
+        assert (fate.by, fate.survived, fate.finished) == ("", False, False)
+        assert "RAN OUT OF TIME" in str(fate)
+        assert "SURVIVED" not in str(fate)
+
+
+def test_a_mutant_that_gets_a_share_of_what_is_left_is_not_measured() -> None:
+    copy = SlowCopy(seconds=50)
+    assert not fate_of(copy, until=5.0, rule="").finished
+    assert len(copy.limits) == 1
+
+
+@pytest.mark.parametrize(
+    ("copy", "rule", "code", "survivors", "unfinished"),
+    [
+        (SlowCopy(5), "a rule", 1, 1, 0),
+        (SlowCopy(5), "", 0, 1, 0),
+        (SlowCopy(5, hangs=True), "a rule", 3, 0, 1),
+        (SlowCopy(5, hangs=True), "", 0, 0, 1),
+        (SlowCopy(5, code=1), "a rule", 0, 0, 0),
+    ],
+)
+def test_survivors_and_what_ran_out_of_time_are_listed_apart(
+    tmp_path: Path, copy: SlowCopy, rule: str, code: int, survivors: int, unfinished: int
+) -> None:
+    assert report([fate_of(copy, rule=rule)], 1, tmp_path) == code
+    for name, count in (("survivors.txt", survivors), ("unfinished.txt", unfinished)):
+        assert len((tmp_path / name).read_text().splitlines()) == count

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from starlette.requests import Request
+from starlette.responses import StreamingResponse
 
+from teds_provision import client
 from teds_provision.errors import NodeBusyError, NoNodeError, StoreError
 from teds_provision.links.discovery import Sighting
 from teds_provision.measure.buses import Buses
@@ -20,6 +24,9 @@ from teds_provision.ncap.nodes.actuator_leases import ActuatorLeases
 from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.node_jobs import NodeJobs, NodeLocks
 from teds_provision.ncap.sinks import DaemonSinks
+from teds_provision.ncap.web import resources as web
+from teds_provision.ncap.web.guard import CALLER
+from teds_provision.ncap.web.resources import Resources
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import KeptMeasurement, WhitelistEntry
 from tests.bench import make_station
@@ -147,6 +154,50 @@ def test_two_writers_of_one_node_wait_for_each_other_and_those_of_others_do_not(
         assert service.measurements.lent_for(NODE) is None
     first.join(10)
     assert service.measurements.lent_for(NODE) == "let go for write"
+
+
+def lending(service: Service, *commands: str) -> list[AsyncIterator[Any]]:
+    """Ask for the one node as commands of this home do; returns the lines of each answer."""
+    resources = Resources(SimpleNamespace(measuring=service.measurements))  # type: ignore[arg-type]
+    answers = []
+    for command in commands:
+        scope = {"type": "http", "path_params": {"uuid": NODE}, "query_string": f"for={command}".encode()}
+        scope[CALLER] = SimpleNamespace(kind="socket")
+        answer = asyncio.run(resources.lend_until_closed(Request(scope)))
+        assert isinstance(answer, StreamingResponse)
+        answers.append(aiter(answer.body_iterator))
+    return answers
+
+
+def test_two_commands_that_wait_for_a_node_at_once_hear_that_they_wait(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second one waits for the first, longer than a command bears silence (client.LETTING_GO)."""
+    assert 2 * web._STILL < client.LETTING_GO
+    monkeypatch.setattr(web, "_STILL", 0.01)
+    commands = lending(service, "write", "address")
+
+    async def heard() -> None:
+        with service.measurements._one_at_a_time(NODE):  # as if another were being lent it, or gave it back
+            for _ in range(3):
+                assert [await anext(command) for command in commands] == ["waiting\n"] * 2
+        for command in commands:
+            assert [line async for line in until_answered(command)][-1] == "not measured\n"
+        whys = sorted(loan.why for loan in service.measurements._loans[NODE])
+        assert whys == ["let go for address", "let go for write"]
+        for command in commands:
+            await command.aclose()  # type: ignore[attr-defined]
+
+    asyncio.run(heard())
+    until(lambda: service.measurements.lent_for(NODE) is None)
+
+
+async def until_answered(lines: AsyncIterator[Any]) -> AsyncIterator[Any]:
+    """Yield lines to the first that is the answer."""
+    async for line in lines:
+        yield line
+        if line != "waiting\n":
+            return
 
 
 @pytest.mark.parametrize(("state", "ended"), [("running", ["This station holds no key of node"]), ("ended", [])])

@@ -217,7 +217,9 @@ def test_what_is_not_measured_need_not_be_released(lab: Lab) -> None:
     lab.service.end()
 
 
-@pytest.mark.parametrize("answer", ["", "refused: It is busy.\n"], ids=["nothing", "no"])
+@pytest.mark.parametrize(
+    "answer", ["", "refused: It is busy.\n", "waiting\nrefused: It is busy.\n"], ids=["nothing", "no", "late"]
+)
 def test_a_base_station_that_does_not_answer_is_6(tmp_path: Path, answer: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(client, "LETTING_GO", 0.5)
     with socket.socket(socket.AF_UNIX) as listener:
@@ -238,4 +240,26 @@ def test_a_base_station_that_does_not_answer_is_6(tmp_path: Path, answer: str, m
             pass
         assert refused.value.exit_code == 6
         assert ("It is busy." in refused.value.message) == bool(answer)
+        thread.join(5)
+
+
+def test_a_base_station_that_is_not_silent_is_waited_for(tmp_path: Path) -> None:
+    """Another command is before this one: each line begins the time anew that a silent base station gets."""
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(tmp_path / client.SOCKET))
+        listener.listen()
+
+        def serve() -> None:
+            connection, _ = listener.accept()
+            with connection:
+                connection.recv(4096)
+                connection.sendall(b"HTTP/1.1 200 OK\r\nConnection: close\r\n\r\n")
+                connection.sendall(5 * client.STILL_WAITING)
+                connection.sendall(b"let go\n")
+                connection.recv(1)
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        with client.connect(home=tmp_path).released("00" * 10, "write") as had:
+            assert had is True
         thread.join(5)

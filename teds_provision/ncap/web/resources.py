@@ -14,6 +14,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from teds_provision import client
 from teds_provision.api import bodies
 from teds_provision.api.operations import (
     FURTHEST,
@@ -43,6 +44,7 @@ from teds_provision.teds.profile import default_folders, list_profiles, listed
 
 Handler = Callable[[Request], Awaitable[Response]]
 _LENT_LOOK: Final = 0.5
+_STILL: Final = client.LETTING_GO / 3  # seconds between two lines to a command that waits for a node
 _OF_UPDATES: Final = ("nodes", "match", "dry_run", "other_board", "allow_downgrade", "parallel", "wait")
 _DIGITS: Final = 9  # of a number in a query; Python gives up on four thousand
 _UNIX: Final = re.compile(r"[0-9]{1,12}(\.[0-9]{1,9})?")
@@ -197,7 +199,9 @@ class Resources:
 
         One whose actuator is in use is not let go for an update: its restart would end that.
 
-        Over the socket alone. A caller that dies closes it, and a silent one has the node for a limited time.
+        Over the socket alone. A caller that dies closes it, and a silent one has the node for a limited time. It gives
+        up if nothing is written for a while, so one that waits (for the node's session to end, for another borrower
+        that is served first) gets a line now and then.
         """
         caller: Caller = request.scope[CALLER]
         if caller.kind != "socket":
@@ -213,9 +217,13 @@ class Resources:
             return measuring.lend_node(loan)
 
         async def had() -> AsyncIterator[str]:
+            lending = asyncio.ensure_future(changing(lend))
+            lending.add_done_callback(lambda done: done.cancelled() or done.exception())  # the client may have gone
             try:
                 try:
-                    yield "let go\n" if await changing(lend) else "not measured\n"
+                    while not (await asyncio.wait({lending}, timeout=_STILL))[0]:
+                        yield client.STILL_WAITING.decode()
+                    yield "let go\n" if lending.result() else "not measured\n"
                 except TedsProvisionError as error:
                     yield f"refused: {error.message}\n"
                     return

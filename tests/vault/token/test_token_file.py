@@ -8,6 +8,8 @@ import pytest
 
 from teds_provision.errors import VaultChangedError, VaultError
 from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.vault import pkcs11
+from teds_provision.vault.master import MasterKeys
 from teds_provision.vault.pkcs11 import FILE_NAME, Pkcs11Vault
 from tests.vault.softhsm import PIN
 from tests.vault.token.person import Person, in_new_process
@@ -56,9 +58,6 @@ def test_every_changed_digit_of_the_file_is_noticed(vault, home, store_id, uri):
 
 def test_masters_that_someone_else_sealed_to_the_station_key_are_refused(vault, home, store_id, uri):
     """Whoever may write the file knows the public key; without the signature they could choose the master key."""
-    from teds_provision.vault import pkcs11
-    from teds_provision.vault.master import MasterKeys
-
     forger = pkcs11._Content(vault._content.station, vault._content.ca, MasterKeys({1: bytes(32)}))
     outsider = SoftwareKey(5)
     with pytest.MonkeyPatch.context() as patch:
@@ -142,3 +141,63 @@ def test_a_backup_joins_what_is_there_and_another_stations_does_not(vault, home,
     other = Pkcs11Vault.create(tmp_path / "other", store_id, uri.replace("?", ";id=%09?"), Person())
     with pytest.raises(VaultError, match="another station"):
         Pkcs11Vault.create(home, store_id, uri, Person(), restored=other.secret_material())
+
+
+def test_an_older_backup_brings_back_old_master_keys_without_losing_the_new(vault, home, store_id, uri):
+    old, backup = vault.wrap(b"o" * 16, context=CONTEXT), vault.secret_material()
+    vault.add_master()
+    vault.retire_masters()
+    vault.drop_ca()
+    new = vault.wrap(b"n" * 16, context=CONTEXT)
+    Pkcs11Vault.create(home, store_id, uri, Person(), restored=backup)
+    again = Pkcs11Vault.open(home, store_id, uri, Person())
+    assert (again.unwrap(old, context=CONTEXT), again.unwrap(new, context=CONTEXT)) == (b"o" * 16, b"n" * 16)
+    assert again.ca() is None  # it was taken out since, and stays out
+
+
+def test_a_backup_comes_back_without_the_ca_key_that_was_destroyed_since(vault, tmp_path, store_id, uri):
+    wrapped, backup = vault.wrap(b"k" * 16, context=CONTEXT), vault.secret_material()
+    vault.drop_ca()
+    (tmp_path / "elsewhere").mkdir()
+    again = Pkcs11Vault.create(tmp_path / "elsewhere", store_id, uri, Person(), restored=backup)
+    assert again.unwrap(wrapped, context=CONTEXT) == b"k" * 16
+    assert again.ca() is None
+    assert Pkcs11Vault.open(tmp_path / "elsewhere", store_id, uri, Person()).ca() is None
+
+
+def test_a_backup_that_brings_nothing_leaves_the_file_as_it_is(vault, home, store_id, uri):
+    backup = vault.secret_material()
+    vault.add_master()
+    before = (home / FILE_NAME).read_bytes()
+    Pkcs11Vault.create(home, store_id, uri, Person(), restored=backup)
+    assert (home / FILE_NAME).read_bytes() == before
+
+
+def test_two_lives_of_one_station_are_not_called_two_stations(vault, home, tmp_path, store_id, uri):
+    """An old backup restored, its master key made anew, then a newer backup, whose second master key is another one."""
+    old = vault.secret_material()
+    vault.add_master()
+    newer = vault.secret_material()
+    (tmp_path / "elsewhere").mkdir()
+    restored = Pkcs11Vault.create(tmp_path / "elsewhere", store_id, uri, Person(), restored=old)
+    restored.add_master()
+    before = restored.secret_material()
+    with pytest.raises(VaultError, match="are of one station, but each has another master key") as error:
+        Pkcs11Vault.create(tmp_path / "elsewhere", store_id, uri, Person(), restored=newer)
+    assert "another --home" in error.value.hint
+    assert restored.secret_material() == before
+
+
+def test_a_backup_joins_what_another_process_has_added_by_then(vault, home, store_id, uri):
+    backup = pkcs11._content_of(
+        pkcs11._parsed(vault.secret_material().encode(), store_id, "The backup"), vault._session
+    )
+    other = Pkcs11Vault.open(home, store_id, uri, Person())
+    vault.add_master()
+    vault.retire_masters()
+    other.refresh()
+    vault.add_master()
+    wrapped = vault.wrap(b"k" * 16, context=CONTEXT)
+    other._join(backup)
+    assert Pkcs11Vault.open(home, store_id, uri, Person()).unwrap(wrapped, context=CONTEXT) == b"k" * 16
+    assert other.masters() == (1, 2, 3)
