@@ -176,6 +176,19 @@ def test_what_is_not_there_or_too_large_or_a_folder(tmp_path: Path) -> None:
         read_limited(tmp_path / "link", 5, "key", failure=StoreError, follow=False)
 
 
+@pytest.mark.parametrize("octets", [0, 1, (1 << 16) - 1, 1 << 16, (1 << 16) + 1, 200_000])
+@pytest.mark.parametrize("known", [0, 1, (1 << 16) - 1, 1 << 16, 200_000])
+def test_a_file_is_read_whole_whatever_size_it_seemed_to_have(tmp_path: Path, octets: int, known: int) -> None:
+    (tmp_path / "a").write_bytes(bytes(octets))
+    for most in (octets, octets + 1, 10, 1 << 20):
+        descriptor = os.open(tmp_path / "a", os.O_RDONLY)
+        assert len(files._read(descriptor, known, most)) == min(octets, most)
+
+
+def test_a_file_without_a_size_is_read_whole() -> None:
+    assert read_limited("/proc/self/stat", 1 << 16, "file").endswith(b"\n")
+
+
 def test_an_endless_file_is_not_read_to_its_end() -> None:
     with pytest.raises(BadDataError):
         read_limited(Path("/dev/zero"), 1000, "key")

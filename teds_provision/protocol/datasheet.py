@@ -10,11 +10,12 @@ from functools import lru_cache
 from teds_provision.errors import BadDataError
 from teds_provision.protocol.keys import Credentials, Verify, is_point, station_key_message, verify
 from teds_provision.teds.codec import frame, security
-from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.security import SecurityTeds
-from teds_provision.teds.image import BlockId
+from teds_provision.teds.image import SECURITY, BlockId
 
 UUID_FIELD = 4
+_UUID_HEAD = bytes([UUID_FIELD, 10])
+_TEDSID_OF_2007 = b"\x03\x04"
 SEQUENCE_WINDOW = 65536
 STORED_CODES = frozenset({*range(1, 18), *range(128, 136)})
 LAST_CHANNEL = 255
@@ -36,7 +37,7 @@ def can_be_stored(block: BlockId) -> bool:
 
 def digests(blocks: Mapping[BlockId, bytes]) -> dict[BlockId, bytes]:
     """Return the SHA-256 of every TEDS (Length to Checksum inclusive) except the Security TEDS."""
-    return {key: hashlib.sha256(teds).digest() for key, teds in blocks.items() if key != (0, AccessCode.SECURITY)}
+    return {key: hashlib.sha256(teds).digest() for key, teds in blocks.items() if key != SECURITY}
 
 
 def unsigned_datasheet(
@@ -107,6 +108,12 @@ def message_signature_good(teds: SecurityTeds, message: bytes) -> bool:
     return _signed(teds.station_key, message, teds.signature)
 
 
+def message_signature_good_once(teds: SecurityTeds, message: bytes) -> bool:
+    """Return :func:`message_signature_good` of a datasheet among many, which nobody asks for again."""
+    key, signature = teds.station_key, teds.signature
+    return key is not None and signature is not None and verify(key, message, signature)
+
+
 @lru_cache(maxsize=16)
 def _signed(station: bytes, message: bytes, signature: bytes) -> bool:
     """Verify a signature once: what was just read and what is stored are usually the same."""
@@ -117,9 +124,11 @@ def meta_names(teds: bytes, uuid: bytes) -> bool:
     """Return True if field 4 of a Meta-TEDS of the 2007 form is ``uuid``; other forms are not compared (True)."""
     try:
         block = frame.unframe(teds)
-        if block[:2] != b"\x03\x04":
+        if block[:2] != _TEDSID_OF_2007:
             return True
         width = block[5] if len(block) > 5 else 1
+        if width == 1 and block[6:18] == _UUID_HEAD + uuid:
+            return True  # it is the first field wherever this program writes it
         return any(part.type == UUID_FIELD and part.value == uuid for part in frame.tuples(block, width=width or 1))
     except BadDataError:
         return False

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 from teds_provision.errors import BadDataError, BadDatasheetError, NotAuthenticError, TedsProvisionError, UnprovenError
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.fingerprints import same_key
-from teds_provision.protocol.keys import fingerprint, node_key_good, other_key
+from teds_provision.protocol.keys import fingerprint, node_key_good, node_key_good_once, other_key
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.shapes.verdict import FRESHNESS, PAGES, SESSION, Check, Verification
 from teds_provision.station.plant.plant import SignerRules
@@ -50,8 +49,8 @@ class TrustLookup(Protocol):
     def trusted_stations(self) -> list[bytes]:
         """Return the station keys that count."""
 
-    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> SignerVerdict | None:
-        """Return the plant's verdict on the signer of this digest; None if it does not apply."""
+    def signing(self, certifier: bytes | None, station_key: bytes, security_teds: bytes) -> SignerVerdict | None:
+        """Return the plant's verdict on the signer of this TEDS, or one of this SHA-256; None if it does not apply."""
 
 
 class TrustSource(Protocol):
@@ -102,8 +101,8 @@ class _TrustSnapshot:
     def trusted_stations(self) -> list[bytes]:
         return list(self.stations)
 
-    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> SignerVerdict | None:
-        return None if self.rules is None else self.rules.signing(certifier, station_key, digest)
+    def signing(self, certifier: bytes | None, station_key: bytes, security_teds: bytes) -> SignerVerdict | None:
+        return None if self.rules is None else self.rules.signing(certifier, station_key, security_teds)
 
 
 @dataclass(frozen=True)
@@ -150,9 +149,6 @@ def _counting(station: Station, cas: Mapping[bytes, bytes]) -> dict[bytes, bytes
     """Return those of the nodes' CAs in which trust has not ended; each CA is looked up once."""
     counts = {ca: station.policy.counts(ca) for ca in set(cas.values())}
     return {uuid: ca for uuid, ca in cas.items() if counts[ca]}
-
-
-_DIGEST_OCTETS: Final = 32  # a TEDS is longer
 
 
 @dataclass(frozen=True)
@@ -226,12 +222,15 @@ def _all_proofs(images: Sequence[Image]) -> list[_SecurityFields]:
         security.tbs(image.uuid, image.blocks[SECURITY]) if isinstance(shown, SecurityTeds) and shown.signed else None
         for image, shown in zip(images, read, strict=True)
     ]
+    alone = len(images) == 1  # each step of a provisioning asks again; of many files none is asked for twice
+    node_good = node_key_good if alone else node_key_good_once
+    datasheet_good = datasheet.message_signature_good if alone else datasheet.message_signature_good_once
     node_keys = [
-        isinstance(shown, SecurityTeds) and node_key_good(image.uuid, shown.node_key, shown.node_key_signature)
+        isinstance(shown, SecurityTeds) and node_good(image.uuid, shown.node_key, shown.node_key_signature)
         for image, shown in zip(images, read, strict=True)
     ]
     datasheets = [
-        message is not None and isinstance(shown, SecurityTeds) and datasheet.message_signature_good(shown, message)
+        message is not None and isinstance(shown, SecurityTeds) and datasheet_good(shown, message)
         for shown, message in zip(read, signed, strict=True)
     ]
     return list(map(_SecurityFields, read, node_keys, datasheets))
@@ -343,13 +342,7 @@ def _own_checks(image: Image, proofs: _SecurityFields) -> tuple[Check, ...]:
         checks.append(Check("node key", "failed", "field 102 does not sign this key for this UUID"))
     if not shown.signed:
         return (*checks, Check("signed", "failed", "this is the initial Security TEDS, which is not signed yet"))
-    checks += [
-        _SIGNED,
-        _check("signature", proofs.datasheet, _CHANGED),
-        _blocks(image, shown),
-        _unlisted(image, shown),
-        _meta(image),
-    ]
+    checks += [_SIGNED, _GOOD_SIGNATURE if proofs.datasheet else _BAD_SIGNATURE, *_listed(image, shown), _meta(image)]
     return tuple(checks)
 
 
@@ -501,9 +494,8 @@ def _signer(
     station: TrustSource, signers: Signers, certifier: bytes | None, security_teds: bytes | None
 ) -> tuple[Check, ...]:
     """Check that the station that signed counts; in a plant by its roster and pages, which may not be here yet."""
-    octets, key = security_teds or b"", signers.station_key or b""
-    digest = octets if len(octets) == _DIGEST_OCTETS else hashlib.sha256(octets).digest()
-    signer = station.policy.signing(certifier, key, digest)
+    key = signers.station_key or b""
+    signer = station.policy.signing(certifier, key, security_teds or b"")
     if signer is None:
         return (_station(station, signers, certifier),)
     name, digits = "signing station", fingerprint(key)[:16]
@@ -522,13 +514,24 @@ def _certificate(station: TrustSource, signers: Signers, certifier: bytes | None
     return Check(name, "skipped", "the station itself is trusted; its CA is not known here")
 
 
-_CHANGED = "field 100 does not verify: the datasheet was changed or belongs to another node"
+_GOOD_SIGNATURE: Final = Check("signature", "passed")
+_BAD_SIGNATURE: Final = Check(
+    "signature", "failed", "field 100 does not verify: the datasheet was changed or belongs to another node"
+)
+_ALL_LISTED: Final = Check("every TEDS is signed", "passed")
+_RIGHT_META: Final = Check("UUID", "passed")
+_WRONG_META: Final = Check("UUID", "failed", "the Meta-TEDS names another")
 
 
-def _blocks(image: Image, shown: SecurityTeds) -> Check:
+def _listed(image: Image, shown: SecurityTeds) -> tuple[Check, Check]:
+    """Check that field 108 names the TEDS that are here, all of them and no others."""
     found = datasheet.digests(image.blocks)
     if found == shown.signed_blocks:
-        return Check("signed TEDS", "passed", f"{len(found)} digests")
+        return Check("signed TEDS", "passed", f"{len(found)} digests"), _ALL_LISTED
+    return _blocks(found, shown), _unlisted(image, shown)
+
+
+def _blocks(found: Mapping[BlockId, bytes], shown: SecurityTeds) -> Check:
     wrong = [block for block, digest in shown.signed_blocks.items() if found.get(block) != digest]
     why = ", ".join(f"TEDS {code} of channel {channel} is missing or changed" for channel, code in wrong)
     return _check("signed TEDS", not wrong, why, f"{len(shown.signed_blocks)} digests")
@@ -542,4 +545,4 @@ def _unlisted(image: Image, shown: SecurityTeds) -> Check:
 
 def _meta(image: Image) -> Check:
     metas = [teds for (_, code), teds in image.blocks.items() if code == AccessCode.META]
-    return _check("UUID", all(datasheet.meta_names(teds, image.uuid) for teds in metas), "the Meta-TEDS names another")
+    return _RIGHT_META if all(datasheet.meta_names(teds, image.uuid) for teds in metas) else _WRONG_META

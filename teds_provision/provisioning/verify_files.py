@@ -33,11 +33,16 @@ _UNREADABLE: Final[dict[str, object]] = {"uuid": None, "scope": "image", "verdic
 class FileVerdict:
     """Result of one file: its checks, or why it could not be read; ``exit_code`` of a command for it alone."""
 
-    path: Path
+    file: str
     verified: Verification | None = None
     warnings: tuple[str, ...] = ()
     exit_code: int = 0
     error: Failure | None = None
+
+    @property
+    def path(self) -> Path:
+        """The file's path."""
+        return Path(self.file)
 
     @property
     def word(self) -> str:
@@ -47,7 +52,7 @@ class FileVerdict:
     def to_json(self) -> dict[str, object]:
         """Return one object of the result."""
         judged = _UNREADABLE if self.verified is None else self.verified.to_json()
-        out = {"file": str(self.path), **judged, "warnings": list(self.warnings)}
+        out = {"file": self.file, **judged, "warnings": list(self.warnings)}
         if self.error is not None:
             out["error"] = self.error
         return out
@@ -119,27 +124,27 @@ class _Work:
     def judge(self, places: range) -> tuple[list[str], VerdictTotals]:
         """Judge the files at these places of the list, which every process has."""
         lines, totals = [], VerdictTotals()
-        for some in _some([Path(self.files[place]) for place in places]):
+        for some in _some([self.files[place] for place in places]):
             for found in _judged(self.judging, some):
                 totals.add(found)
                 lines.append(self.format_row(found))
         return lines, totals
 
 
-_Read = tuple[Path, Image | TedsProvisionError]
+_Read = tuple[str, Image | TedsProvisionError]
 
 
-def _some(paths: Sequence[Path]) -> Iterator[list[_Read]]:
+def _some(files: Sequence[str]) -> Iterator[list[_Read]]:
     """Read images, some at a time: as many as are no burden to hold together."""
     some: list[_Read] = []
     octets = 0
-    for path in paths:
+    for file in files:
         try:
-            text = read_limited(path, LIMITS.teds_file, "image", failure=BadDataError)
+            text = read_limited(file, LIMITS.teds_file, "image", failure=BadDataError)
             octets += len(text)
-            some.append((path, security.require_our_wire(Image.from_json(text))))
+            some.append((file, security.require_our_wire(Image.from_json(text))))
         except TedsProvisionError as error:
-            some.append((path, error))
+            some.append((file, error))
         if octets > _TOGETHER:
             yield some
             some, octets = [], 0
@@ -150,16 +155,16 @@ def _some(paths: Sequence[Path]) -> Iterator[list[_Read]]:
 def _judged(judging: TrustSource, some: Sequence[_Read]) -> Iterator[FileVerdict]:
     """Yield the verdicts of files that were read, in their order."""
     checks = iter(verify_images(judging, (image for _, image in some if isinstance(image, Image))))
-    for path, image in some:
+    for file, image in some:
         if isinstance(image, Image):
-            yield _verdict(path, image, next(checks))
+            yield _verdict(file, image, next(checks))
         else:
-            yield FileVerdict(path, exit_code=image.exit_code, error=failure_of(image))
+            yield FileVerdict(file, exit_code=image.exit_code, error=failure_of(image))
 
 
-def _verdict(path: Path, image: Image, checks: Sequence[Check]) -> FileVerdict:
+def _verdict(file: str, image: Image, checks: Sequence[Check]) -> FileVerdict:
     verified = Verification(image.uuid, tuple(checks), scope="image")
-    result = FileVerdict(path, verified)
+    result = FileVerdict(file, verified)
     try:
         if verified.verdict != "authentic":
             require_authentic(verified)

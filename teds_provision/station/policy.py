@@ -111,10 +111,13 @@ class Policy:
             {record.fingerprint for record in self.trust_rows() if record.role == "station"}
         )
 
-    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> signer.SignerVerdict | None:
-        """Return the verdict of roster and pages on a signer; None if they do not apply, or there is no plant."""
+    def signing(self, certifier: bytes | None, station_key: bytes, security_teds: bytes) -> signer.SignerVerdict | None:
+        """Return the verdict of roster and pages on the signer of a Security TEDS, or of one of this SHA-256.
+
+        None if they do not apply, or there is no plant.
+        """
         rules = self.signer_rules()
-        return None if rules is None else rules.signing(certifier, station_key, digest)
+        return None if rules is None else rules.signing(certifier, station_key, security_teds)
 
     def trust(self, record: TrustRecord) -> None:
         """Trust a key under a name (the vault opens); PolicyError if another key or role has the name."""

@@ -563,6 +563,20 @@ PATTERNS = (
         "tests/provisioning/test_update.py",
     ),
     Pattern(
+        "a member that is there twice makes no image",
+        "_plain_image",
+        "members != counted",
+        "False",
+        "tests/teds/test_image.py",
+    ),
+    Pattern(
+        "a layout counts only for the same types and lengths",
+        "_cut",
+        "parts[::2] == layout.heads",
+        "True",
+        "tests/teds/test_codec_security.py",
+    ),
+    Pattern(
         "a new image shows a valid value",
         "require_working_hardware",
         "free and (not any((_gives_value(node, channel, digest) for channel in free[:_TRIED])))",

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NotWhitelistedError, PolicyError
+from teds_provision.protocol import datasheet
 from teds_provision.protocol.datasheet import sign_datasheet
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
 from teds_provision.protocol.messages.identity import Identity
@@ -277,3 +278,21 @@ def test_a_datasheet_signed_before_a_rotation_is_refused_before_anything_is_stag
         with pytest.raises(PolicyError, match="epoch") as refused:
             write(station, node, draft.image)
     assert refused.type is PolicyError, "said here, not by the node after its flash was written"
+
+
+@pytest.mark.parametrize(
+    ("fields", "holds"),
+    [
+        (b"\x04\x0a" + b"u" * 10 + b"\x0a\x00", True),
+        (b"\x0a\x00\x04\x0a" + b"u" * 10, True),
+        (b"\x04\x0a" + b"v" * 10, False),
+        (b"\x04\x0a" + b"v" * 10 + b"\x04\x0a" + b"u" * 10, True),
+        (b"\x04\x0b" + b"u" * 11, False),
+        (b"\x0a\x0a" + b"u" * 10, False),
+        (b"\x04\x0a" + b"u" * 9, False),
+    ],
+)
+def test_a_meta_teds_names_its_node_in_whichever_place_the_field_is(fields: bytes, holds: bool) -> None:
+    meta = frame(b"\x03\x04\x00\x01\x01\x01" + fields)
+    assert datasheet.meta_names(meta, b"u" * 10) is holds
+    assert not datasheet.meta_names(meta[:-1] + bytes([meta[-1] ^ 1]), b"u" * 10), "the checksum is wrong"

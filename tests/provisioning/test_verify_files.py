@@ -213,7 +213,7 @@ def test_so_many_images_are_held_at_a_time_as_there_is_room_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = signed(1)
-    paths = [write(tmp_path, f"{number}.json", image if number != 2 else "{") for number in range(5)]
+    paths = [str(write(tmp_path, f"{number}.json", image if number != 2 else "{")) for number in range(5)]
     size = len(image.to_json())
     for room, held in ((0, [1, 1, 1, 1, 1]), (2 * size, [3, 2]), (9 * size, [5])):
         monkeypatch.setattr(many, "_TOGETHER", room)
@@ -271,5 +271,5 @@ def test_the_worst_exit_code_wins_whatever_the_order() -> None:
     for codes in ((0, 6, 4), (4, 0, 8), (4,)):
         totals = VerdictTotals()
         for code in codes:
-            totals.add(FileVerdict(Path("x"), exit_code=code))
+            totals.add(FileVerdict("x", exit_code=code))
         assert totals.exit_code == 4

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision import teds
+from teds_provision.errors import BadDataError
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 
@@ -114,3 +115,46 @@ def test_security_of_2024_keeps_unknown_fields() -> None:
     assert decoded.verdict == "clean"
     assert [(field.type, field.raw) for field in decoded.fields[3:]] == [(12, b"\x0a"), (13, b"\x04")]
     assert teds.recompose(decoded) == octets
+
+
+@given(st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), max_size=4), st.booleans())
+def test_a_layout_that_was_seen_before_changes_no_verdict(changes: list[tuple[int, int]], swapped: bool) -> None:
+    good = ours(signed_blocks={(0, 1): bytes(32), (1, 3): b"3" * 32}, extra={120: b"more"})
+    block = bytearray(good[4:-2])
+    for place, octet in changes:
+        block[place % len(block)] = octet
+    if swapped:  # two fields of one length
+        at = block.find(b"\x6a\x04")
+        block[at : at + 12] = block[at + 6 : at + 12] + block[at : at + 6]
+
+    def read() -> object:
+        found: list[object] = []
+        for look in (
+            lambda: vars(security.decode_block(bytes(block))),
+            lambda: security.tbs(bytes(10), frame(bytes(block))),
+        ):
+            try:
+                found.append(look())
+            except BadDataError as error:
+                found.append(error.message)
+        return found
+
+    security._LAYOUTS.clear()
+    security._walked.cache_clear()
+    fresh = read()
+    security._LAYOUTS.clear()
+    security._walked.cache_clear()
+    assert security.decode_block(good[4:-2]).extra == {120: b"more"}
+    assert read() == fresh
+
+
+def test_layouts_that_are_remembered_are_few_and_short() -> None:
+    security._LAYOUTS.clear()
+    for length in range(200):
+        with pytest.raises(security.NotCanonicalError):
+            security.decode_block(security.TEDSID_TUPLE + bytes([5, length]) + bytes(length))
+    assert len(security._LAYOUTS) <= 64
+    security._LAYOUTS.clear()
+    many = ours(signed_blocks={(channel, 3): bytes(32) for channel in range(256)})
+    assert len(security.decode(many).signed_blocks) == 256
+    assert not security._LAYOUTS

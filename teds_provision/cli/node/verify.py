@@ -127,7 +127,7 @@ def verify_many(app: App, what: Sequence[str]) -> None:
 def _line(found: provisioning.verify_files.FileVerdict) -> str:
     why = found.error["message"] if found.error is not None else "; ".join(found.warnings)
     uuid = found.verified.uuid.hex() if found.verified is not None else "-"
-    text = f"{found.word:<13}  {uuid:<20}  {found.path}"
+    text = f"{found.word:<13}  {uuid:<20}  {found.file}"
     return printable(f"{text}: {why}" if why else text)
 
 

@@ -5,6 +5,7 @@ A station that joined none reports nothing, and statements of others count as be
 
 from __future__ import annotations
 
+import hashlib
 import json
 import secrets
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -74,6 +75,7 @@ class RosterRow:
 
 
 _PLANT = ", ".join(column.name for column in fields(PlantRecord))
+_DIGEST_OCTETS: Final = 32  # a TEDS is longer
 
 
 @dataclass(frozen=True)
@@ -90,11 +92,16 @@ class SignerRules:
     added: frozenset[str]
     words: Callable[[bytes], Collection[signer.SignatureClaim]]
 
-    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> signer.SignerVerdict | None:
-        """Judge who signed a datasheet; None if the roster does not apply: another owner's CA, and a key not in it."""
+    def signing(self, certifier: bytes | None, station_key: bytes, security_teds: bytes) -> signer.SignerVerdict | None:
+        """Judge who signed a Security TEDS, or one of this SHA-256.
+
+        None if the roster does not apply: another owner's CA, and a key not in it.
+        """
         key = keys.fingerprint(station_key)
         if key not in self.roster.by_key and certifier != self.ca:
             return None
+        hashed = len(security_teds) == _DIGEST_OCTETS
+        digest = security_teds if hashed else hashlib.sha256(security_teds).digest()
         return signer.signing(
             self.roster,
             key,

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import base64
 import binascii
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
+from struct import Struct
 from typing import Final
 
 from teds_provision.errors import BadDataError
@@ -141,42 +143,41 @@ def decode(teds: bytes) -> SecurityTeds:
     Every step of a provisioning decodes the same octets, so the last results are cached: they are immutable.
     """
     try:
-        block, parts = _walked(teds)
+        block, layout, values = _walked(teds)
     except BadDataError as error:
         raise NotCanonicalError(error.message) from error
-    return _read(block, parts)
+    return _read(block, layout, values)
 
 
 @lru_cache(maxsize=128)  # as decode: what is decoded is checked next, over the octets that are signed
-def _walked(teds: bytes) -> tuple[bytes, list[tuple[int, int, int]]]:
-    """Return the data block of a framed Security TEDS and the places of its tuples; raises BadDataError."""
+def _walked(teds: bytes) -> tuple[bytes, _Layout, tuple[bytes, ...]]:
+    """Return the data block of a framed Security TEDS, its layout and the values; raises BadDataError."""
     block = unframe(teds)
-    return block, _places(block)
+    return block, *_cut(block)
 
 
 def decode_block(block: bytes) -> SecurityTeds:
     """Read the data block of a Security TEDS; raises NotCanonicalError."""
     try:
-        parts = _places(block)
+        layout, values = _cut(block)
     except BadDataError as error:
         raise NotCanonicalError(error.message) from error
-    return _read(block, parts)
+    return _read(block, layout, values)
 
 
 def decode_with_tbs(uuid: bytes, teds: bytes) -> tuple[SecurityTeds, bytes]:
     """Decode and compute :func:`tbs` in one pass, for callers that check many TEDS once each."""
     block = unframe(teds)
-    places = _places(block)
-    return _read(block, places), _without_signature(uuid, block, places)
+    layout, values = _cut(block)
+    return _read(block, layout, values), _without_signature(uuid, block, layout)
 
 
-def _read(block: bytes, parts: list[tuple[int, int, int]]) -> SecurityTeds:
+def _read(block: bytes, layout: _Layout, found: tuple[bytes, ...]) -> SecurityTeds:
     if block[:6] != TEDSID_TUPLE:
         raise NotCanonicalError("The first tuple of the Security TEDS is not exactly 03 04 00 80 01 01.")
-    values, blocks = _ascending(block, parts[1:])
-    missing = INITIAL_FIELDS - values.keys()
-    if missing:
-        raise NotCanonicalError(f"The Security TEDS lacks field {min(missing)}.")
+    if layout.fault:
+        raise NotCanonicalError(layout.fault)
+    values = {number: found[place] for number, place in layout.fields}
     raw = {number: _base64(number, values[number]) for number in _BASE64 if number in values}
     return SecurityTeds(
         node_key=raw[NODE_KEY],
@@ -188,24 +189,20 @@ def _read(block: bytes, parts: list[tuple[int, int, int]]) -> SecurityTeds:
         signature=raw.get(SIGNATURE),
         station_key=raw.get(STATION_KEY),
         station_key_signature=raw.get(STATION_KEY_SIGNATURE),
-        signed_blocks=_signed_blocks(blocks),
+        signed_blocks=_signed_blocks(found[layout.blocks]),
         values={number: values[number][0] for number in _U8},
-        extra={number: value for number, value in values.items() if number >= 111},
+        extra={number: values[number] for number in layout.extra},
     )
 
 
 def tbs(uuid: bytes, teds: bytes) -> bytes:
     """Return what field 100 signs: label ‖ UUID ‖ the data block without the tuple of type 100, cut from the octets."""
-    return _without_signature(uuid, *_walked(teds))
+    block, layout, _ = _walked(teds)
+    return _without_signature(uuid, block, layout)
 
 
-def _without_signature(uuid: bytes, block: bytes, places: list[tuple[int, int, int]]) -> bytes:
-    kept, done = [b"TEDS1 datasheet\0", uuid], 0
-    for number, start, end in places:
-        if number == SIGNATURE:
-            kept.append(block[done : start - 2])
-            done = end
-    return b"".join([*kept, block[done:]])
+def _without_signature(uuid: bytes, block: bytes, layout: _Layout) -> bytes:
+    return b"".join([b"TEDS1 datasheet\0", uuid, *(block[part] for part in layout.signed)])
 
 
 def has_profile_version(teds: bytes) -> bool:
@@ -216,11 +213,71 @@ def has_profile_version(teds: bytes) -> bool:
         return False
 
 
-def _places(block: bytes) -> list[tuple[int, int, int]]:
-    """Return type, start and end of every tuple's value (one length octet each); raises BadDataError for a cut one.
+_MOST_TUPLES: Final = 256
+"""Longer blocks are walked each time: their layouts would take much memory."""
+_LAYOUTS: Final[dict[int, _Layout]] = {}
+"""The last layout of each length of a data block."""
+_MOST_LAYOUTS: Final = 64
 
-    Walked twice for each datasheet (its content, and what is signed), so this loop does no more.
+
+@dataclass(frozen=True, eq=False, repr=False)
+class _Layout:
+    """Types and lengths of a data block's tuples, and all that follows from them alone.
+
+    The datasheets of a line differ in values, so that this is worked out once for thousands of them. ``heads``: type
+    and length of each tuple; ``fault``: why no such block is canonical, empty if it may be; ``fields``: number and
+    place of every field but the SignedBlocks, which lie at ``blocks``; ``extra``: numbers from 111 on; ``signed``: the
+    parts of the block that field 100 signs.
     """
+
+    parts: Struct
+    heads: tuple[bytes, ...]
+    fault: str
+    fields: tuple[tuple[int, int], ...]
+    blocks: slice
+    extra: tuple[int, ...]
+    signed: tuple[slice, ...]
+
+
+def _cut(block: bytes) -> tuple[_Layout, tuple[bytes, ...]]:
+    """Return the layout of a data block and the value of each tuple; raises BadDataError for a cut one."""
+    layout = _LAYOUTS.get(len(block))
+    if layout is not None:
+        parts = layout.parts.unpack(block)
+        # The first head says where the second one is, and so on: if all are the same, so is every place.
+        if parts[::2] == layout.heads:
+            return layout, parts[1::2]
+    places = _places(block)
+    layout = _layout(block, places)
+    if len(places) <= _MOST_TUPLES:
+        if len(_LAYOUTS) >= _MOST_LAYOUTS:
+            _LAYOUTS.clear()
+        _LAYOUTS[len(block)] = layout
+    return layout, tuple(block[start:end] for _, start, end in places)
+
+
+def _layout(block: bytes, places: list[tuple[int, int, int]]) -> _Layout:
+    numbers = [number for number, _, _ in places]
+    first = next((place for place, number in enumerate(numbers) if place and number == SIGNED_BLOCK), 0)
+    signed, done = [], 0
+    for number, start, end in places:
+        if number == SIGNATURE:
+            signed.append(slice(done, start - 2))
+            done = end
+    fields = tuple((number, place) for place, number in enumerate(numbers) if place and number != SIGNED_BLOCK)
+    return _Layout(
+        parts=Struct("".join(f"2s{end - start}s" for _, start, end in places)),
+        heads=tuple(block[start - 2 : start] for _, start, _ in places),
+        fault=_fault(places[1:]),
+        fields=fields,
+        blocks=slice(first, first + numbers[1:].count(SIGNED_BLOCK)),
+        extra=tuple(number for number, _ in fields if number >= 111),
+        signed=(*signed, slice(done, len(block))),
+    )
+
+
+def _places(block: bytes) -> list[tuple[int, int, int]]:
+    """Return type, start and end of every tuple's value (one length octet each); raises BadDataError for a cut one."""
     places, at, size = [], 0, len(block)
     try:
         while at < size:
@@ -236,38 +293,32 @@ def _places(block: bytes) -> list[tuple[int, int, int]]:
     return places
 
 
-def _ascending(block: bytes, parts: list[tuple[int, int, int]]) -> tuple[dict[int, bytes], list[bytes]]:
-    """Return values by field, and those of every SignedBlock.
-
-    Raises NotCanonicalError for a wrong order, field or length.
-    """
-    values: dict[int, bytes] = {}
-    blocks: list[bytes] = []
+def _fault(places: list[tuple[int, int, int]]) -> str:
+    """Return which rule about order, fields and lengths the tuples after the TEDSID break; empty for none."""
+    lengths: dict[int, int] = {}
     last = 0
-    for number, start, end in parts:
-        if number == SIGNED_BLOCK:
-            if number < last:
-                raise NotCanonicalError(
-                    f"Field {number} of the Security TEDS is out of ascending order or occurs twice."
-                )
-            blocks.append(block[start:end])
-        elif number <= last:
-            raise NotCanonicalError(f"Field {number} of the Security TEDS is out of ascending order or occurs twice.")
-        else:
-            values[number] = block[start:end]
-            wanted = _OCTETS.get(number)
-            if wanted is not None and end - start != wanted:
-                raise NotCanonicalError(f"Field {number} of the Security TEDS has {end - start} octets, not {wanted}.")
+    for number, start, end in places:
+        if number < last or (number == last and number != SIGNED_BLOCK):
+            return f"Field {number} of the Security TEDS is out of ascending order or occurs twice."
         last = number
-    unknown = values.keys() - _KNOWN
+        if number == SIGNED_BLOCK:
+            continue
+        lengths[number] = end - start
+        wanted = _OCTETS.get(number)
+        if wanted is not None and end - start != wanted:
+            return f"Field {number} of the Security TEDS has {end - start} octets, not {wanted}."
+    unknown = lengths.keys() - _KNOWN
     if unknown and min(unknown) < 111:
-        raise NotCanonicalError(f"The Security TEDS holds a field {min(unknown)} that the profile does not know.")
-    if len(values.get(5, b"")) > CA_OCTETS:
-        raise NotCanonicalError(f"Field 5 (CA) has {len(values[5])} octets; at most {CA_OCTETS} are allowed.")
-    return values, blocks
+        return f"The Security TEDS holds a field {min(unknown)} that the profile does not know."
+    if lengths.get(5, 0) > CA_OCTETS:
+        return f"Field 5 (CA) has {lengths[5]} octets; at most {CA_OCTETS} are allowed."
+    missing = INITIAL_FIELDS - lengths.keys()
+    if missing:
+        return f"The Security TEDS lacks field {min(missing)}."
+    return ""
 
 
-def _signed_blocks(values: list[bytes]) -> dict[BlockId, bytes]:
+def _signed_blocks(values: Sequence[bytes]) -> dict[BlockId, bytes]:
     blocks: dict[BlockId, bytes] = {}
     last = b""
     for value in values:

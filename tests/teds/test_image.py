@@ -1,0 +1,60 @@
+"""The image file: one that holds nothing but an image is read sooner, and never otherwise than member by member."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from teds_provision.errors import BadDataError
+from teds_provision.teds import image as image_file
+from teds_provision.teds.image import Image
+
+_PIECES = st.sampled_from(
+    [
+        "{", "}", "[", "]", ",", ":", '"format"', '"teds-image/1"', '"uuid"', '"00000000000000000001"', '"blocks"',
+        '{"access_code": 1, "channel": 0, "teds": "00"}',
+        '"teds": "0a"', '"teds"', '"te\\u003ads"', '"a:b"', '"channel"',
+        "1", "300", "-0", "true", "1e0", "NaN", "null", " ",
+    ]
+)  # fmt: skip
+
+
+@given(st.lists(st.tuples(st.integers(0, 400), st.integers(0, 30), _PIECES), max_size=3), st.booleans())
+@example([(0, 0, "\ufeff")], False)
+def test_an_image_is_read_plainly_only_as_it_is_read_member_by_member(
+    changes: list[tuple[int, int, str]], as_text: bool
+) -> None:
+    text = Image(bytes(10), {(0, 1): b"one", (2, 3): b"two"}).to_json()
+    for place, length, piece in changes:
+        at = place % len(text)
+        text = text[:at] + piece + text[at + length :]
+    plain = image_file._plain_image(text if as_text else text.encode())
+    if plain is not None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(image_file, "_plain_image", lambda _text: None)
+            assert Image.from_json(text) == plain
+            assert list(plain.blocks) == list(Image.from_json(text).blocks)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"blocks": [', '"uuid": "00000000000000000000", "blocks": ['),
+        ('"teds": "6f6e65"', '"teds": "00", "teds": "6f6e65"'),
+        ('"teds": "6f6e65"', '"teds": "6f6e65", "note": ":"'),
+        ('"access_code": 1,', '"access_code": 1, "channel": 5,'),
+        ('"format"', '"note": 1, "format"'),
+    ],
+)
+def test_a_member_that_is_there_twice_or_unknown_is_never_read_plainly(old: str, new: str) -> None:
+    text = Image(bytes(10), {(0, 1): b"one"}).to_json()
+    assert image_file._plain_image(text) == Image.from_json(text)
+    assert old in text
+    assert image_file._plain_image(text.replace(old, new)) is None
+
+
+@pytest.mark.parametrize("blocks", ["{}", '""', "null"])
+def test_blocks_that_are_no_list_make_no_image(blocks: str) -> None:
+    with pytest.raises(BadDataError, match="not a list"):
+        Image.from_json(f'{{"format": "teds-image/1", "uuid": "{"00" * 10}", "blocks": {blocks}}}')
