@@ -595,6 +595,31 @@ def test_nodes_without_a_key_are_sampled_too(stationed: System, monkeypatch: pyt
     assert verdicts(system)["seals"][0] == "failed"
 
 
+def test_neighbours_without_a_key_are_sampled_however_far_another_row_is(
+    stationed: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sheet of whitelisted boards has UUIDs of one place, maker and hour; one board of another maker stands apart."""
+    monkeypatch.setattr(row_sample, "SAMPLED", 180)
+    monkeypatch.setattr(row_sample, "_RUN", 1)
+    forget_vaults()
+    maker = bytes.fromhex("8d4d9da65281f7")
+    with Station.open(stationed.home, ask=lambda prompt, confirm: PASSPHRASE) as station, station.transaction():
+        station.unlock()
+        for number in range(200):
+            station.pins.put(WhitelistEntry(maker + number.to_bytes(3), f"{number:064x}"))
+        for apart in (bytes(10), b"\xff" * 10):
+            station.pins.put(WhitelistEntry(apart, "ab" * 32))
+    system = replace(stationed, ask=lambda prompt, confirm: PASSPHRASE)
+    assert verdicts(system)["seals"] == ("ok", True)
+    changed_in(
+        stationed.home,
+        f"UPDATE whitelist SET fingerprint = 'ff' WHERE uuid BETWEEN x'{maker.hex()}000008' AND x'{maker.hex()}0000c0'",
+    )
+    assert (
+        verdicts(system)["seals"][0] == "failed"
+    )  # 45 starts, each among them one time in four: missed once in 400,000 runs
+
+
 def test_what_another_program_did_to_the_newest_is_always_found(crowded: System) -> None:
     changed_in(crowded.home, "UPDATE whitelist SET fingerprint = 'ff' WHERE uuid = (SELECT max(uuid) FROM whitelist)")
     changed_in(crowded.home, "UPDATE audit SET outcome = 'x' WHERE seq = (SELECT max(seq) - 1 FROM audit)")

@@ -1033,6 +1033,13 @@ PATTERNS = (
         "tests/ncap/test_supervisor.py",
     ),
     Pattern(
+        "neighbours without a key are sampled",
+        "_runs",
+        "number % 2 == 1",
+        "False",
+        "tests/doctor/test_doctor.py",
+    ),
+    Pattern(
         "a waiting child ends with its parent",
         "wait_for_master",
         "os.getppid() != parent",

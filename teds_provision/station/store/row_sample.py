@@ -2,7 +2,7 @@
 
 Nothing here counts or reads a whole large table. A row of a node with a key, or of a table with numbers, that another
 program changed is found with a probability of half of ``SAMPLED / n`` at least by each run; other rows as their keys
-are spread. A pin, a key or a CA is checked whenever it is used anyway.
+are spread, of a batch with neighbouring UUIDs as of others. A pin, a key or a CA is checked whenever it is used anyway.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import random
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from teds_provision.station.store.database import Database
@@ -18,7 +19,7 @@ SAMPLED: Final = 5_000
 """Rows at random of each large table; a table with no more rows is read whole."""
 ALL_ROWS: Final = "1"
 _NEWEST: Final = 500
-_RUN: Final = 50
+_RUN: Final = 20
 """Rows or entries of a log that are read in one go, from a random one on."""
 
 
@@ -98,48 +99,82 @@ class RowSample:
 def _runs(store: Database, table: str, key: Sequence[str], count: int, *, whole: bool = False) -> Iterator[Any]:
     """Yield so many rows in runs of neighbours that begin at random, and the last run: the key's first column of each.
 
-    A start is drawn between the first and the last value of each column of the key in turn, not among the rows, which
-    are not counted. So rows that are close together by their key are read as one run, or all left out.
+    No row is counted to draw a start. Half of them are drawn between the first and the last value of each column of
+    the key in turn, so that a row far from all others is reached. The other half are found by halving that range again
+    and again, so that rows close together are reached, however far another one is from them.
     """
     columns, what = ", ".join(key), "*" if whole else key[0]
     places = ", ".join("?" * len(key))
     after = f"SELECT {what} FROM {table} WHERE ({columns}) >= ({places}) ORDER BY {columns} LIMIT {_RUN}"
-    for _ in range(max(1, count // _RUN)):
-        yield from (row[0] for row in store.execute(after, _drawn(store, table, key)))
+    for number in range(max(2, count // _RUN)):
+        start = _drawn(store, table, key, by_halves=number % 2 == 1)
+        yield from (row[0] for row in store.execute(after, start))
     last = ", ".join(f"{column} DESC" for column in key)
     yield from (row[0] for row in store.execute(f"SELECT {what} FROM {table} ORDER BY {last} LIMIT {_RUN}"))
 
 
-def _drawn(store: Database, table: str, key: Sequence[str]) -> list[Any]:
+def _drawn(store: Database, table: str, key: Sequence[str], *, by_halves: bool) -> list[Any]:
     """Return the values of a key that is there, drawn column by column."""
     values: list[Any] = []
-    for column in key:
-        fixed = "".join(f"{name} = ? AND " for name in key[: len(values)])
-        ends = [
-            store.first_row(f"SELECT {column} FROM {table} WHERE {fixed}1 ORDER BY {column} {way} LIMIT 1", values)
-            for way in ("ASC", "DESC")
-        ]
-        first, last = (end[0] if end is not None else None for end in ends)
-        found = store.first_row(
-            f"SELECT {column} FROM {table} WHERE {fixed}{column} >= ? ORDER BY {column} LIMIT 1",
-            [*values, _between(first, last)],
-        )
-        values.append(found[0] if found is not None else last)
+    for name in key:
+        column = _Column(store, table, name, tuple(zip(key, values, strict=False)))
+        values.append(column.drawn_by_halves() if by_halves else column.drawn_by_value())
     return values
 
 
-def _between(first: Any, last: Any) -> Any:
-    """Return a random value from ``first`` to ``last``, in the order of SQLite: both integers, blobs or texts."""
+@dataclass(frozen=True)
+class _Column:
+    """A column of a key, in the rows that have certain values in the columns before it; there is one row at least."""
+
+    store: Database
+    table: str
+    name: str
+    before: tuple[tuple[str, Any], ...]
+
+    def drawn_by_value(self) -> Any:
+        """Return the first value that is there from a random one on."""
+        first, last = self._end("ASC"), self._end("DESC")
+        found = self._end("ASC", ">=", _between(first, last))
+        return found if found is not None else last
+
+    def drawn_by_halves(self) -> Any:
+        """Return a value that is there: the range is halved, and one half taken by chance, until one value is left."""
+        first, last = self._end("ASC"), self._end("DESC")
+        while first != last:
+            middle = _between(first, last, random_one=False)
+            if not first < middle <= last:  # a text that is no number
+                middle = last
+            lower = random.random() < 0.5
+            found = self._end("DESC", "<", middle) if lower else self._end("ASC", ">=", middle)
+            if found is None:  # in a damaged file alone
+                break
+            first, last = (first, found) if lower else (found, last)
+        return first
+
+    def _end(self, way: str, compared: str = "IS NOT", value: Any = None) -> Any:
+        """Return the first value in this order that compares so with ``value``, None if there is none."""
+        fixed = "".join(f"{name} = ? AND " for name, _ in self.before)
+        found = self.store.first_row(
+            f"SELECT {self.name} FROM {self.table} WHERE {fixed}{self.name} {compared} ?"
+            f" ORDER BY {self.name} {way} LIMIT 1",
+            [*(value for _, value in self.before), value],
+        )
+        return found[0] if found is not None else None
+
+
+def _between(first: Any, last: Any, *, random_one: bool = True) -> Any:
+    """Return a random value from ``first`` to ``last``, in SQLite's order, or the middle: integers, blobs or texts."""
     if isinstance(first, int):
-        return random.randint(first, last)
+        return random.randint(first, last) if random_one else (first + last + 1) // 2
     if isinstance(first, str):
         try:
-            return _between(bytes.fromhex(first), bytes.fromhex(last)).hex()  # of other characters none is a key
+            low, high = bytes.fromhex(first), bytes.fromhex(last)
         except ValueError:
-            return _between(first.encode(), last.encode()).decode(errors="ignore")
+            return _between(first.encode(), last.encode(), random_one=random_one).decode(errors="ignore")
+        return _between(low, high, random_one=random_one).hex()  # of other characters none is a key
     size = max(len(first), len(last))
-    low, high = int.from_bytes(first.ljust(size, b"\0")), int.from_bytes(last.ljust(size, b"\xff"))
-    return random.randint(low, high).to_bytes(size)
+    low_number, high_number = int.from_bytes(first.ljust(size, b"\0")), int.from_bytes(last.ljust(size, b"\xff"))
+    return int(_between(low_number, high_number, random_one=random_one)).to_bytes(size)
 
 
 def _listed(values: Iterable[bytes]) -> str:
