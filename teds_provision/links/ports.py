@@ -349,6 +349,22 @@ class Port(Protocol):
         """Release the reader or the bus; never raises."""
 
 
+ContactSink = Callable[[Contact], object]
+"""Takes a node that was found; it must not block."""
+
+
+@runtime_checkable
+class EarlyFinder(Protocol):
+    """A port that shows nodes while it still asks who else is there (CAN)."""
+
+    def find_all_early(self, *, seconds: float, notice: NoticeSink, listen: float, seen: ContactSink) -> list[Contact]:
+        """Return what ``Port.find_all`` returns; ``seen`` is called with each node as soon as it has answered.
+
+        It is called in the thread that asks, once for each address. Another node may still answer under the same UUID
+        or address: until this returns, the node may be read, and nothing may be changed.
+        """
+
+
 class LinkSpec(Protocol):
     """WHERE of a place ``LINK:WHERE``, read."""
 

@@ -24,6 +24,7 @@ from teds_provision.errors import (
     VaultLockedError,
 )
 from teds_provision.links import Contact, LinkSettings, Port, open_port
+from teds_provision.links.ports import EarlyFinder
 from teds_provision.one_core import one_core
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.provisioning.adoption import read_factory_datasheet
@@ -52,6 +53,7 @@ from teds_provision.provisioning.build import (
 )
 from teds_provision.provisioning.calibration_guard import merged
 from teds_provision.provisioning.conversation import Conversation, SessionLostError
+from teds_provision.provisioning.early_reading import EarlyReading
 from teds_provision.provisioning.identify import IdentifiedNode, examine
 from teds_provision.provisioning.meeting import (
     IdleStop,
@@ -150,6 +152,7 @@ class BatchRun:
         taps = self.progress is not None and not request.watch and not request.everyone
         self.stop = IdleStop(links.timeout if taps else None)  # what is on a bus is found once: no board is waited for
         self._all_done = False
+        self._early: EarlyReading | None = None
         self._turn = threading.Lock()
         self._rows: dict[bytes, SheetRow] = {}
         self._boards: list[BoardResult] = []
@@ -322,11 +325,18 @@ class BatchRun:
 
     def _all_at_once(self, operator: Operator) -> Iterator[BoardResult]:
         with one_core(), closing(open_port(self._links)) as port:
+            if isinstance(port, EarlyFinder):
+                self._early = EarlyReading(at_once=self._at_once(port))
             everyone, contacts = self._on_the_bus(port)
             yield from self._side_by_side(port, contacts, operator)
             if not self.stop.is_asked:
                 self._all_done = True
                 refuse_duplicate_uuids(everyone)  # the others are done, and what is not done is not passed over
+
+    def _at_once(self, port: Port) -> int:
+        """Return how many boards are worked on at a time: as many as the bus and the token bear."""
+        token = self._station.identity.keystore.startswith("pkcs11:")
+        return _TOKEN_WORKERS if token else port.capabilities.max_parallel
 
     def _on_the_bus(self, port: Port) -> tuple[list[Contact], list[Contact]]:
         """Return the nodes that answer, and those of them that are to be provisioned."""
@@ -335,20 +345,41 @@ class BatchRun:
                 "--all needs a bus: a reader sees one node at a time.",
                 hint="Use --watch to provision boards one tap after the other.",
             )
-        everyone = port.find_all(seconds=self._links.timeout, notice=self._reporter.notice, listen=self._links.listen)
+        everyone = self._find_all(port)
         found = drop_duplicate_uuids(everyone, self._reporter.notice)
         contacts = [contact for contact in found if self._is_meant(contact)]
         if not contacts:
             self._require_known(found)
         return everyone, contacts
 
+    def _find_all(self, port: Port) -> list[Contact]:
+        """Return every node of the bus; new ones that may be meant are read in plain while others are asked."""
+        seconds, notice, listen = self._links.timeout, self._reporter.notice, self._links.listen
+        early = self._early
+        if early is None or not isinstance(port, EarlyFinder):
+            return port.find_all(seconds=seconds, notice=notice, listen=listen)
+
+        def seen(contact: Contact) -> None:
+            if self._may_be_meant(contact):
+                early.add(contact)
+
+        try:
+            return port.find_all_early(seconds=seconds, notice=notice, listen=listen, seen=seen)
+        finally:
+            early.stop()
+
+    def _may_be_meant(self, contact: Contact) -> bool:
+        """Return True if it is on the whitelist, or may be in the sheet or the job."""
+        if self.line is not None:
+            return not self.line.only_verify
+        return self.progress is not None or self._station.pins.entry(contact.identity.uuid) is not None
+
     def _side_by_side(self, port: Port, contacts: list[Contact], operator: Operator) -> Iterator[BoardResult]:
         """Provision each of these nodes in a thread, as many at a time as the bus and the token bear.
 
         Once a person asks to stop, no further node is begun; those that are begun are finished and yielded.
         """
-        token = self._station.identity.keystore.startswith("pkcs11:")
-        workers = max(1, min(_TOKEN_WORKERS if token else port.capabilities.max_parallel, len(contacts)))
+        workers = max(1, min(self._at_once(port), len(contacts)))
         self.expected = len(contacts)
         work = ParallelWork(
             contacts, lambda contact: self._board(contact, port.place, operator), at_once=workers, name="node"
@@ -423,6 +454,7 @@ class BatchRun:
             with Conversation(contact, notice=reporter.notice) as node:
                 if self._was_finished_elsewhere(node):
                     return None
+                node.early = None if self._early is None else self._early.answers_of(contact)
                 done = self._provision(node, operator, reporter)
             error = self._lacks_calibration(uuid, done.image)
         except VaultLockedError:  # of the whole command, and of no board

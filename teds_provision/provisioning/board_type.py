@@ -241,7 +241,8 @@ def is_remembered(station: Station, uuid: bytes, wanted: str | None, *, factory:
 
 def shown_by(node: Conversation, channels: Collection[int]) -> dict[BlockId, bytes]:
     """Return the TransducerChannel TEDS that a board shows for these channels; in a session, or plainly."""
-    wanted = [block for block in list_blocks(node) if block[1] == AccessCode.CHANNEL and block[0] in channels]
+    listed = list_blocks(node) if node.sealed or node.early is None else node.early.listed
+    wanted = [block for block in listed if block[1] == AccessCode.CHANNEL and block[0] in channels]
     return {block: read_block(node, block) for block in wanted}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from types import TracebackType
 
@@ -24,6 +25,7 @@ from teds_provision.protocol.messages.frames import (
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.messages.tables import describe_answer, describe_request
 from teds_provision.protocol.session import StationSession
+from teds_provision.teds.image import BlockId
 
 _log = logging.getLogger(__name__)
 BUSY_PAUSE, BUSY_SECONDS = 0.25, 10.0
@@ -132,6 +134,23 @@ def came_under_key(error: BaseException) -> bool:
     return not isinstance(error, NodeRefusedError) or error.sealed
 
 
+@dataclass(frozen=True)
+class ShownKey:
+    """P(node) that a node shows in plain and proved a moment ago, its SIG102, and the Security TEDS with both."""
+
+    point: bytes
+    signature: bytes
+    security_teds: bytes
+
+
+@dataclass(frozen=True)
+class EarlyAnswers:
+    """What a new board showed in plain: its key, which it proved, and the TEDS that it lists."""
+
+    key: ShownKey
+    listed: tuple[BlockId, ...]
+
+
 class Conversation:
     """One node on one link. Commands go plain until :meth:`open` succeeded, sealed from then on."""
 
@@ -151,6 +170,8 @@ class Conversation:
         """c of the Open of this session, 8 octets; a change shows that the node has restarted."""
         self.reported_firmware: tuple[bytes | None, FirmwareReport | None] | None = None
         """Last answer to About, and the c of its session (None: plain); see provisioning/firmware.py."""
+        self.early: EarlyAnswers | None = None
+        """What it answered on this link a moment ago, and is not asked again; see provisioning/early_reading.py."""
         self._release: Callable[[], object] = _nothing
 
     def __enter__(self) -> Conversation:

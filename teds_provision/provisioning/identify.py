@@ -23,7 +23,7 @@ from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.keys import CHALLENGE_OCTETS, fingerprint, node_key_good, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import Identity, NodeState
-from teds_provision.provisioning.conversation import Conversation
+from teds_provision.provisioning.conversation import Conversation, ShownKey
 from teds_provision.provisioning.firmware import keep_firmware, read_firmware
 from teds_provision.provisioning.meeting import Arrival, meet_everyone, watch_nodes
 from teds_provision.provisioning.parallel import ParallelWork
@@ -58,6 +58,17 @@ class IdentifiedNode:
     def fingerprint(self) -> str:
         """Fingerprint of the node's key."""
         return fingerprint(self.point)
+
+
+def show_key(node: Conversation) -> ShownKey:
+    """Read the key that a node shows, and have the node prove it; raises NotAuthenticError, BadDataError, LinkError."""
+    octets = read_block(node, SECURITY)
+    shown = security.decode(octets)
+    point = shown.node_key
+    if not node_key_good(node.uuid, point, shown.node_key_signature):
+        raise NotAuthenticError(f"The key that the node presents is not signed for UUID {node.uuid.hex()} (field 102).")
+    prove(node, point)
+    return ShownKey(point, shown.node_key_signature, octets)
 
 
 def prove(node: Conversation, point: bytes) -> None:
@@ -148,16 +159,12 @@ def examine(station: Station, node: Conversation, *, recall: bool = False) -> Id
 
     ``recall``, for a caller that opens a session next: a node with a key held here, whose Security TEDS was read in a
     session before, proves the key that was read then, and its Security TEDS is not read. If it cannot, it is read.
+    What the node showed early is not asked for again.
     """
-    if recall and (who := _recalled(station, node)) is not None:
+    if node.early is None and recall and (who := _recalled(station, node)) is not None:
         return who
-    octets = read_block(node, SECURITY)
-    shown = security.decode(octets)
-    point = shown.node_key
-    if not node_key_good(node.uuid, point, shown.node_key_signature):
-        raise NotAuthenticError(f"The key that the node presents is not signed for UUID {node.uuid.hex()} (field 102).")
-    prove(node, point)
-    return _examined(station, node, point, shown.node_key_signature, octets)
+    shown = show_key(node) if node.early is None else node.early.key
+    return _examined(station, node, shown.point, shown.signature, shown.security_teds)
 
 
 def _recalled(station: Station, node: Conversation) -> IdentifiedNode | None:

@@ -28,6 +28,20 @@ PATTERNS = (
         "station.keys.held(node.uuid) and not self.rotate",
         "False",
     ),
+    Pattern(
+        "no board that has a key is read early",
+        "EarlyReading.add",
+        "contact.identity.state != NodeState.FACTORY",
+        "False",
+        "tests/provisioning/test_early_reading.py",
+    ),
+    Pattern(
+        "an early proof counts for a minute",
+        "EarlyReading.answers_of",
+        "time.monotonic() - look.at < _FRESH_SECONDS",
+        "True",
+        "tests/provisioning/test_early_reading.py",
+    ),
     Pattern("a takeover needs a word", "_agree", "word.require(station, node)", "None", "tests/handover/test_fleet.py"),
     Pattern(
         "restored: no bus without a word",

@@ -34,7 +34,7 @@ from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.link import CanLink, conflict
 from teds_provision.links.can.spec import LAST_NODE, CanSpec, parse_spec
 from teds_provision.links.discovery import SightingSink
-from teds_provision.links.ports import CAN, Capabilities, Contact, Notice, NoticeSink, Trace
+from teds_provision.links.ports import CAN, Capabilities, Contact, ContactSink, Notice, NoticeSink, Trace
 from teds_provision.links.streaming import DataListener, MeasuringLink, StreamPieces
 from teds_provision.protocol.announce import uuid_crc
 from teds_provision.protocol.messages.identity import Identity
@@ -53,6 +53,24 @@ _ROUND_SECONDS: Final = 1.0
 _BUSY_SECONDS: Final = 1.5
 """Seconds that a node may take for its answer when nodes are collected: a key agreement blocks a small one."""
 _REOPEN_SECONDS: Final = 1.0
+
+
+_Shown = Callable[[int, Identity], object]
+
+
+def _ignore(*_: object) -> None:
+    """Show nobody."""
+
+
+def _patience(left: float, known: int) -> float:
+    """Return the seconds of silence for which the answers to a question to everyone are waited for.
+
+    ``left`` are those until the listening may end. Where many are ``known`` a last question fits in: the first frame of
+    an answer may be lost, and a node may have started meanwhile.
+    """
+    if known >= _MANY and left > 2 * SILENCE_SECONDS:
+        left -= SILENCE_SECONDS
+    return max(SILENCE_SECONDS, min(_BUSY_SECONDS, left))
 
 
 def open_port(where: str, trace: Trace | None = None) -> CanPort:
@@ -246,10 +264,20 @@ class CanPort(MeasuringLink):
         each answer: a node may be busy with another station, or about to start. Raises NoNodeError after ``seconds``,
         AddressConflictError, LinkError.
         """
+        return self.find_all_early(seconds=seconds, notice=notice, listen=listen, seen=_ignore)
+
+    def find_all_early(self, *, seconds: float, notice: NoticeSink, listen: float, seen: ContactSink) -> list[Contact]:
+        """Return every node as :meth:`find_all`, and show each as soon as it has answered; see ``EarlyFinder``."""
         began = time.monotonic()
         until, enough = began + seconds, began + min(listen, seconds)
         notice(Notice("waiting", f"Asking every node on {self.spec.text}.", seconds))
         found, reported = FunctionalAnswers(), set[str]()
+        answered = set[int]()
+
+        def show(node: int, identity: Identity) -> None:
+            if node not in answered:
+                answered.add(node)
+                seen(self.contact(node, identity))
 
         def once(shown: Notice) -> None:
             if shown.text not in reported:
@@ -257,8 +285,8 @@ class CanPort(MeasuringLink):
                 notice(shown)
 
         while self.spec.node is None and (left := until - time.monotonic()) > 0:
-            silence = max(SILENCE_SECONDS, min(_BUSY_SECONDS, enough - time.monotonic()))
-            found = found.combined_with(self._everyone(min(LONGEST_SECONDS, left), once, silence))
+            silence = _patience(enough - time.monotonic(), len(found.identities))
+            found = self._everyone(found, min(LONGEST_SECONDS, left), once, silence, show)
             if found.conflicts:
                 raise conflict(min(found.conflicts))
             if found.identities and time.monotonic() >= enough:
@@ -273,16 +301,17 @@ class CanPort(MeasuringLink):
             )
         return [self.find(lambda _: True, seconds=seconds, notice=notice)]
 
-    def _everyone(self, longest: float, notice: NoticeSink, silence: float = SILENCE_SECONDS) -> FunctionalAnswers:
+    def _everyone(
+        self, known: FunctionalAnswers, longest: float, notice: NoticeSink, silence: float, show: _Shown
+    ) -> FunctionalAnswers:
+        """Ask everyone, of many until nobody new answers; return who is ``known`` with who answered."""
         began = time.monotonic()
-        found = self._asked_once(longest, silence)
-        for _ in range(_ROUNDS_OF_MANY - 1):
-            if len(found.identities) < _MANY or time.monotonic() - began >= longest:
-                break
-            more = self._asked_once(longest)
-            known = len(found.identities)
-            found = found.combined_with(more)
-            if len(found.identities) == known:
+        found = known
+        for number in range(_ROUNDS_OF_MANY):
+            before = len(found.identities)
+            found = found.combined_with(self._asked_once(longest, SILENCE_SECONDS if number else silence, show))
+            count = len(found.identities)
+            if count < _MANY or count == before or time.monotonic() - began >= longest:
                 break
         found = self.settled(found, began + LONGEST_SECONDS + _HELLO_SECONDS)
         if found.unfinished:
@@ -292,11 +321,15 @@ class CanPort(MeasuringLink):
         self.report_rivals(notice)
         return found
 
-    def _asked_once(self, longest: float, silence: float = SILENCE_SECONDS) -> FunctionalAnswers:
+    def _asked_once(
+        self, longest: float, silence: float = SILENCE_SECONDS, show: _Shown = _ignore
+    ) -> FunctionalAnswers:
         found = FunctionalAnswers()
         for news in ask_all(self.bus(), self.next_transaction(), silence=silence, longest=longest):
             if isinstance(news, FunctionalAnswers):
                 found = news
+            else:
+                show(*news)
         return found
 
     def settled(self, found: FunctionalAnswers, until: float) -> FunctionalAnswers:

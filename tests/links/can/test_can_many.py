@@ -14,9 +14,9 @@ import pytest
 from teds_provision.doctor import links as doctor
 from teds_provision.doctor.checks import System
 from teds_provision.errors import LinkClosedError, LinkError, NodeSilentError, UsageError
-from teds_provision.links import LINKS, LinkSettings, Notice, open_place, open_port
+from teds_provision.links import LINKS, Contact, LinkSettings, Notice, open_place, open_port
 from teds_provision.links.can.bus import Bus, Frame
-from teds_provision.links.can.port import CanPort
+from teds_provision.links.can.port import CanPort, _patience
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.protocol.messages.identity import Identity
 from tests.links.can.hub import Hub
@@ -96,6 +96,30 @@ def test_everyone_is_asked_while_exchanges_run(hub: Hub, nodes: Start) -> None:
     assert results[4] is True, results[4]
     assert all(isinstance(count, int) and count for count in results[:4]), results
     port.close()
+
+
+def test_each_node_is_shown_once_while_others_are_still_asked(hub: Hub, nodes: Start) -> None:
+    addresses = list(range(0x21, 0x2B))
+    nodes(hub.spec, *addresses)
+    with closing(CanPort(hub.spec)) as port:
+        shown: list[int | None] = []
+        talked: list[bool] = []
+
+        def seen(contact: Contact) -> None:
+            shown.append(contact.address)
+            port.bus().check()
+            asking = [one for one in port.bus()._asked if one.until > time.monotonic()]
+            talked.append(bool(asking))
+
+        found = port.find_all_early(seconds=PATIENCE, notice=quiet, listen=1.0, seen=seen)
+        assert sorted(shown, key=str) == sorted((contact.address for contact in found), key=str)
+        assert sorted(address or 0 for address in shown) == addresses
+        assert all(talked), "each while the question to everyone was open"
+
+
+def test_where_many_answer_the_listening_ends_with_a_last_question() -> None:
+    for left, known, seconds in [(3.0, 0, 1.5), (1.0, 3, 1.0), (1.0, 8, 0.7), (0.5, 200, 0.5), (0.1, 8, 0.3)]:
+        assert _patience(left, known) == pytest.approx(seconds)
 
 
 def test_a_question_is_given_up_when_the_node_announces_itself(hub: Hub, nodes: Start) -> None:
