@@ -163,6 +163,16 @@ def test_a_node_goes_there_and_back(pair: Pair) -> None:
         session(pair.south, pair.board)
 
 
+def test_a_copy_brings_no_moved_node_back(pair: Pair) -> None:
+    pair.take(pair.export("move")[0])
+    session(pair.south, pair.board)
+    copy = pair.folder / "copy.jwe"
+    export_bundle(pair.south, plan_export(pair.south, ExportOrder(("north",), None, "copy")), copy)
+    with pytest.raises(PolicyError, match="only that station can move it back"):
+        plan_import(pair.north, copy.read_bytes())
+    assert pair.north.policy.tombstone(pair.board.uuid) is not None
+
+
 @pytest.mark.parametrize("revoked", [True, False])
 def test_a_move_under_way_is_not_sealed_again_with_a_node_that_was_revoked_or_forgotten(
     pair: Pair, revoked: bool

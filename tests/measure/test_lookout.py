@@ -275,6 +275,11 @@ def test_a_mark_names_its_holder_and_shows_one_that_was_killed(tmp_path: Path) -
         UsageLock(place, command="measure"),
     ):
         pass
+    with UsageLock(place, command="set b", shared=True), UsageLock(place, command="set c", shared=True):
+        with UsageLock(place, command="set d", shared=True):
+            pass
+        with pytest.raises(UsageLockTakenError, match="set d"), UsageLock(place, command="measure"):
+            pass  # the first to leave takes no name away: it may be that of one who stays
     with UsageLock(place, command="measure") as free:
         assert not free.left_behind, "whoever leaves in order puts the mark away"
     place.write_text("{}")  # what a process leaves that was killed

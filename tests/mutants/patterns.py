@@ -1083,6 +1083,65 @@ PATTERNS = (
         "None",
         "tests/test_one_core.py",
     ),
+    # drawn by a reader of the source who had not read the tests
+    Pattern(
+        "the session that was silent longest makes room",
+        "Sessions._make_room",
+        "min(idle)",
+        "max(idle)",
+        "tests/protocol/operation/test_claims.py",
+    ),
+    Pattern("a reading that falls is unstable too", "SampleStatistics.is_unstable", "abs(self.drift)", "self.drift"),
+    Pattern(
+        "who leaves a shared mark takes no name away",
+        "UsageLock._release",
+        "self._shared",
+        "False",
+        "tests/measure/test_lookout.py",
+    ),
+    Pattern(
+        "the same version is no downgrade",
+        "_Look._look",
+        "version > self._order.image.version",
+        "version >= self._order.image.version",
+        "tests/provisioning/test_update.py",
+    ),
+    Pattern(
+        "an image that lost sequence or epoch is not confirmed",
+        "_Update._prove",
+        "(identity.state, identity.epoch, identity.sequence) != (was.state, was.epoch, was.sequence)",
+        "False",
+        "tests/provisioning/test_update.py",
+    ),
+    Pattern(
+        "the Security TEDS is written last",
+        "_stage",
+        "sorted(image, key=lambda block: block == SECURITY)",
+        "sorted(image)",
+        "tests/provisioning/test_exchanges.py",
+    ),
+    Pattern("unlock again ends the agent before", "start", "lock(home)", "None", "tests/vault/test_agent.py"),
+    Pattern(
+        "a copy brings no moved node back",
+        "_Judge._obstacle",
+        "self.sender != tombstone.to_fingerprint or self.mode != 'move'",
+        "self.sender != tombstone.to_fingerprint",
+        "tests/handover/test_move.py",
+    ),
+    Pattern(
+        "evidence of a lost station does not hold beside a roster",
+        "_gone",
+        "left.why != 'retired'",
+        "left.why == 'stolen'",
+        "tests/plant/test_jobs.py",
+    ),
+    Pattern(
+        "two boards at one address: neither was pressed",
+        "ButtonPressLog._is_clear",
+        "len(self._crcs[press.address]) > 1",
+        "False",
+        "tests/links/can/test_button_presses.py",
+    ),
 )
 
 _C_TESTS = "tests/firmware/test_c_tests.py"

@@ -504,6 +504,13 @@ def test_a_stolen_stations_evidence_does_not_hold_beside_a_roster(tmp_path: Path
     assert "its station has no role for working on boards" in faults()
     plant.change(owning.draft_removal(plant.north, "west", "stolen", 0))
     assert "its station was removed: stolen" in faults()
+    roster = plant.north.plant.roster
+    assert roster is not None
+    (west_left,) = roster.removed
+    for why, holds in (("lost", False), ("stolen", False), ("retired", True)):
+        left = replace(roster, removed=(replace(west_left, why=why),))
+        found = EvidenceAnchors(plant.north.identity.ca, roster=left).faults(document)
+        assert (f"its station was removed: {why}" not in found) == holds, "a file cannot show when it was signed"
     plant.close()
 
 

@@ -26,7 +26,8 @@ FIRST: Final = [
     "list",  # in plain: a board of another type is refused before it becomes ours
     *AGREED,
     "[list]",  # authentic, and so is all that follows
-    *["[write]"] * WRITTEN,
+    *["[write]"] * (WRITTEN - 1),
+    "[write 128]",  # the last one: a node that cannot rewind counts on it
     "[update]",
     *["[read]"] * (WRITTEN - 1),
     "[read 128]",
@@ -55,15 +56,16 @@ _NAMES: Final = {
     (128, 19): "operation",
     (128, 21): "about",
 }
+_BY_TEDS: Final = (TedsFunction.READ, TedsFunction.WRITE)
 
 
 def named(command: Command) -> str:
-    """Return the name of a command; Open, and Read of the Security TEDS, by their kind."""
+    """Return the name of a command; Open, and Read and Write of the Security TEDS, by their kind."""
     key = command.command_class, command.function
     if key == (128, Function.OPEN):
         return "open" if command.payload else "open c"
-    if key == (1, TedsFunction.READ) and command.payload[:1] == b"\x80":
-        return "read 128"
+    if command.command_class == 1 and key in _NAMES and command.payload[:1] == b"\x80":
+        return f"{_NAMES[key]} 128" if command.function in _BY_TEDS else _NAMES[key]
     return _NAMES.get(key, f"{command.command_class}.{command.function}")
 
 

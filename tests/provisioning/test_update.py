@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cbor2
 import pytest
@@ -121,6 +122,10 @@ def test_an_older_image_needs_a_word_and_the_counter_may_still_stop_it(bench: Up
     assert bench.runs == ("1.9.0", False, False)
 
 
+def test_another_image_of_the_same_version_is_none_to_go_back_to(bench: UpdateBench, owner: Owner) -> None:
+    assert bench.update(owner.image("1.0.0", counter=1, octets=700)).result == "updated"
+
+
 def test_another_owners_image_never_starts(bench: UpdateBench, owner: Owner) -> None:
     done = bench.update(owner.image("6.0.0", owner.rival, counter=9))
     assert (done.result, type(done.error)) == ("reverted", RevertedError)
@@ -199,6 +204,8 @@ def test_a_board_that_lost_power_on_trial_runs_its_old_image_and_takes_the_new_o
         ("datasheet", "shows another datasheet"),
         ("key", "cannot prove that it holds the key"),
         ("values", "gives a valid value"),
+        ("sequence", "lost key, epoch or sequence"),
+        ("epoch", "lost key, epoch or sequence"),
         ("confirms itself", "confirmed itself before it was proven"),
     ],
 )
@@ -217,6 +224,9 @@ def test_an_image_that_does_not_prove_itself_is_reverted(
         if sabotage == "datasheet":
             other = {**flash.blocks, SECURITY: flash.blocks[SECURITY][:-2] + b"xx"}
             node.tim._flash = replace(flash, blocks=other) if new else flash
+        elif sabotage in ("sequence", "epoch"):
+            less: dict[str, Any] = {sabotage: 0}
+            node.tim._flash = replace(flash, **less) if new else flash
         elif sabotage == "key":
             node.tim.key = SoftwareKey.generate() if new else key
         elif sabotage == "values":

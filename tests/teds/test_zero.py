@@ -47,6 +47,9 @@ def test_a_drift_shows_that_hides_in_the_spread() -> None:
     assert reading.drift == pytest.approx(0.516, abs=1e-3)
     assert reading.spread == pytest.approx(0.298, abs=1e-3)
     assert reading.is_unstable(0.4)
+    falls = reading_of(np.linspace(1, 0, 32))
+    assert falls.drift == pytest.approx(-0.516, abs=1e-3)
+    assert falls.is_unstable(0.4), "whichever way it moves"
 
 
 @given(st.floats(0, 360), st.floats(0, 3), st.integers(16, 64))

@@ -53,6 +53,14 @@ def process_of(home: Path) -> int:
         return int.from_bytes(line.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)[:4], "little")
 
 
+def lives(process: int) -> bool:
+    """Return True if a process runs: one that has ended and was not waited for has no command line."""
+    try:
+        return bool(Path("/proc", str(process), "cmdline").read_bytes())
+    except OSError:
+        return False
+
+
 def wait_until(holds: Callable[[], bool], seconds: float = 60) -> None:
     until = time.monotonic() + seconds
     while not holds():
@@ -163,6 +171,7 @@ def test_a_killed_one_is_none_and_is_replaced(home: Path) -> None:
     first = process_of(home)
     assert run(home, "unlock", "--for", "1h", passphrase=PASSPHRASE).code == 0
     assert process_of(home) != first
+    wait_until(lambda: not lives(first))  # nothing reaches it any more: lock would leave its secret where it is
     assert opens(home) == 0
     os.kill(process_of(home), signal.SIGTERM)
     wait_until(lambda: not (home / agent.SOCKET).exists())

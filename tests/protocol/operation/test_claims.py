@@ -211,6 +211,15 @@ def test_the_session_beyond_the_room_ends_the_silent_one_without_a_claim() -> No
     assert bench.plain(bench.sessions["can:f4"].seal(CLOCK), "can:f4").reason == Reason.WRONG_STATE
 
 
+def test_of_two_sessions_without_a_claim_the_one_that_was_silent_longest_ends() -> None:
+    bench = Bench(sessions=2).open("can:f1").open("can:f2")
+    for link in ("can:f1", "can:f2", "can:f1"):  # the first to begin is not the one that is silent longest
+        assert bench.later(1 * SECOND).send(CLOCK, link).ok
+    assert bench.open("can:f3").send(CLOCK, "can:f3").ok
+    assert bench.plain(bench.sessions["can:f2"].seal(CLOCK), "can:f2").reason == Reason.WRONG_STATE
+    assert bench.send(CLOCK, "can:f1").ok
+
+
 def test_half_open_sessions_beyond_the_room_replace_the_oldest() -> None:
     bench = Bench(sessions=2)
     for number in (1, 2, 3):
