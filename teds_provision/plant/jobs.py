@@ -132,13 +132,13 @@ def require_open(station: Station, job: Job, *, for_station: str | None = None) 
     A job whose end this station has seen stays over: it is recorded, as the clock may be put back. ``for_station``: its
     fingerprint, by default this one's.
     """
-    row = station.plant.line.job(job.id)
-    now = now_of(roster_of(station))
-    seen = station.plant.line.end_seen(job.id)
+    with station.reading():
+        state, seen = station.plant.line.state_of(job.id)
+        now = now_of(roster_of(station))
     if now >= job.ends and not seen:
         with station.durable("job"):
             station.plant.line.put_end_seen(job.id)
-    why = "it is closed here" if row is not None and row.state == CLOSED else None
+    why = "it is closed here" if state == CLOSED else None
     why = why or job.why_not(max(now, job.ends) if seen else now, for_station or station.identity.fingerprint)
     if why is not None:
         raise PolicyError(f"The job “{job.title}” cannot be worked on: {why}.", hint="Ask the keeper for a new job.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import threading
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -68,6 +69,9 @@ class LineRun:
     _digests: dict[bytes, str] = field(default_factory=dict)
     _common: dict[str | None, PreparedOrder] = field(default_factory=dict)
     _units_as_json: dict[bytes, dict[str, Any]] = field(default_factory=dict)
+    _given: int = 0
+    """How many units of the job were given here at least."""
+    _restored: bool = False
 
     def __post_init__(self) -> None:
         if self.job is None:
@@ -83,6 +87,8 @@ class LineRun:
         self.order_of_all = replace(_NO_CALIBRATION, profile=self.job.profile)
         if self.job.calibration.rule == "one" and not self.only_verify:
             self._common_calibration()
+        self._given = self.station.plant.line.count_units(self.job.id)[0]
+        self._restored = self.station.plant.restored
 
     @property
     def _own(self) -> str:
@@ -240,7 +246,10 @@ class LineRun:
     def allot_unit(
         self, node: Conversation, who: IdentifiedNode, prepared: PreparedOrder, entry: WhitelistEntry | None
     ) -> LineUnit:
-        """Take the board's unit, durably, or count a further attempt; raises PolicyError if none is left."""
+        """Have the board's unit taken by the run's next durable step, or a further attempt counted.
+
+        Raises PolicyError if none is left, as does that step if another process takes the last one meanwhile.
+        """
         job, begun = self.job, utc_now()
         held = entry if entry is not None else who.whitelisted
         assurance = "tap" if node.tapped else held.assurance if held is not None else "uuid"
@@ -259,26 +268,41 @@ class LineRun:
                 f" '{assurance}'.",
                 hint="Tap it on the NFC reader." if job.assurance == "tap" else "Connect it to a wired bus, or tap it.",
             )
-        with self.station.durable("job"):
-            row = self._row(job, who.uuid)
-            self.station.plant.line.put_unit(row)
-            self.station.audit("unit", who.uuid, "taken", job=job.id, unit=row.unit, attempt=row.attempts)
-        facts = {"job": job.id, "unit": row.unit, "of": job.total, "attempt": row.attempts}
-        with self._turn:
-            self._units_as_json[who.uuid] = facts
-        name = job.name_for(who.uuid, row.unit)
-        named = prepared if name is None else replace(prepared, order=replace(prepared.order, name=name))
-        return LineUnit(self, named, row, row.attempts, assurance, begun)
+        self._require_unit_left(job, who.uuid)
+        unit = LineUnit(self, prepared, None, 0, assurance, begun)
+        unit.wait_for(job, who.uuid)
+        return unit
 
-    def _row(self, job: Job, uuid: bytes) -> UnitRow:
-        """Return the unit of this board with one more attempt; called in the transaction that keeps it."""
+    def unit_kept(self, uuid: bytes, facts: dict[str, Any]) -> None:
+        """Take note of a unit that is on the disk now."""
+        with self._turn:
+            self._units_as_json[uuid] = facts
+
+    def _require_unit_left(self, job: Job, uuid: bytes) -> None:
+        """Raise PolicyError before anything is asked of a board that is known to get no unit.
+
+        Units are never taken back, so while there were enough when this was last looked at here, the transaction that
+        takes one is soon enough.
+        """
+        if self._given >= self._allotment(job) or self._restored:
+            self.next_row(job, uuid)
+
+    def _allotment(self, job: Job) -> int:
+        return job.stations[self._own] if job.count is not None else len(job.boards)
+
+    def next_row(self, job: Job, uuid: bytes) -> UnitRow:
+        """Return the unit of this board with one more attempt; raises PolicyError if none is left.
+
+        It counts in the transaction that keeps it.
+        """
         line = self.station.plant.line
         kept = line.unit(job.id, uuid)
         if kept is not None:
             return replace(kept, attempts=kept.attempts + 1)
         require_adopted(self.station)
         given, _, greatest = line.count_units(job.id)
-        allotment = job.stations[self._own] if job.count is not None else len(job.boards)
+        allotment = self._allotment(job)
+        self._given = max(self._given, given + 1)
         if given >= allotment:
             raise PolicyError(
                 f"All {allotment} units of the job “{job.title}” for this station are assigned: {uuid.hex()} is"
@@ -317,10 +341,8 @@ class LineRun:
 
     def note(self, uuid: bytes, unit: LineUnit, *, passed: bool) -> None:
         """Note the attempt at which the unit passed first; in the caller's transaction."""
-        row = None if self.only_verify else unit.row
-        kept = self.station.plant.line.unit(row.job, uuid) if row is not None else None
-        if kept is not None and passed and not kept.passed:
-            self.station.plant.line.put_unit(replace(kept, passed=unit.attempt))
+        if unit.row is not None and passed and not self.only_verify:
+            self.station.plant.line.put_passed(unit.row.job, uuid, unit.attempt)
 
     def calibration_digest(self, uuid: bytes) -> str | None:
         """Return the SHA-256 of the calibration file that a board got, None for none."""
@@ -378,11 +400,41 @@ class LineUnit:
     """One board of a run; see :class:`teds_provision.provisioning.provision.Unit`."""
 
     run: LineRun
-    prepared: PreparedOrder
+    _prepared: PreparedOrder
     row: UnitRow | None
     attempt: int
     assurance: str
     begun: str
+    _waits: bool = False
+    """True from when its unit is to be taken until it is on the disk."""
+
+    @property
+    def prepared(self) -> PreparedOrder:
+        """What the board gets; its name depends on the unit, which is on the disk then."""
+        if self._waits:
+            self.run.station.write_joining()
+        return self._prepared
+
+    def wait_for(self, job: Job, uuid: bytes) -> None:
+        """Have the run's next durable step take the unit; raises what that raises if there is no run."""
+        station, row = self.run.station, UnitRow(job.id, uuid, 0, "")
+
+        def take() -> None:
+            nonlocal row
+            row = self.run.next_row(job, uuid)
+            station.plant.line.put_unit(row)
+            station.audit("unit", uuid, "taken", job=job.id, unit=row.unit, attempt=row.attempts)
+
+        def taken() -> None:
+            name = job.name_for(uuid, row.unit)
+            if name is not None:
+                self._prepared = replace(self._prepared, order=replace(self._prepared.order, name=name))
+            self.row, self.attempt, self._waits = row, row.attempts, False
+            facts = {"job": job.id, "unit": row.unit, "of": job.total, "attempt": row.attempts}
+            self.run.unit_kept(uuid, facts)
+
+        self._waits = True
+        station.join_next_step(take, taken)
 
     def sign(
         self, node: Conversation, keys: SignedNodeKey, proposal: Proposal, present: NodeSnapshot
@@ -420,7 +472,7 @@ class LineUnit:
             steps = _step_facts(done.steps)
             if failure is not None:
                 steps = (*steps, ("verdict", failure.code, 0))
-            self._keep(node, done.who.uuid, teds, steps)
+            self._keep(node, done.who.uuid, teds, steps, done.image)
         else:
             with self.run.station.durable("job"):
                 self.run.note(done.who.uuid, self, passed=failure is None)
@@ -430,19 +482,30 @@ class LineUnit:
     def failed(
         self, node: Conversation, who: IdentifiedNode, steps: Sequence[StepResult], step: str, error: TedsProvisionError
     ) -> None:
-        """Record evidence of the failure, with the board's signature if it still answers."""
-        if self._wanted:
-            self._keep(node, who.uuid, who.security_teds, (*_step_facts(steps), (step, error.code, 0)))
+        """Record evidence of the failure, with the board's signature if it still answers; nothing without a unit."""
+        if not self._wanted:
+            return
+        with suppress(PolicyError):  # another process took the last unit
+            self.run.station.write_joining()
+        if not self._waits:
+            steps_so_far = (*_step_facts(steps), (step, error.code, 0))
+            last = self.run.station.datasheets.datasheet(who.uuid)
+            self._keep(node, who.uuid, who.security_teds, steps_so_far, last)
 
     @property
     def _wanted(self) -> bool:
         return self.run.job is None or self.run.job.evidence
 
-    def _keep(self, node: Conversation, uuid: bytes, teds: bytes, steps: tuple[tuple[str, str, int], ...]) -> None:
+    def _keep(
+        self, node: Conversation, uuid: bytes, teds: bytes, steps: tuple[tuple[str, str, int], ...], image: Image | None
+    ) -> None:
+        """Have the facts signed, and keep the evidence; ``image`` is what was read of the board last."""
         station, shown = self.run.station, security.decode(teds)
-        job, row = self.run.job, station.nodes.get(uuid)
         credentials = station.credentials(uuid)
-        certificates, origin = _named_in(station.datasheets.datasheet(uuid), shown)
+        certificates, origin = _named_in(image, shown)
+        with station.reading():
+            job, row = self.run.job, station.nodes.get(uuid)
+            heads = heads_digest(station) if station.plant.joined is not None else None
         facts = BoardFacts(
             station=fingerprint(credentials.key.point),
             job=job.id if job is not None else None,
@@ -458,7 +521,7 @@ class LineUnit:
             assurance=self.assurance,
             tool=TOOL,
             begun=self.begun,
-            heads=heads_digest(station) if station.plant.joined is not None else None,
+            heads=heads,
             certificates=certificates,
             origin=origin,
             firmware=_firmware_in_session(node),

@@ -132,8 +132,9 @@ def verify_only(station: Station, node: Conversation, line: ProductionLine, repo
 class Unit(Protocol):
     """One board of a line, from before its key is agreed on until it is done."""
 
-    prepared: PreparedOrder
-    """What it gets, including its name."""
+    @property
+    def prepared(self) -> PreparedOrder:
+        """What it gets, including its name; its unit is on the disk then. Raises PolicyError if none is left."""
 
     def sign(
         self, node: Conversation, keys: SignedNodeKey, proposal: Proposal, present: NodeSnapshot
@@ -183,9 +184,10 @@ class ProductionLine(Protocol):
     def allot_unit(
         self, node: Conversation, who: IdentifiedNode, prepared: PreparedOrder, entry: WhitelistEntry | None
     ) -> Unit:
-        """Take a unit for this board, durably, or find the one that it has; ``entry`` is a newcomer's.
+        """Have a unit taken for this board, or find the one that it has; ``entry`` is a newcomer's.
 
-        Raises PolicyError, and then no unit was taken.
+        It is on the disk with the agreed key, before the board has that. Raises PolicyError, and then no unit was
+        taken; the step that takes it raises it too if another process was given the last one meanwhile.
         """
 
 
@@ -284,8 +286,9 @@ class _Run:
         entry = self._whitelist(who)
         if self.line is not None:
             self.unit = self.line.allot_unit(self.node, who, prepared, entry)
-            prepared = self.unit.prepared
         self._agree(who, entry)
+        if self.unit is not None:
+            prepared = self.unit.prepared
         if self.onward is not None:
             self.onward(self.node)
         firmware = read_firmware(self.node)
@@ -462,7 +465,15 @@ class _Run:
 
     def _verify(self, who: IdentifiedNode, written: WriteResult) -> Verification:
         with self.steps.step("verify") as step:
-            verified = judge_and_keep(self.station, self.node, written.on_node, who.point, by="provision").verified
+            # of a line the evidence follows, which nothing but its own challenge to the board precedes
+            verified = judge_and_keep(
+                self.station,
+                self.node,
+                written.on_node,
+                who.point,
+                by="provision",
+                more_follows=self.unit is not None,
+            ).verified
             step.take_verdict(verified.verdict)
         return verified
 

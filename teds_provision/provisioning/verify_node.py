@@ -112,11 +112,13 @@ def judge_and_keep(
     why: str = "",
     by: str = "verify",
     c: bytes | None = None,
+    more_follows: bool = False,
 ) -> NodeVerdict:
     """Check what was read off a node, have it prove its key, and keep the reading. Raises only for the link.
 
     ``why``: why there is no session although a key is held; then nothing of the reading is kept. ``by`` is the command,
-    ``c`` that of the session in which the reading began.
+    ``c`` that of the session in which the reading began. ``more_follows``: in a run the reading reaches the disk in the
+    transaction of the next durable step.
     """
     identity = (node.proven or read_identity(node)) if node.sealed else None
     firmware = read_firmware(node) if node.sealed else None
@@ -133,15 +135,21 @@ def judge_and_keep(
         row, judged = readings.judge_reading(station, image, c, by=by, floor=floor, more=more)
 
     def record() -> None:
-        with station.durable("verify"):
-            readings.keep_judged(station, row, judged, image)
-            keep_firmware(station, image.uuid, firmware)
-            kept = station.datasheets.reading(image.uuid)
-            if identity is not None or (kept is not None and not kept.in_session):
-                station.nodes.remember(image.uuid, **_facts(image, identity))
-            station.audit("verify", image.uuid, judged.verified.verdict)
+        readings.keep_judged(station, row, judged, image)
+        keep_firmware(station, image.uuid, firmware)
+        kept = station.datasheets.reading(image.uuid)
+        if identity is not None or (kept is not None and not kept.in_session):
+            station.nodes.remember(image.uuid, **_facts(image, identity))
+        station.audit("verify", image.uuid, judged.verified.verdict)
 
-    station.run_in_background(record)  # a run prints its result when it is on the disk, and asks the hardware meanwhile
+    def record_durably() -> None:
+        with station.durable("verify"):
+            record()
+
+    if more_follows:
+        station.join_next_step(record)
+    else:  # a run prints its result when it is on the disk, and asks the hardware meanwhile
+        station.run_in_background(record_durably)
     return judged
 
 

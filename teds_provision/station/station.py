@@ -27,7 +27,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -76,12 +76,24 @@ else:
 __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", "not_initialised"]
 
 
+@dataclass(frozen=True)
+class _JoiningStep:
+    """Rows for the transaction of the next durable step, and who learns that they are kept."""
+
+    write: Callable[[], object]
+    kept: Callable[[], object]
+
+
 @dataclass
 class _DurableRun:
-    """A run of steps: who takes some in the background, and the number of its ``last`` commit not waited for."""
+    """A run of steps: who takes some in the background, and the number of its ``last`` commit not waited for.
+
+    ``joining``: what its next durable step writes as well.
+    """
 
     background: BackgroundWriter
     last: int = 0
+    joining: list[_JoiningStep] = field(default_factory=list)
 
 
 class Station:
@@ -363,11 +375,26 @@ class Station:
         :meth:`run` it may reach the disk together with the step after it. Only for data that was not promised to any
         party before: a loss of power in between is then as one an instant earlier.
         """
-        run: _DurableRun | None = getattr(self._runs, "now", None) if more_follows else None
-        with self.lock(command), self._store.transaction(later=run is not None):
-            if run is not None:
-                run.last = self._store.commits_not_waited_for + 1  # this one, when it is committed
-            yield
+        run: _DurableRun | None = getattr(self._runs, "now", None)
+        later = run is not None and more_follows
+        with self.lock(command):
+            joined: list[_JoiningStep] = []
+            try:
+                with self._store.transaction(later=later):
+                    if run is not None:
+                        if later:
+                            run.last = self._store.commits_not_waited_for + 1  # this one, when it is committed
+                        while run.joining:  # one that fails is dropped, and fails this step
+                            step = run.joining.pop(0)
+                            step.write()
+                            joined.append(step)
+                    yield
+            except BaseException:
+                if run is not None:  # undone with this step
+                    run.joining = [*joined, *run.joining]
+                raise
+            for step in joined:
+                step.kept()
 
     @contextmanager
     def run(self) -> Iterator[None]:
@@ -377,8 +404,11 @@ class Station:
             try:
                 yield
             finally:
-                self._runs.now = None
-                run.background.close()
+                try:
+                    self.write_joining()
+                finally:
+                    self._runs.now = None
+                    run.background.close()
         finally:
             self._store.flush(run.last)  # not what other threads have written since: they see to it themselves
 
@@ -402,6 +432,29 @@ class Station:
                 self._runs.now = None
 
         run.background.submit(taken)
+
+    def join_next_step(self, write: Callable[[], object], kept: Callable[[], object] = lambda: None) -> None:
+        """Have rows written in the transaction of the next durable step of this :meth:`run`; elsewhere at once.
+
+        It saves a commit for what no message before that step depends on, and what nothing before it reads. If that
+        step is undone they join the one after it; the run ends with them at the latest. An error that ``write`` raises
+        is that step's, and then it is not written. ``kept`` is called when the rows are. Not inside a durable step.
+        """
+        run: _DurableRun | None = getattr(self._runs, "now", None)
+        if run is not None:
+            self._store.drain()
+            run.joining.append(_JoiningStep(write, kept))
+            return
+        with self.durable("run"):
+            write()
+        kept()
+
+    def write_joining(self) -> None:
+        """Write now what waits for the next durable step of this thread's run."""
+        run: _DurableRun | None = getattr(self._runs, "now", None)
+        if run is not None and run.joining:
+            with self.durable("run"):
+                pass
 
     def flush(self) -> None:
         """Wait until all that this thread's run has written is on the disk; outside a run it is."""

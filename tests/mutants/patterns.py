@@ -439,6 +439,20 @@ PATTERNS = (
         "tests/plant/test_jobs.py",
     ),
     Pattern(
+        "a job's last unit is given once",
+        "LineUnit.wait_for.take",
+        "self.run.next_row(job, uuid)",
+        "UnitRow(job.id, uuid, self.run._given + 1, utc_now())",
+        "tests/plant/test_jobs.py",
+    ),
+    Pattern(
+        "what joined a step that was undone joins the next one",
+        "Station.durable",
+        "[*joined, *run.joining]",
+        "run.joining",
+        "tests/station/test_commits.py",
+    ),
+    Pattern(
         "a job's count is checked again", "_require_room", "given >= job.total", "False", "tests/plant/test_office.py"
     ),
     Pattern(

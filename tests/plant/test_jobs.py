@@ -6,7 +6,7 @@ import hashlib
 import json
 import uuid
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import Any, cast
@@ -32,6 +32,7 @@ from teds_provision.plant.line import LineRun, Scans
 from teds_provision.plant.sign_requests import send_job
 from teds_provision.plant.verify_evidence import EvidenceAnchors
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.protocol.messages.frames import SECURITY_CLASS, Function
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.job import CalibrationRule, Job, open_job, require_pattern, seal_job
@@ -119,6 +120,91 @@ def test_one_board_too_many_is_refused_and_stays_what_it_is(owner: Station) -> N
         build(line, third)
     assert third.state.state == NodeState.FACTORY
     assert len(units(line)) == 2
+
+
+@dataclass
+class _HookedLink(MemoryLink):
+    """Calls ``before`` with the function of each plain security command before it leaves."""
+
+    before: Callable[[int], None] = lambda function: None
+
+    def exchange(self, frame: bytes) -> bytes:
+        if frame[2] == SECURITY_CLASS:
+            self.before(frame[3])
+        return super().exchange(frame)
+
+
+def test_the_last_unit_goes_to_one_of_two_boards_that_are_worked_on_at_once(owner: Station) -> None:
+    """Another process takes it after this one has looked: then the board gets no key, no unit and no evidence."""
+    line, late = line_of(owner, count=1, stations={owner.identity.fingerprint: 1}), make_board(2)
+    assert line.job is not None
+    with Station.open(owner.home, ask=lambda prompt, confirm: PASSPHRASE) as other:
+        beside = LineRun(other, find_job(other, line.job.id))
+
+        def meanwhile(function: int) -> None:
+            if function == Function.REQUEST:
+                build(beside, make_board(1))
+
+        with pytest.raises(PolicyError, match="one too many"):
+            build(line, late, _HookedLink(late, before=meanwhile))
+    assert late.state.state == NodeState.FACTORY
+    assert not owner.keys.held(late.uuid)
+    assert [row.uuid for row in owner.plant.line.units(line.job.id)] == [make_board(1).uuid]
+    assert list(owner.plant.line.evidence(uuid=late.uuid)) == []
+    assert line.unit_to_json(late.uuid) == {}
+
+
+@pytest.mark.parametrize("evidence", [True, False])
+def test_a_board_that_falls_silent_before_it_has_a_key_has_its_unit_all_the_same(
+    owner: Station, evidence: bool
+) -> None:
+    """The attempt counts, and its evidence names the unit that the store has."""
+
+    def silent(function: int) -> None:
+        if function == Function.REQUEST:
+            raise NodeSilentError("It was pulled.")
+
+    line, board = line_of(owner, evidence=evidence), make_board(1)
+    with pytest.raises(NodeSilentError):
+        build(line, board, _HookedLink(board, before=silent))
+    assert units(line) == [(1, 1, 0)]
+    rows = list(owner.plant.line.evidence(uuid=board.uuid))
+    assert [(row.unit, row.attempt, row.verdict) for row in rows] == ([(1, 1, codec.FAILED)] if evidence else [])
+    assert line.unit_to_json(board.uuid)["unit"] == 1
+
+
+def test_a_unit_is_on_the_disk_with_the_key_and_the_verdict_with_the_evidence(owner: Station) -> None:
+    """Beside a job a board needs no commit more; its unit is durable before the board may keep the key."""
+    seen: list[str] = []
+    watch = owner._store._connection.set_trace_callback
+
+    def note(function: int) -> None:
+        seen.append(f"sent {function}")
+
+    def commits(line: LineRun | None, board: Board) -> list[list[str]]:
+        seen.clear()
+        watch(seen.append)
+        with talk(board, _HookedLink(board, before=note)) as node:
+            order = prepare(owner, BuildOrder(ANGLE)) if line is None else line.order
+            provision(owner, node, order, operator=AcceptingOperator(), reporter=SilentReporter(), line=line)
+        watch(None)
+        parts: list[list[str]] = [[]]
+        for statement in seen:
+            parts[-1].append(statement)
+            if statement == "COMMIT":
+                parts.append([])
+        return parts
+
+    line = line_of(owner)
+    line.order_of_all = BuildOrder(ANGLE)
+    without, within = commits(None, make_board(1)), commits(line, make_board(2))
+    assert len(within) == len(without)
+    (with_unit,) = (part for part in within if any(text.startswith("INSERT INTO units") for text in part))
+    assert any(text.startswith("INSERT INTO keys") for text in with_unit)
+    assert f"sent {int(Function.CONFIRM)}" in within[within.index(with_unit) + 1]
+    assert not any(text.startswith("PRAGMA synchronous=NORMAL") for text in with_unit), "it waits for the disk"
+    (with_evidence,) = (part for part in within if any("INTO evidence(" in text for text in part))
+    assert any("'verify'" in text for text in with_evidence if "INTO audit" in text)
 
 
 @pytest.mark.parametrize(

@@ -310,3 +310,71 @@ def test_what_is_done_behind_a_run_is_done_by_the_same_person(watched: Statement
     finally:
         ACTOR.reset(before)
     assert [entry.who for entry in watched.station.audit_log.entries()][-1] == "token lab"
+
+
+def test_what_joins_the_next_durable_step_is_written_with_it_and_kept_with_it(watched: StatementLog) -> None:
+    station, names = watched.station, ["left", "right"]
+    kept: list[str] = []
+
+    def join(name: str) -> None:
+        uuid = bytes([names.index(name)]) * 10
+        station.join_next_step(lambda: station.nodes.remember(uuid, name=name), lambda: kept.append(name))
+
+    def known() -> list[str | None]:
+        return [row.name for row in station.nodes.all()]
+
+    with station.run():
+        join("left")
+        join("right")
+        assert (known(), kept) == ([], [])
+
+        def undone() -> None:
+            with station.durable("agree"):
+                assert known() == names
+                raise StoreError("The step is undone, and they with it.")
+
+        with pytest.raises(StoreError, match="undone"):
+            undone()
+        assert (known(), kept) == ([], [])
+        watched.statements.clear()
+        with station.durable("agree"):
+            assert kept == []
+        assert (known(), kept) == (names, names)
+        assert watched.statements.count("COMMIT") == 1
+        with station.durable("agree"):
+            pass
+    assert kept == names
+
+
+def test_what_no_step_takes_is_written_at_the_end_of_a_run_however_it_ends(watched: StatementLog) -> None:
+    station = watched.station
+
+    def cut_short() -> None:
+        with station.run():
+            station.join_next_step(lambda: station.nodes.remember(bytes(10), name="left"))
+            raise LinkError("It was pulled.")
+
+    with pytest.raises(LinkError):
+        cut_short()
+    assert station.nodes.named("left") is not None
+    station.join_next_step(lambda: station.nodes.remember(bytes([1]) * 10, name="right"))
+    assert station.nodes.named("right") is not None, "outside a run at once"
+
+
+def test_an_error_of_what_joins_a_step_is_that_steps_and_it_is_not_tried_again(watched: StatementLog) -> None:
+    station, tries = watched.station, []
+
+    def full() -> None:
+        tries.append("a try")
+        raise StoreError("No unit is left.")
+
+    with station.run():
+        station.join_next_step(lambda: station.nodes.remember(bytes(10), name="left"))
+        station.join_next_step(full)
+        with pytest.raises(StoreError, match="No unit"), station.durable("agree"):
+            tries.append("the step itself")
+        assert station.nodes.named("left") is None
+        with station.durable("agree"):
+            pass
+    assert tries == ["a try"]
+    assert station.nodes.named("left") is not None

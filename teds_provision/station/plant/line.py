@@ -96,9 +96,13 @@ class Line:
         """Open or close a job."""
         self._store.execute("UPDATE jobs SET state = ? WHERE id = ?", (state, id))
 
-    def end_seen(self, id: str) -> bool:
-        """Return True if this station's clock was once past the end of the job."""
-        return self._store.first_row("SELECT 1 FROM meta WHERE name = ?", (f"job-over-{id}",)) is not None
+    def state_of(self, id: str) -> tuple[str | None, bool]:
+        """Return a job's state, None if it was not taken, and whether this station's clock was once past its end."""
+        state, seen = self._store.execute(
+            "SELECT (SELECT state FROM jobs WHERE id = ?), EXISTS(SELECT 1 FROM meta WHERE name = ?)",
+            (id, f"job-over-{id}"),
+        )[0]
+        return state, bool(seen)
 
     def put_end_seen(self, id: str) -> None:
         """Record that this station's clock was past the end of the job."""
@@ -126,6 +130,12 @@ class Line:
             f"INSERT INTO units({_UNIT}) VALUES(?, ?, ?, ?, ?, ?)"
             " ON CONFLICT(job, uuid) DO UPDATE SET attempts = excluded.attempts, passed = excluded.passed",
             (row.job, row.uuid, row.unit, row.at, row.attempts, row.passed),
+        )
+
+    def put_passed(self, job: str, uuid: bytes, attempt: int) -> None:
+        """Note the attempt at which a unit passed first; a unit that has passed stays as it is."""
+        self._store.execute(
+            "UPDATE units SET passed = ? WHERE job = ? AND uuid = ? AND passed = 0", (attempt, job, uuid)
         )
 
     # -- evidence --------------------------------------------------------------------------------------------------
