@@ -23,7 +23,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from functools import partial
 from pathlib import Path
 
 import teds_provision
@@ -117,7 +116,10 @@ def cost(files: Path, ca: Path, count: int = 60 * ROW) -> FileCost:
     """Return what a document costs; its four bare checks have their keys loaded."""
     anchors = EvidenceAnchors(from_pem(ca.read_bytes()))
     return cost_of_a_file(
-        sorted(files.iterdir())[:count], signed=_signed, ours=partial(judge_files, anchors), libraries=_libraries
+        sorted(files.iterdir())[:count],
+        signed=_signed,
+        ours=lambda row: judge_files(anchors, list(map(str, row))),
+        libraries=_libraries,
     )
 
 

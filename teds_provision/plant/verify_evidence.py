@@ -109,10 +109,15 @@ def _gone(roster: Roster, station: str, what: str) -> Iterator[str]:
 class JudgedEvidence:
     """Result of one file: its content and faults; ``exit_code`` of a command for it alone."""
 
-    path: Path
+    file: str
     evidence: Evidence | None = None
     faults: tuple[str, ...] = ()
     error: TedsProvisionError | None = None
+
+    @property
+    def path(self) -> Path:
+        """The file's path."""
+        return Path(self.file)
 
     @property
     def good(self) -> bool:
@@ -135,7 +140,7 @@ class JudgedEvidence:
 
     def to_json(self) -> dict[str, Any]:
         """Return the members of one line of the result."""
-        members: dict[str, Any] = {"file": str(self.path), "good": self.good, "faults": list(self.faults)}
+        members: dict[str, Any] = {"file": self.file, "good": self.good, "faults": list(self.faults)}
         if self.evidence is not None:
             facts = self.evidence.facts
             members |= {
@@ -213,7 +218,7 @@ class _Work:
 
     def judge(self, places: range) -> tuple[list[str], EvidenceTotals]:
         lines, totals = [], EvidenceTotals()
-        for judged in judge_files(self.grounds, [Path(self.files[place]) for place in places]):
+        for judged in judge_files(self.grounds, [self.files[place] for place in places]):
             totals.add(judged)
             lines.append(self.format_row(judged))
         return lines, totals
@@ -221,24 +226,24 @@ class _Work:
 
 def judge_file(grounds: EvidenceAnchors, path: Path) -> JudgedEvidence:
     """Judge one file; whatever is wrong with it is in what is returned."""
-    return judge_files(grounds, [path])[0]
+    return judge_files(grounds, [str(path)])[0]
 
 
-def judge_files(grounds: EvidenceAnchors, paths: Sequence[Path]) -> list[JudgedEvidence]:
+def judge_files(grounds: EvidenceAnchors, files: Sequence[str]) -> list[JudgedEvidence]:
     """Judge some files: all are read, then all signatures are checked in a row."""
-    read = [_read(path) for path in paths]
+    read = [_read(file) for file in files]
     checked = [codec.check_signatures(event) if isinstance(event, CheckedEvidence) else None for event in read]
     found = []
-    for path, judged, signatures in zip(paths, read, checked, strict=True):
+    for file, judged, signatures in zip(files, read, checked, strict=True):
         if isinstance(judged, CheckedEvidence) and signatures is not None:
-            found.append(JudgedEvidence(path, judged.evidence, tuple(grounds.faults_of(judged, signatures))))
+            found.append(JudgedEvidence(file, judged.evidence, tuple(grounds.faults_of(judged, signatures))))
         elif isinstance(judged, TedsProvisionError):
-            found.append(JudgedEvidence(path, error=judged))
+            found.append(JudgedEvidence(file, error=judged))
     return found
 
 
-def _read(path: Path) -> CheckedEvidence | TedsProvisionError:
+def _read(file: str) -> CheckedEvidence | TedsProvisionError:
     try:
-        return codec.ready(codec.read(read_limited(path, codec.MAX_OCTETS, "evidence", failure=BadDataError)))
+        return codec.ready(codec.read(read_limited(file, codec.MAX_OCTETS, "evidence", failure=BadDataError)))
     except TedsProvisionError as error:
         return error

@@ -129,6 +129,60 @@ def test_what_its_own_station_signs_again_is_reported(
     assert any(why in fault for fault in faults(station, anew))
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda s: s["subject"].append(s["subject"][0]),
+        lambda s: s["subject"].clear(),
+        lambda s: s["subject"][0].update(note=1),
+        lambda s: s["subject"][0].pop("name"),
+        lambda s: s["subject"][0].update(name=5),
+        lambda s: s["subject"][0].update(name="8d4d9da65281f7000000"),
+        lambda s: s["subject"][0]["digest"].update(sha512="0" * 128),
+        lambda s: s["subject"][0]["digest"].update(sha256="A" * 64),
+        lambda s: s["subject"][0].update(digest=["sha256"]),
+        lambda s: s.update(subject={"name": "teds:8d4d9da65281f7000000"}),
+    ],
+)
+def test_a_statement_has_one_subject_in_one_form(
+    station: Station, document: bytes, change: Callable[[dict[str, Any]], object]
+) -> None:
+    key = station.credentials(codec.read(document).uuid).key
+    with pytest.raises(BadDataError, match="subject"):
+        codec.read(signed_anew(document, key, change))
+
+
+@pytest.mark.parametrize(
+    "time", ["2026-02-31T11:31:00Z", "2026-03-01T24:31:00Z", "2026-03-01T11:31:00", "٢026-03-01T11:31:00Z"]
+)
+def test_a_time_that_is_none_is_refused(station: Station, document: bytes, time: str) -> None:
+    key = station.credentials(codec.read(document).uuid).key
+    for where in (lambda s: s["predicate"].update(finished=time), lambda s: s["predicate"]["facts"].update(begun=time)):
+        with pytest.raises(BadDataError, match="time"):
+            codec.read(signed_anew(document, key, where))
+
+
+@pytest.mark.parametrize(
+    ("job", "holds"),
+    [
+        ("0b5f1c52-7d0e-4a3b-9c1d-5e6f7a8b9c0d", True),
+        ("0B5F1C52-7D0E-4A3B-9C1D-5E6F7A8B9C0D", True),
+        ("0b5f1c52-7d0e-1a3b-9c1d-5e6f7a8b9c0d", False),
+        ("0b5f1c52-7d0e-4a3b-cc1d-5e6f7a8b9c0d", False),
+        ("0b5f1c527d0e4a3b9c1d5e6f7a8b9c0d", False),
+        ("{0b5f1c52-7d0e-4a3b-9c1d-5e6f7a8b9c0d}", False),
+    ],
+)
+def test_a_job_is_a_random_uuid_in_its_one_spelling(station: Station, document: bytes, job: str, holds: bool) -> None:
+    key = station.credentials(codec.read(document).uuid).key
+    anew = signed_anew(document, key, lambda s: s["predicate"]["facts"].update(job=job))
+    if holds:
+        assert codec.read(anew).facts.job == job.lower()
+        return
+    with pytest.raises(BadDataError, match="UUIDv4"):
+        codec.read(anew)
+
+
 def test_a_certified_station_cannot_pass_anothers_evidence_off_as_its_own(station: Station, document: bytes) -> None:
     other = SoftwareKey(11)
     certificate = station.identity.certify(other.point)

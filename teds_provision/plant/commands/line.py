@@ -566,7 +566,7 @@ def verify(app: App, files: tuple[str, ...], ca: Path, pins: Path | None, roster
 
 def _line(judged: JudgedEvidence) -> str:
     found = judged.evidence
-    text = f"{judged.word:<13}  {found.uuid.hex() if found else '-':<20}  {judged.path}"
+    text = f"{judged.word:<13}  {found.uuid.hex() if found else '-':<20}  {judged.file}"
     why = judged.error.message if judged.error is not None else "; ".join(judged.faults)
     if judged.good and found is not None and found.facts.failure is not None:
         why = f"the attempt ended with {found.facts.failure}"

@@ -286,6 +286,7 @@ _EXACT = strict_decoder(fractions=False)
 LAST_U32 = 0xFFFFFFFF
 _MAX_TEXT = 1024
 _UUID = re.compile(r"[0-9A-Fa-f]{20}")
+_RANDOM_ID = re.compile(r"[0-9a-f]{8}-[0-9a-f]{4}-4[0-9a-f]{3}-[89ab][0-9a-f]{3}-[0-9a-f]{12}")
 _SHA256 = re.compile(r"[0-9A-Fa-f]{64}")
 # RFC 3339 section 5.6.
 _TIME = re.compile(r"\d{4}-\d\d-\d\d[Tt]\d\d:\d\d:\d\d(\.\d{1,6})?([Zz]|[+-]\d\d:\d\d)")
@@ -356,6 +357,8 @@ class Members:
     def random_id(self, name: str) -> str:
         """Return a UUIDv4 (RFC 9562) in its canonical spelling."""
         value = self.get(name)
+        if isinstance(value, str) and _RANDOM_ID.fullmatch(value):
+            return value
         try:
             read = UUID(value) if isinstance(value, str) else None
         except ValueError:
