@@ -18,7 +18,7 @@ def main() -> None:
 
         output = stdout.guard()
         code = command_line.run(sys.argv[1:])
-        sys.exit(stdout.ended(code, output, as_json=command_line.wants_json(sys.argv[1:])))
+        sys.exit(stdout.ended(code, output, must_print=lambda: command_line.must_print(sys.argv[1:])))
     except ModuleNotFoundError as error:  # click: without it there is no command line that could report it
         cure = f"Install it: {sys.executable} -m pip install {error.name}"
         print(f"Error: The installation is incomplete: {error.name} missing.\n  → {cure}", file=sys.stderr)

@@ -8,7 +8,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
 
 import click
 
@@ -48,6 +48,29 @@ _OF_A_FILE: Final = (2, 3, 7, 8)
 _NO_NAMES: Final = frozenset({errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR})
 """Error numbers for names that the system rejects, wherever they are first used."""
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF})
+_SHOWING: Final = frozenset(
+    [
+        "check",
+        "completion",
+        "describe",
+        "doctor",
+        "history",
+        "identify",
+        "info",
+        "label",
+        "list",
+        "log",
+        "nodes",
+        "path",
+        "read",
+        "sample",
+        "show",
+        "sql",
+        "status",
+        "verify",
+    ]
+)
+"""Last words of the names of commands that are called for their output alone."""
 COMPLETE = "_TEDS_PROVISION_COMPLETE"
 _WIDEST, _NARROWEST = 100, 50
 
@@ -235,7 +258,7 @@ def run(arguments: list[str]) -> int:
         hint = f"{kind} {error.hint}".rstrip() if kind and named not in error.message else error.hint
         return _fail(arguments, error.exit_code, error.code, error.message, hint)
     except OSError as error:
-        return _bad_file_name(arguments, error)
+        return _system_error(arguments, error)
     except Exception as error:  # noqa: BLE001 - the last line of defence: a foreign exception is a bug of ours
         return _bug(arguments, error)
     finally:
@@ -272,8 +295,8 @@ def _misused(arguments: list[str], error: click.ClickException) -> int:
     return _fail(arguments, 2, "usage", text, hint)
 
 
-def _bad_file_name(arguments: list[str], error: OSError) -> int:
-    """Handle lost output: the reader has gone, or the disk is full; the work was done before."""
+def _system_error(arguments: list[str], error: OSError) -> int:
+    """Handle what the system refused: the reader of stdout has gone, a file's name is invalid, the disk is full."""
     if isinstance(error, BrokenPipeError):
         discard_output(sys.stdout)
         return BROKEN_PIPE
@@ -286,10 +309,7 @@ def _bad_file_name(arguments: list[str], error: OSError) -> int:
         return _bug(arguments, error)
     discard_output(sys.stdout)  # a table that was being printed; what reads a store or a file has errors of its own
     text = f"Cannot write the result to stdout: {error.strerror}."
-    if _wants(arguments, "--json"):
-        return _fail(arguments, StoreError.exit_code, StoreError.code, text, "")
-    _print_message(text)
-    return 0
+    return _fail(arguments, StoreError.exit_code, StoreError.code, text, "")
 
 
 def _bug(arguments: list[str], error: Exception) -> int:
@@ -301,9 +321,33 @@ def _bug(arguments: list[str], error: Exception) -> int:
     return _fail(arguments, 1, "bug", f"Unexpected {type(error).__name__}.", hint)
 
 
-def wants_json(arguments: list[str]) -> bool:
-    """Return True if a run of these arguments prints its result as JSON."""
-    return _wants(arguments, "--json")
+def must_print(arguments: list[str]) -> bool:
+    """Return True if a run of these arguments has failed once its output is lost.
+
+    So it is with JSON, which a program reads, and with a command that only shows what is there. Any other has done its
+    work all the same.
+    """
+    if _wants(arguments, "--json"):
+        return True
+    name = _command_name(arguments)
+    return not name or (name in _SHOWING and "--output" not in arguments)
+
+
+def _command_name(arguments: list[str]) -> str:
+    """Return the last word of the command's name, "" without one: ``list`` of ``whitelist list``."""
+    context, group, name = click.Context(cli), cast("click.Group", cli), ""
+    words = in_front(arguments, lambda word: cli.get_command(context, word))
+    at = _command_at(words)
+    for word in words[at:] if at is not None else ():
+        if word.startswith("-"):
+            continue
+        found = group.get_command(context, word)
+        if found is not None:
+            name = word
+        if not isinstance(found, click.Group):
+            break
+        group = found
+    return name
 
 
 def _wants(arguments: list[str], option: str) -> bool:

@@ -11,6 +11,7 @@ import io
 import os
 import re
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final
 
@@ -80,10 +81,10 @@ def guard() -> GuardedOutput | None:
     return output
 
 
-def ended(code: int, output: GuardedOutput | None, *, as_json: bool) -> int:
+def ended(code: int, output: GuardedOutput | None, *, must_print: Callable[[], bool]) -> int:
     """Write out what is left and return the exit code: ``code``, or 141 for a broken pipe.
 
-    If the one JSON object was lost, and all else went well, 7: a reader must not take silence for a result.
+    If output was lost, and all else went well, 7 for what ``must_print``: a reader must not take silence for a result.
     """
     try:
         sys.stdout.flush()
@@ -100,7 +101,7 @@ def ended(code: int, output: GuardedOutput | None, *, as_json: bool) -> int:
             file=sys.stderr,
             flush=True,
         )
-    return _NOT_PRINTED if as_json and code == 0 else code
+    return _NOT_PRINTED if code == 0 and must_print() else code
 
 
 def silence() -> None:

@@ -60,6 +60,27 @@ def test_json_that_a_full_disk_does_not_take_is_7_after_the_work(home: Path, run
     assert shell(f"{run} --json nodes 1234 >/dev/full").returncode == 3
 
 
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        ("nodes", 7),
+        ("--quiet whitelist list", 7),
+        ("whitelist --quiet list", 7),
+        ("log", 7),
+        ("--help", 7),
+        ("", 7),
+        (f"whitelist remove {UUID.hex()} --yes", 0),
+        ("nodes 1234", 3),
+    ],
+)
+def test_a_list_that_a_full_disk_does_not_take_is_7(home: Path, run: str, words: str, code: int) -> None:
+    """What was called for its output alone has done nothing: a file that was cut short is no list."""
+    assert call(home, "whitelist", "add", UUID.hex()).code == 0
+    done = shell(f"{run} {words} >/dev/full")
+    assert done.returncode == code, done.stderr
+    assert ("could not be written to stdout: No space left" in done.stderr) == (code != 3)
+
+
 @pytest.mark.parametrize("option", ["", "--json"])
 def test_a_broken_pipe_ends_quietly_with_141_after_the_work(home: Path, run: str, option: str) -> None:
     done = shell(f"set -o pipefail; (sleep 0.2; {run} {option} whitelist add {UUID.hex()}; echo $? >&2) | :")

@@ -1068,6 +1068,13 @@ PATTERNS = (
         "tests/doctor/test_doctor.py",
     ),
     Pattern(
+        "a list that was cut short is a failure",
+        "must_print",
+        "name in _SHOWING and '--output' not in arguments",
+        "False",
+        "tests/cli/test_stdout.py",
+    ),
+    Pattern(
         "a waiting child ends with its parent",
         "wait_for_master",
         "os.getppid() != parent",
