@@ -43,9 +43,9 @@ from teds_provision.sanitize import printable
 from teds_provision.shapes.verdict import Verification
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import Draft, NodeRecord
+from teds_provision.teds import calibration as calibrating
 from teds_provision.teds import guard as guarding
 from teds_provision.teds.calibration import Calibration
-from teds_provision.teds.calibration.files import load_calibrations
 from teds_provision.teds.certificate import CertificateChoice, CertificateReference, ChooseItem
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.access_code import AccessCode
@@ -429,7 +429,7 @@ def _from_file(order: BuildOrder, profile: Profile) -> Mapping[int, Calibration]
         return None
     pems = tuple(read_limited(path, _MOST_PEM, "certificate") for path in order.trusted)
     choice = CertificateChoice(order.channel, order.item, pems, order.choose)
-    return load_calibrations(order.calibration, profile, choice, due=order.due)
+    return calibrating.load_calibrations(order.calibration, profile, choice, due=order.due)
 
 
 def _built_of(

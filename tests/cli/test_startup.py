@@ -60,6 +60,13 @@ def test_the_version_loads_nothing_of_the_command_line() -> None:
     }
 
 
+def test_provisioning_loads_the_readers_of_calibration_files_only_for_a_file() -> None:
+    code = "import sys, teds_provision.provisioning.provision\nprint(*sys.modules)"
+    assert {f"teds_provision.teds.calibration.{name}" for name in ("files", "order")} & set(
+        python(code).out.split()
+    ) == set()
+
+
 @pytest.mark.parametrize("columns", ["0", "20", "60", "80", "97", "300", "many"])
 def test_help_is_as_wide_as_click_makes_it(columns: str) -> None:
     """The sections and the width are written without click's own wrapping: both must come to the same text."""
