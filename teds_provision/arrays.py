@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from teds_provision.lazy import late
 
-__all__ = ["Ends", "Floats", "NDArray", "Octets", "np"]
+__all__ = ["Ends", "Floats", "NDArray", "Octets", "np", "without_repeats"]
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,3 +21,9 @@ if TYPE_CHECKING:
 else:
     np = late("numpy")
     NDArray = Floats = Ends = Octets = object  # for annotations alone, which nothing evaluates
+
+
+def without_repeats(values: Floats) -> Floats:
+    """Return numbers in ascending order, each once: numpy.unique without what that loads (numpy.ma, 40 ms of CPU)."""
+    ordered = np.sort(values)
+    return ordered[np.append(True, ordered[1:] != ordered[:-1])] if ordered.size else ordered

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
-from teds_provision.arrays import NDArray, np
+from teds_provision.arrays import NDArray, np, without_repeats
 from teds_provision.teds.calibration.formula import evaluate
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import Range
@@ -225,4 +225,4 @@ def _spread(boundaries: tuple[float, ...], low: float, high: float, count: int, 
     if 2 < count < SAMPLES and len(edges) > count:
         below, at = below[:: len(edges) // count + 1], at[:: len(edges) // count + 1]
     samples = np.concatenate([spread, below, at])
-    return np.unique(samples[(samples >= low) & (samples <= high)])
+    return without_repeats(samples[(samples >= low) & (samples <= high)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import http.client
 import json
 import signal
@@ -11,7 +12,7 @@ from datetime import datetime
 from typing import Any
 from urllib.parse import urlsplit
 
-import jsonschema
+import jsonschema_rs
 
 from teds_provision import client
 from teds_provision.api.operations import document
@@ -61,13 +62,18 @@ def described(method: str, path: str, status: int, kind: str, octets: bytes) -> 
     answers = DOCUMENT["paths"][template][method.lower()]["responses"]
     assert str(status) in answers, f"{method} {path} answers {status}, which nobody described"
     ANSWERED.add((method, template, status))
-    if not kind.startswith("application/json"):
-        return
-    answer = answers[str(status)]
+    if kind.startswith("application/json"):
+        _validator(method.lower(), template, str(status)).validate(json.loads(octets))
+
+
+@functools.cache
+def _validator(method: str, template: str, status: str) -> jsonschema_rs.Draft202012Validator:
+    """Return what checks the JSON of an answer."""
+    answer = DOCUMENT["paths"][template][method]["responses"][status]
     if "$ref" in answer:
         answer = DOCUMENT["components"]["responses"][answer["$ref"].rpartition("/")[2]]
     schema = answer["content"]["application/json"]["schema"]
-    jsonschema.Draft202012Validator({**schema, "components": DOCUMENT["components"]}).validate(json.loads(octets))
+    return jsonschema_rs.Draft202012Validator({**schema, "components": DOCUMENT["components"]})
 
 
 def _matches(template: str, path: str) -> bool:

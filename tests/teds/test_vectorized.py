@@ -10,11 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from teds_provision.arrays import without_repeats
 from teds_provision.teds import Sheet
 from teds_provision.teds.calibration import ChannelInterpreter, fit, vectorized
 from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.calibration.vectorized import ManyChannels
 from teds_provision.teds.units import parse_unit
+from tests.cli.shell import python
 from tests.teds.test_interpreter import sheet_of, turned
 
 CURVES = {
@@ -155,3 +157,23 @@ def test_channels_of_other_forms_stay_alone() -> None:
     assert ManyChannels.side_by_side([ChannelInterpreter(wider, number) for number in (1, 2)], [True, True]) is None
     floats = replace(known, channels=(replace(first, sample=SampleForm(1, 4), calibration=None), *rest))
     assert ManyChannels.side_by_side([ChannelInterpreter(floats, 1)], [True]) is None
+
+
+@given(st.lists(st.floats(allow_nan=False) | st.sampled_from([0.0, 1.0, 2.5]), max_size=12))
+def test_numbers_are_ordered_and_each_stands_once(numbers: list[float]) -> None:
+    assert list(without_repeats(np.array(numbers))) == sorted(set(numbers))
+
+
+def test_a_curve_and_its_inverse_load_no_masked_arrays() -> None:
+    """``numpy.unique`` loads them: 40 ms of CPU in the middle of a provisioning."""
+    code = """
+import sys
+from teds_provision.teds.calibration import fit
+from teds_provision.teds.calibration.formula import PreparedCurve, PreparedInverse
+from teds_provision.teds.curve import _spread
+calibration = fit([(0, 0.0), (100, 5.0), (200, 20.0)], "table", channel=1)
+PreparedInverse(PreparedCurve(calibration), 0.0, 200.0)
+assert len(_spread((0.0, 200.0), 0.0, 200.0, 50, True))
+print("numpy" in sys.modules, "numpy.ma" in sys.modules)
+"""
+    assert python(code).out == "True False\n"

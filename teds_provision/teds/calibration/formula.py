@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Final, Generic, TypeVar, overload
 
-from teds_provision.arrays import Floats, NDArray, np
+from teds_provision.arrays import Floats, NDArray, np, without_repeats
 from teds_provision.errors import BadDataError
 from teds_provision.sanitize import counted
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput, Method
@@ -107,7 +107,7 @@ class PreparedInverse:
     def _single_direction(self) -> int:
         part = self._curve.calibration.inputs[0]
         samples = np.concatenate([np.linspace(self._low, self._high, _SAMPLES), np.asarray(part.boundaries)])
-        samples = np.unique(samples[(samples >= self._low) & (samples <= self._high)])
+        samples = without_repeats(samples[(samples >= self._low) & (samples <= self._high)])
         results = self._curve(samples)
         steps = np.diff(results)
         slack = 8 * 2.0**-23 * float(np.abs(results).max(initial=0.0))
