@@ -64,6 +64,14 @@ def test_config_show_names_values_and_where_they_come_from(home: Path, monkeypat
     assert call(home, "--json", "config", "path").json == {"path": str(home / "config.toml"), "exists": True}
 
 
+def test_a_commands_own_table_goes_before_its_groups_and_that_before_what_stands_outside_of_tables() -> None:
+    zero = {"timeout": 7}
+    defaults = Defaults({"timeout": 40, "provision": {"timeout": 5}, "calibrate": {"timeout": 6, "zero": zero}})
+    assert [defaults.get(command)["timeout"] for command in ("verify", "provision")] == [40, 5]
+    calibrate = defaults.get("calibrate")
+    assert [calibrate.get(command)["timeout"] for command in ("capture", "zero")] == [6, 7]
+
+
 def test_a_bad_value_is_named_before_it_hurts(home: Path) -> None:
     (home / "config.toml").write_text('[provision]\ntimeout = "soon"\n')
     done = call(home, "--json", "config", "show")

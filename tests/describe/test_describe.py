@@ -24,6 +24,7 @@ from teds_provision.provisioning.operator import AcceptingOperator
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.provision import provision
 from teds_provision.station.station import Station
+from teds_provision.teds.channel import Timing
 from teds_provision.teds.profile.load import shipped_profiles
 from tests.bench import Board, talk
 from tests.cli.shell import call
@@ -104,6 +105,23 @@ def test_xacro_expands_the_macro_with_the_limits_of_the_datasheet(
         channel.period for channel in node.sheet.channels if channel.number in {joint.actuator, *joint.state.values()}
     ]
     assert manager["update_rate"] <= 1 / max(period for period in periods if period == period) + 1
+
+
+@pytest.mark.parametrize(("of_the_actuator", "of_the_sensors"), [(0.01, 0.1), (0.1, 0.01)])
+def test_the_update_rate_is_that_of_the_slowest_channel_of_a_joint(
+    station: Station, board: Board, tmp_path: Path, of_the_actuator: float, of_the_sensors: float
+) -> None:
+    node = gripper(station, board, tmp_path)
+    channels = tuple(
+        replace(channel, timing=Timing(period=of_the_actuator if channel.actuator else of_the_sensors))
+        for channel in node.sheet.channels
+    )
+    node = replace(node, sheet=replace(node.sheet, channels=channels))
+    topics = Topics(station_facts(station))
+    found = ros2_control.joints(node, topics)
+    assert any(joint.state for joint in found), "a joint without a sensor has one rate alone"
+    files = yaml.safe_load(ros2_control.controllers(node, found, topics))
+    assert files["controller_manager"]["ros__parameters"]["update_rate"] == 10
 
 
 def test_an_asset_shell_is_read_back_by_basyx_and_is_the_same_twice(

@@ -282,7 +282,7 @@ def test_a_clock_that_went_back_is_reported(stationed: System, monkeypatch: pyte
     assert look(stationed, "clock")[0].result == "ok", "an entry was made since the clock was set right"
 
 
-@pytest.mark.parametrize(("ahead", "result"), [(0, "ok"), (86_000, "warning")])
+@pytest.mark.parametrize(("ahead", "result"), [(0, "ok"), (86_000, "warning"), (-86_000, "warning")])
 def test_a_hardware_clock_that_differs_is_reported(system: System, ahead: int, result: str) -> None:
     clock = system.at("/sys/class/rtc/rtc0/since_epoch")
     clock.parent.mkdir(parents=True)

@@ -281,6 +281,23 @@ def test_it_advertises_after_a_tap_and_drops_stations_without_a_session() -> Non
     node.close()
 
 
+def test_a_station_with_a_session_is_not_dropped_and_ten_seconds_after_its_end_it_is() -> None:
+    twins = InTheAir(7, 247)
+    station = Roamer(twins, 7)
+    station.air = twins
+    station.begin_measuring("ble:2")
+    for _ in range(3):
+        twins.hardware.tick += 60 * SECONDS
+        assert not twins.c.ble_drops(0)
+        assert twins.c.ble_drops(1), "the other connection has none"
+    assert station.sealed(security_command(Function.CLOSE), "ble:2")[0]
+    twins.hardware.tick += 9 * SECONDS
+    assert not twins.c.ble_drops(0)
+    twins.hardware.tick += SECONDS
+    assert twins.c.ble_drops(0)
+    twins.c.close()
+
+
 @needs_dbus
 @pytest.mark.link
 def test_it_is_checked_written_verified_and_measured_over_the_air(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
 from teds_provision.measure.blocks import SetPointCommand
-from teds_provision.ncap.nodes.actuator_leases import ActuatorLeases, _HeldActuator, _SetPointOrder
+from teds_provision.ncap.nodes.actuator_leases import ActuatorLeases, Measured, _HeldActuator, _SetPointOrder
 
 
 class Events:
@@ -35,3 +38,43 @@ def test_no_set_point_of_a_topic_moves_an_actuator_until_its_request_has_ended(
         assert leases.admits(SetPointCommand("ab", 1, 0.5, 0.0)) is admitted
     assert events.states == ([] if admitted else ["refused"]), "reported once"
     assert leases.admits(SetPointCommand("ab", 2, 0.5, 0.0))
+
+
+class NewsOfTheEnd:
+    """The condition of a lease that is being let go: whoever waits for its end is told of it at once."""
+
+    def __init__(self, course: list[str]) -> None:
+        self.course = course
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def wait_for(self, over: Callable[[], bool], _seconds: float) -> bool:
+        assert not over()
+        self.course.append("the one before ends")
+        return True
+
+
+def test_an_actuator_is_claimed_again_only_when_its_release_is_over() -> None:
+    """Two claims of one session cannot have an actuator: the second would be refused as a topic's."""
+    course: list[str] = []
+
+    class Leases(ActuatorLeases):
+        @contextmanager
+        def _session(self, uuid: str) -> Iterator[Measured]:
+            yield cast(Measured, None)
+
+        def _hold(self, held: _HeldActuator, session: Measured) -> None:
+            course.append("claimed")
+
+    none, order = cast(Any, None), _SetPointOrder(0.5, None, 1)
+    station = cast(Any, SimpleNamespace(audit=lambda *_words, **_facts: None))
+    leases = Leases(station, cast(Any, Events()), none, none, none, none, none)
+    before = _HeldActuator("ab", 1, 0.0, order, news=cast(Any, NewsOfTheEnd(course)), let_go=True)
+    after = _HeldActuator("ab", 1, 0.0, order, before=before)
+    leases._run(after, 0.5, None)
+    assert course == ["the one before ends", "claimed"]
+    assert after.ended

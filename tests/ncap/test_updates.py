@@ -272,6 +272,8 @@ def test_no_further_board_is_begun_after_a_cancel(bench: Bench) -> None:
 
         until(begins)
         asked.cancel_update(begun["id"])
+        kept = json.loads((bench.service.station.home / "updates" / f"{begun['id']}.json").read_bytes())
+        assert [row["state"] for row in kept["rows"]] == ["running", "skipped"], "nor after a restart of the service"
     done = bench.ended(begun)
     assert done["state"] == "stopped"
     assert [(row["state"], row["result"]) for row in done["boards"]] == [("ended", "updated"), ("skipped", None)]

@@ -161,6 +161,20 @@ def test_what_was_looked_at_while_others_took_its_place_leaves(
     assert present(watch) == 0
 
 
+def test_a_node_that_was_on_another_bus_meanwhile_is_shown_where_it_answers_now(watch: LinkWatch) -> None:
+    looked: list[str] = []
+    watch._for_strangers = SimpleNamespace(submit=lambda _work, contact: looked.append(contact.identity.uuid.hex()))  # type: ignore[assignment]
+    uuid = sighting(4).uuid.hex()
+    for times in (1, 1):
+        watch.on_sighting(sighting(4))
+        watch._pending.clear()
+        assert len(looked) == times, "it is where it was: no news"
+    watch._directory.note(uuid, "came", place="can:y", present=True)
+    watch.on_sighting(sighting(4))
+    assert len(looked) == 2
+    assert watch._directory.seen(uuid).place == watch.place
+
+
 @pytest.mark.parametrize("set_by", [-86_400.0, 86_400.0], ids=["back", "forward"])
 def test_a_clock_that_is_set_keeps_no_node_from_being_looked_at_again(
     watch: LinkWatch, monkeypatch: pytest.MonkeyPatch, set_by: float

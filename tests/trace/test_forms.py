@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -167,3 +168,16 @@ def test_a_trace_is_private_and_never_over_another_file(tmp_path: Path) -> None:
     with pytest.raises(NotFoundError):
         open_trace(tmp_path / "none" / "t", messages.append)
     assert not messages
+
+
+@pytest.mark.parametrize("name", ["t.trace", "t.pcapng"])
+def test_a_frame_has_the_time_of_its_arrival_however_late_it_is_written_down(name: str, tmp_path: Path) -> None:
+    trace = open_trace(tmp_path / name, lambda _text: None)
+    before = time.time()
+    trace.frame("can", "in", b"\2", identifier=1, at=time.monotonic() - 3600)
+    trace.frame("can", "out", b"\2", identifier=1)
+    after = time.time()
+    trace.close()
+    came, left = read_trace(tmp_path / name)
+    assert before - 1 < came.time + 3600 < after + 1
+    assert before - 1 < left.time < after + 1

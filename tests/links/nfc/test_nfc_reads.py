@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from teds_provision.errors import GarbledError
 from teds_provision.links.nfc.nfcpy import Type4TagCommandError
-from teds_provision.links.nfc.tag import Type4Ndef
+from teds_provision.links.nfc.tag import ReaderTag, Type4Ndef
 from teds_provision.node.nfc.tags import NdefApplication, Type4Memory
 
 
@@ -81,3 +83,18 @@ def test_a_tag_that_cannot_be_read_beyond_its_message_is_read_in_two_steps() -> 
     ndef._write_ndef_data(bytearray(b"request"))
     assert ndef._read_ndef_data() == b"short"
     assert tag.reads[3:] == [(0, 2), (2, 5)], "and is not asked again"
+
+
+@pytest.mark.parametrize(("octets", "writeable"), [(101, True), (100, False)])
+def test_a_message_that_the_tag_cannot_hold_is_not_written(octets: int, writeable: bool) -> None:
+    target = object()
+    tag = ReaderTag(
+        SimpleNamespace(identifier=b"\1\2\3\4", target=target, clf=SimpleNamespace(target=target)), "Type 4"
+    )
+    tag._ndef = SimpleNamespace(is_writeable=writeable, capacity=100, octets=b"as it was")
+    with pytest.raises(GarbledError, match=f"does not take an NDEF message of {octets} octets"):
+        tag.write(bytes(octets))
+    assert tag._ndef.octets == b"as it was"
+    tag._ndef.is_writeable = True
+    tag.write(bytes(100))
+    assert tag._ndef.octets == bytes(100)
