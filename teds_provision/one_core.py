@@ -4,11 +4,12 @@ One thread of an interpreter runs at a time. On several cores its threads hand t
 and each handing over wakes a core that sleeps: a station with 200 nodes then takes two to three times the processor
 time for the same work (docs/internals/speed.md).
 
-The core is one of those that the process may use (``taskset``, ``CPUAffinity=``, a cpuset), of the fastest kind. Every
-two or three seconds the others' work on each core is looked at; a core that is taken is left for a less busy one. If
-somebody else gives the process other cores meanwhile, it stays as it was put. Processes are started in ``with
-every_core():``, so that they get all cores back. Linux alone; where the kernel's figures cannot be read, nothing is
-changed.
+The core is one of those that the process may use (``taskset``, ``CPUAffinity=``, a cpuset), of the fastest kind, on
+which others have little to do; every two or three seconds their work is looked at. If they take a core, the threads go
+to a free one, and if they take all, to all: a thread that waits for its turn on one core of a busy machine waits twice
+as long as one that gets the next turn anywhere, and where no core sleeps, none has to be woken. If somebody else gives
+the process other cores meanwhile, it stays as it was put. Processes are started in ``with every_core():``, so that they
+get all cores back. Linux alone; where the kernel's figures cannot be read, nothing is changed.
 """
 
 from __future__ import annotations
@@ -24,11 +25,12 @@ from typing import Final, Protocol
 
 _log = logging.getLogger(__name__)
 
+FIRST_LOOK: Final = 0.3  # seconds
 LOOK_SECONDS: Final = 2.0
-TAKEN: Final = 0.3
-"""The share of a core that others may take before a better one is looked for."""
-WORTH_MOVING: Final = 0.25
-"""By so much of a core another one has to be less busy."""
+FREE: Final = 0.35
+"""The share of a core that others take at most if the threads go there."""
+TAKEN: Final = 0.5
+"""The share of their core that others take at most while the threads stay there."""
 
 
 class Kernel(Protocol):
@@ -40,8 +42,8 @@ class Kernel(Protocol):
     def fastest(self, cores: Set[int]) -> Set[int]:
         """Return those of the cores that are of the fastest kind."""
 
-    def current(self) -> int:
-        """Return the core on which the calling thread runs."""
+    def waits(self) -> bool:
+        """Return True if this process's threads wait while others' work runs; those of real-time processes do not."""
 
     def place(self, thread: int, cores: Set[int]) -> None:
         """Let a thread (0: the calling one) run on these cores alone."""
@@ -71,9 +73,9 @@ class LinuxKernel:
         speeds = {core: _capacity(core) for core in cores}
         return {core for core in cores if speeds[core] == max(speeds.values())}
 
-    def current(self) -> int:
-        """Return the core on which the calling thread runs (proc(5), /proc/pid/stat, field 39)."""
-        return int(Path("/proc/thread-self/stat").read_text().rpartition(")")[2].split()[36])
+    def waits(self) -> bool:
+        """Return True if this process's threads wait while others' work runs (sched(7): real-time ones do not)."""
+        return os.sched_getscheduler(0) not in (os.SCHED_FIFO, os.SCHED_RR)
 
     def place(self, thread: int, cores: Set[int]) -> None:
         """Let a thread (0: the calling one) run on these cores alone."""
@@ -115,7 +117,10 @@ def _capacity(core: int) -> int:
 
 
 class OneCore:
-    """Keeps the threads of this process on one core; raises OSError or ValueError where that cannot be done."""
+    """Keeps the threads of this process on one core while one is free; raises OSError, ValueError: it cannot be done.
+
+    ``core`` is where they are, None while they may run on all.
+    """
 
     def __init__(self, kernel: Kernel) -> None:
         self._kernel = kernel
@@ -128,35 +133,52 @@ class OneCore:
         self._busy, self._own, self._since = kernel.busy(), kernel.own(), kernel.now()
         if not self._busy.keys() >= self._cores:
             raise ValueError("the kernel's figures are of other cores")
-        current = kernel.current()
-        self.core = current if current in self._fit else min(self._fit)
-        self._place_all({self.core})
+        self.core: int | None = None
 
     @property
     def left(self) -> bool:
-        """True once the threads may run on several cores again."""
+        """True once the threads' cores are no longer decided here."""
         return self._left
 
     def look(self) -> None:
-        """Move to a less busy core if others take this one; stay as placed if somebody else placed the threads."""
-        kernel = self._kernel
+        """Go where a core is free; stay as placed if somebody else placed the threads."""
         with self._guard:
             if self._left:
                 return
-            if kernel.allowed() != {self.core}:
+            if self._kernel.allowed() != self._placed:
                 self._left = True
                 _log.info("The cores of this process were changed from outside; its threads stay on them.")
                 return
-            busy, own, now = kernel.busy(), kernel.own(), kernel.now()
-            seconds = max(now - self._since, 1e-3)
-            others = {core: (busy[core] - self._busy[core]) / seconds for core in self._fit if core in busy}
-            others[self.core] = others.get(self.core, 0.0) - (own - self._own) / seconds
-            self._busy, self._own, self._since = busy, own, now
+            others = self._others()
+            if self.core is not None and others[self.core] <= TAKEN:
+                return
             best = min(others, key=lambda core: (others[core], core))
-            if others[self.core] > TAKEN and others[self.core] - others[best] > WORTH_MOVING:
-                _log.info("Others take %.0f %% of core %d: on to core %d.", 100 * others[self.core], self.core, best)
-                self.core = best
-                self._place_all({best})
+            if others[best] <= FREE:
+                found: int | None = best
+            elif self._kernel.waits():
+                found = None
+            else:
+                found = best if self.core is None else self.core
+            if found != self.core:
+                _log.info("Threads on core %s; others take %.0f %% of the least busy core.", found, 100 * others[best])
+                self._place_all(self._cores if found is None else {found})
+                self.core = found
+
+    def _others(self) -> dict[int, float]:
+        """Return the share of each core that others took since the last look."""
+        busy, own, now = self._kernel.busy(), self._kernel.own(), self._kernel.now()
+        seconds = max(now - self._since, 1e-3)
+        mine = (own - self._own) / seconds
+        others = {core: (busy[core] - self._busy[core]) / seconds for core in self._fit}
+        for core in others if self.core is None else [self.core]:
+            others[core] = max(0.0, others[core] - mine / (len(others) if self.core is None else 1))
+        self._busy, self._own, self._since = busy, own, now
+        return others
+
+    @property
+    def _placed(self) -> Set[int]:
+        """The cores on which the threads are."""
+        return self._cores if self.core is None else {self.core}
 
     def leave(self) -> None:
         """Give every thread all cores back that the process had, unless somebody else has placed it."""
@@ -188,14 +210,15 @@ class OneCore:
                 with self._guard:
                     self._elsewhere.discard(thread)
                     if not self._left:
-                        self._kernel.place(0, {self.core})
+                        self._kernel.place(0, self._placed)
 
     def _run(self) -> None:
-        apart = 1 + os.getpid() % 8 / 16  # two stations on one core do not leave it at the same moment
-        while not self._end.wait(LOOK_SECONDS * apart):
+        pause, apart = FIRST_LOOK, 1 + os.getpid() % 8 / 16  # two stations do not leave a core at the same moment
+        while not self._end.wait(pause):
+            pause = LOOK_SECONDS * apart
             try:
                 self.look()
-            except (OSError, ValueError):  # a core was taken out
+            except (OSError, ValueError, KeyError):  # a core was taken out
                 self.leave()
             if self._left:
                 return
@@ -215,13 +238,13 @@ _IN_FORCE: Final[list[OneCore]] = []
 
 
 @contextmanager
-def one_core() -> Iterator[OneCore | None]:
-    """Keep all threads of this process on one core for the length of the block, where that can be done.
+def one_core(kernel: Kernel | None = None) -> Iterator[OneCore | None]:
+    """Keep all threads of this process on one core for the length of the block, while one is free.
 
     Yields None where nothing is changed: one core alone, another system than Linux, a kernel that denies it or shows no
     figures, a block inside of another one.
     """
-    kept = None if _IN_FORCE else _keep(LinuxKernel())
+    kept = None if _IN_FORCE else _keep(kernel or LinuxKernel())
     if kept is None:
         yield None
         return

@@ -10,10 +10,13 @@ import threading
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-from teds_provision.one_core import OneCore, every_core, one_core
+from teds_provision.ncap import service_run
+from teds_provision.one_core import LinuxKernel, OneCore, every_core, one_core
+from teds_provision.provisioning import batch
 from tests.pace import PATIENCE, until
 from tests.parsed import parsed
 
@@ -27,11 +30,11 @@ needs_two_cores = pytest.mark.skipif(
 
 @dataclass
 class StatedKernel:
-    """A kernel whose figures the test states: a thread of this process is number 1, the calling one."""
+    """A kernel whose figures the test states: the calling thread is number 1, as the system counts it 0."""
 
     cores: Set[int] = frozenset({0, 1, 2})
-    on: int = 1
     fast: Set[int] | None = None
+    real_time: bool = False
     work: dict[int, float] = field(default_factory=dict)
     mine: float = 0.0
     seconds: float = 0.0
@@ -44,8 +47,8 @@ class StatedKernel:
     def fastest(self, cores: Set[int]) -> Set[int]:
         return cores if self.fast is None else cores & self.fast
 
-    def current(self) -> int:
-        return self.on
+    def waits(self) -> bool:
+        return not self.real_time
 
     def place(self, thread: int, cores: Set[int]) -> None:
         self.places[thread or 1] = frozenset(cores)
@@ -62,110 +65,133 @@ class StatedKernel:
     def now(self) -> float:
         return self.seconds
 
-    def passes(self, seconds: float, *, mine: float = 0.0, on: int = 1, **others: float) -> None:
-        """Let time pass, with so much work of this process on that core, and of others (``core0=1.5``)."""
-        self.seconds += seconds
-        self.mine += mine
-        self.work[on] = self.work.get(on, 0.0) + mine
-        for name, worked in others.items():
-            core = int(name.removeprefix("core"))
-            self.work[core] = self.work.get(core, 0.0) + worked
+
+@dataclass
+class Run:
+    """One core of a stated kernel, and what it decides in each two seconds."""
+
+    kernel: StatedKernel = field(default_factory=StatedKernel)
+
+    def __post_init__(self) -> None:
+        self.kept = OneCore(self.kernel)
+
+    def look(self, *, mine: float = 0.0, others: Mapping[int, float] = {}) -> int | None:
+        """Let two seconds pass, with so much work of this process and of others on each core; return the core."""
+        self.kernel.seconds += 2.0
+        self.kernel.mine += mine
+        placed = sorted(self.kernel.places.get(1, self.kernel.cores))
+        for core in placed:
+            self.kernel.work[core] = self.kernel.work.get(core, 0.0) + mine / len(placed)
+        for core, worked in others.items():
+            self.kernel.work[core] = self.kernel.work.get(core, 0.0) + worked
+        self.kept.look()
+        return self.kept.core
 
 
-def test_every_thread_gets_the_core_on_which_the_process_runs() -> None:
-    kernel = StatedKernel(started=[1, 7, 8])
-    assert OneCore(kernel).core == 1
-    assert kernel.places == {1: {1}, 7: {1}, 8: {1}}
+def test_every_thread_gets_the_core_on_which_others_do_least() -> None:
+    run = Run(StatedKernel(started=[1, 7, 8]))
+    assert run.kernel.places == {}, "before the first look nothing is known"
+    assert run.look(mine=0.6, others={0: 0.4, 1: 0.2, 2: 1.0}) == 1
+    assert run.kernel.places == {1: {1}, 7: {1}, 8: {1}}
 
 
 def test_the_core_is_one_of_those_that_the_user_left() -> None:
-    kernel = StatedKernel(cores=frozenset({2, 3}), on=3)
-    kept = OneCore(kernel)
-    kernel.passes(2, core3=2)
-    kept.look()
-    assert (kept.core, kernel.places[1]) == (2, {2}), "cores 0 and 1 are idle as well, but not this process's"
+    run = Run(StatedKernel(cores=frozenset({2, 3})))
+    assert run.look(others={2: 0.2, 3: 0.1}) == 3
+    assert run.look(others={3: 1.5}) == 2, "cores 0 and 1 are free as well, but not this process's"
 
 
 def test_a_slow_core_is_not_taken() -> None:
-    kernel = StatedKernel(on=0, fast={1, 2})
-    kept = OneCore(kernel)
-    assert kept.core == 1
-    kernel.passes(2, core1=2, core2=1)
-    kept.look()
-    assert kept.core == 2
+    run = Run(StatedKernel(fast={1, 2}))
+    assert run.look(others={1: 0.1}) == 2
+    assert run.look(others={2: 1.4}) == 1
 
 
-def test_a_core_that_others_take_is_left_for_the_least_busy_one() -> None:
-    kernel = StatedKernel(started=[1, 7])
-    kept = OneCore(kernel)
-    kernel.passes(2, mine=0.6, core1=1.4, core2=0.5, core0=0.9)
-    kept.look()
-    assert kept.core == 2
-    assert kernel.places == {1: {2}, 7: {2}}
+def test_a_core_that_others_take_is_left_for_a_free_one() -> None:
+    run = Run(StatedKernel(started=[1, 7]))
+    run.look()
+    assert run.look(mine=0.6, others={0: 1.4, 1: 0.5, 2: 0.3}) == 2
+    assert run.kernel.places == {1: {2}, 7: {2}}
+    assert run.look(mine=0.6, others={0: 0.0, 1: 0.5, 2: 0.3}) == 2, "it stays while it can"
 
 
 def test_its_own_work_is_no_reason_to_move() -> None:
-    kernel = StatedKernel()
-    kept = OneCore(kernel)
-    kernel.passes(2, mine=2.0)
-    kept.look()
-    assert kept.core == 1
+    run = Run()
+    assert [run.look(mine=2.0) for _ in range(3)] == [0, 0, 0]
 
 
-@pytest.mark.parametrize(
-    "others", [{"core1": 0.5}, {"core1": 2.0, "core0": 1.9, "core2": 1.6}], ids=["little", "the same everywhere"]
-)
-def test_it_stays_where_moving_gains_nothing(others: dict[str, float]) -> None:
-    kernel = StatedKernel()
-    kept = OneCore(kernel)
-    kernel.passes(2, mine=0.0, on=1, **others)
-    kept.look()
-    assert kept.core == 1
+def test_on_a_machine_whose_cores_are_all_taken_the_threads_have_all() -> None:
+    """On one core of it a thread that is woken waits longer for its turn than on the first that gives it one."""
+    run = Run(StatedKernel(started=[1, 7]))
+    run.look()
+    everywhere = {0: 1.9, 1: 1.8, 2: 1.7}
+    assert run.look(mine=0.1, others=everywhere) is None
+    assert run.kernel.places == {1: {0, 1, 2}, 7: {0, 1, 2}}
+    assert run.look(mine=0.3, others=everywhere) is None
+    assert run.look(mine=0.3, others={**everywhere, 1: 0.5}) == 1
+
+
+def test_a_real_time_process_has_one_core_whatever_others_do() -> None:
+    run = Run(StatedKernel(real_time=True))
+    assert run.look(mine=0.6, others={0: 1.7, 1: 1.8, 2: 1.9}) == 0
+    assert run.look(mine=0.6, others={0: 1.4, 1: 1.1, 2: 1.9}) == 0
+    assert run.look(mine=0.6, others={0: 1.4, 1: 0.1, 2: 1.9}) == 1
 
 
 def test_only_what_happened_since_the_last_look_counts() -> None:
-    kernel = StatedKernel()
-    kept = OneCore(kernel)
-    kernel.passes(2, core1=2)
-    kept.look()
-    kernel.passes(2, mine=0.6, on=kept.core)
-    kept.look()
-    assert kept.core == 0, "and not back: the core that was left is idle now, but so is this one"
+    run = Run()
+    run.look()
+    assert run.look(others={0: 2.0}) == 1
+    assert run.look(mine=0.6) == 1, "and not back: the core that was left is free now, but so is this one"
 
 
 def test_a_thread_that_begins_while_the_others_move_is_placed_too() -> None:
-    kernel = StatedKernel()
-    kept = OneCore(kernel)
+    run = Run()
+    kernel = run.kernel
 
     def place(thread: int, cores: Set[int]) -> None:
         if thread == 1 and 9 not in kernel.started:
             kernel.started.append(9)
-            kernel.places[9] = kernel.places[1]
+            kernel.places[9] = kernel.allowed()
         kernel.places[thread] = cores
 
     kernel.place = place  # type: ignore[method-assign]
-    kernel.passes(2, core1=2)
-    kept.look()
+    assert run.look() == 0
     assert kernel.places[9] == {0}
 
 
 def test_cores_that_somebody_else_gives_stay() -> None:
-    kernel = StatedKernel()
-    kept = OneCore(kernel)
-    kernel.places[1] = frozenset({0, 2})
-    kernel.passes(2, core1=2)
-    kept.look()
-    kept.leave()
-    assert kept.left
-    assert kernel.places[1] == {0, 2}
+    run = Run()
+    run.look()
+    run.kernel.places[1] = frozenset({0, 2})
+    run.look(others={0: 2.0})
+    run.kept.leave()
+    assert run.kept.left
+    assert run.kernel.places[1] == {0, 2}
 
 
 def test_figures_of_other_cores_change_nothing() -> None:
     """A container may count its cores anew in /proc/stat."""
-    kernel = StatedKernel(cores=frozenset({6, 7}), on=6)
+    kernel = StatedKernel(cores=frozenset({6, 7}))
     with pytest.raises(ValueError, match="other cores"):
         OneCore(kernel)
     assert kernel.places == {}
+
+
+def test_the_kernels_figures_are_read() -> None:
+    kernel = LinuxKernel()
+    assert kernel.busy().keys() >= kernel.allowed() >= kernel.fastest(kernel.allowed()) > frozenset()
+    assert threading.get_native_id() in kernel.threads()
+    assert kernel.waits() is (os.sched_getscheduler(0) == os.SCHED_OTHER)
+    before = kernel.busy()
+    until(lambda: kernel.busy() != before)
+
+
+class IdleMachine(LinuxKernel):
+    """This machine, as if nobody else worked on it."""
+
+    def busy(self) -> Mapping[int, float]:
+        return dict.fromkeys(super().busy(), 0.0)
 
 
 @needs_two_cores
@@ -174,8 +200,9 @@ def test_threads_and_those_that_they_start_have_one_core_until_the_end() -> None
     ends, seen = threading.Event(), []
     early = threading.Thread(target=ends.wait, args=(PATIENCE,))
     early.start()
-    with one_core() as kept:
+    with one_core(IdleMachine()) as kept:
         assert kept is not None
+        until(lambda: kept.core is not None)
         late = threading.Thread(target=lambda: seen.append(os.sched_getaffinity(0)))
         late.start()
         late.join()
@@ -192,8 +219,9 @@ def test_threads_and_those_that_they_start_have_one_core_until_the_end() -> None
 @needs_two_cores
 def test_a_process_that_is_started_gets_all_cores_back() -> None:
     cores = len(os.sched_getaffinity(0))
-    with one_core() as kept:
+    with one_core(IdleMachine()) as kept:
         assert kept is not None
+        until(lambda: kept.core is not None)
         with every_core():
             counted = subprocess.run(COUNT_CORES, capture_output=True, check=True)
         assert os.sched_getaffinity(0) == {kept.core}
@@ -208,11 +236,12 @@ def test_a_process_that_is_started_gets_all_cores_back() -> None:
 @needs_two_cores
 def test_a_move_leaves_a_thread_alone_that_starts_a_process() -> None:
     cores = os.sched_getaffinity(0)
-    with one_core() as kept:
+    with one_core(IdleMachine()) as kept:
         assert kept is not None
         with every_core():
-            kept._place_all({kept.core})
+            until(lambda: kept.core is not None)
             assert os.sched_getaffinity(0) == cores
+        assert os.sched_getaffinity(0) == {kept.core}
 
 
 @needs_two_cores
@@ -223,6 +252,17 @@ def test_the_watcher_ends_with_the_block() -> None:
     with one_core():
         assert watchers() == 1
     until(lambda: not watchers())
+
+
+@pytest.mark.parametrize("module", [batch, service_run], ids=["provision --all", "ncap run"])
+def test_who_works_with_many_nodes_keeps_to_one_core(module: ModuleType) -> None:
+    blocks = [
+        ast.unparse(item.context_expr)
+        for node in ast.walk(parsed(Path(str(module.__file__))))
+        if isinstance(node, ast.With)
+        for item in node.items
+    ]
+    assert "one_core()" in blocks
 
 
 ALONE = {

@@ -1095,8 +1095,9 @@ PATTERNS = (
         "held is None or held.let_go",
         "tests/ncap/test_actuator_leases.py",
     ),
-    Pattern("a core that others take is left", "OneCore.look", "others[self.core] > TAKEN", "False"),
-    Pattern("one's own work is no reason to leave a core", "OneCore.look", "(own - self._own) / seconds", "0.0"),
+    Pattern("a core that others take is left", "OneCore.look", "others[self.core] <= TAKEN", "True"),
+    Pattern("where every core is taken, threads have all", "OneCore.look", "self._kernel.waits()", "False"),
+    Pattern("its own work is no reason to leave a core", "OneCore._others", "(own - self._own) / seconds", "0.0"),
     Pattern(
         "a started process gets all cores",
         "OneCore.on_every_core",

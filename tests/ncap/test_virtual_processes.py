@@ -6,12 +6,8 @@ import os
 import signal
 import subprocess
 import threading
-from pathlib import Path
-
-import pytest
 
 from teds_provision.ncap.nodes.virtual import _die_with
-from tests.ncap.service import Service, virtual
 from tests.pace import PATIENCE
 
 
@@ -41,18 +37,3 @@ def test_a_node_whose_daemon_died_before_it_asked_to_die_with_it_ends_at_once() 
     other = os.getppid()
     process = subprocess.Popen(["true"], preexec_fn=lambda: _die_with(other))  # noqa: PLW1509 - as the daemon does
     assert process.wait(PATIENCE) == 1
-
-
-@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="this process has one core alone")
-def test_the_daemons_threads_are_on_one_core_and_its_nodes_on_all(service: Service) -> None:
-    virtual(service)
-    assert service.process is not None
-    daemon = service.process.process.pid
-    cores = [os.sched_getaffinity(int(task.name)) for task in Path(f"/proc/{daemon}/task").iterdir()]
-    assert len(cores) > 5
-    assert len(set.union(*cores)) == 1
-    started = [(task / "children").read_text() for task in Path(f"/proc/{daemon}/task").iterdir()]
-    nodes = [int(pid) for pids in started for pid in pids.split()]
-    assert nodes
-    for node in nodes:
-        assert os.sched_getaffinity(node) == os.sched_getaffinity(0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import threading
 import time
 from pathlib import Path
@@ -19,7 +18,6 @@ from teds_provision.errors import (
     VaultLockedError,
 )
 from teds_provision.links import Contact, LinkSettings
-from teds_provision.provisioning import batch
 from teds_provision.provisioning.batch import BatchRun, ProvisionRequest
 from teds_provision.provisioning.batch_sheet import (
     BatchSheet,
@@ -316,23 +314,6 @@ def test_boards_that_are_finished_when_the_vault_is_locked_are_counted(
     with pytest.raises(VaultLockedError):
         came.extend(ended.uuid for ended in everyone)
     assert sorted(came) == sorted(contact.identity.uuid for contact in contacts[1:])
-
-
-@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="this process has one core alone")
-def test_the_nodes_of_a_bus_are_worked_on_by_one_core(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch, "open_port", lambda _links: SixAtOnce())
-    boards = BatchRun(station, LinkSettings("can"), ProvisionRequest(everyone=True), SilentReporter())
-    cores: list[set[int]] = []
-
-    def on_the_bus(_port: object) -> tuple[list[Contact], list[Contact]]:
-        cores.append(os.sched_getaffinity(0))
-        return [], []
-
-    monkeypatch.setattr(boards, "_on_the_bus", on_the_bus)
-    before = os.sched_getaffinity(0)
-    assert list(boards.many(Operator())) == []
-    assert [len(seen) for seen in cores] == [1]
-    assert os.sched_getaffinity(0) == before
 
 
 class SixAtOnce:
