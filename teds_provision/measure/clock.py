@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections import deque
+from array import array
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,7 +78,8 @@ class ClockMap:
         self.lie = ""
         self._own = own_drift
         self._rate = (own_drift + NODE_DRIFT) / 1e6  # ns of doubt for each ns of age
-        self._exchanges: deque[Exchange] = deque(maxlen=EXCHANGES)
+        # Of the last EXCHANGES, oldest first: plain numbers, as a station has these of each of its nodes.
+        self._ticks, self._offsets, self._errors = array("q"), array("d"), array("d")
         self._hull = LowerHull()
         self._low, self._high, self._when = -math.inf, math.inf, 0  # what the evidence allows, at tick `_when`
         self._origin = 0  # tick of the line's offset
@@ -93,11 +94,6 @@ class ClockMap:
     def known(self) -> bool:
         """True if there is any evidence yet."""
         return self._known
-
-    @property
-    def exchanges(self) -> tuple[Exchange, ...]:
-        """Those that are kept, oldest first."""
-        return tuple(self._exchanges)
 
     def exchange(self, exchange: Exchange) -> bool:
         """Take an exchange; False if the clock is dishonest (``lie`` has the reason).
@@ -122,13 +118,19 @@ class ClockMap:
             if exchange.offset - exchange.error > high or exchange.offset + exchange.error < low:
                 self.lie = "two exchanges contradict each other: the node's clock was set or runs at the wrong speed"
                 return False
-            self._exchanges.append(exchange)
+            self._keep(exchange)
             self._narrow(exchange.tick, exchange.offset - exchange.error, exchange.offset + exchange.error)
             self._refit(exchange.tick)
             return True
         if not self._known:  # stamps go on: until a sample arrives, the end of the reply is all that there is
             self._origin, self._offset = exchange.sent, float(exchange.answered - exchange.sent)
         return False
+
+    def _keep(self, exchange: Exchange) -> None:
+        self._ticks.append(exchange.tick)
+        self._offsets.append(exchange.offset)
+        self._errors.append(exchange.error)
+        del self._ticks[:-EXCHANGES], self._offsets[:-EXCHANGES], self._errors[:-EXCHANGES]
 
     def arrival(self, tick: int, host: int) -> None:
         """Take a sample's tick and when the message that held it had come (host, monotonic ns)."""
@@ -216,7 +218,7 @@ class ClockMap:
 
     def _refit(self, tick: int) -> None:
         before = self._line(tick) if self._handed_out else None
-        offset, skew = self._by_exchanges(tick) if self._exchanges else self._by_arrivals(tick)
+        offset, skew = self._by_exchanges(tick) if self._ticks else self._by_arrivals(tick)
         low, high = self._limits(tick)
         self._origin, self._offset, self._skew = tick, float(min(max(offset, low), high)), skew
         self._residue, self._refitted = 0.0 if before is None else before - self._offset, tick
@@ -229,9 +231,8 @@ class ClockMap:
         than the mean of many, and so is the quickest reply. Their limits are carried to ``tick`` along the skew, whose
         uncertainty weakens old ones.
         """
-        at = np.array([exchange.tick - tick for exchange in self._exchanges], dtype=np.float64)
-        offsets = np.array([exchange.offset for exchange in self._exchanges])
-        errors = np.array([exchange.error for exchange in self._exchanges])
+        at = (np.array(self._ticks) - tick).astype(np.float64)
+        offsets, errors = np.array(self._offsets), np.array(self._errors)
         base = offsets[-1]
         edge, skew = self._by_arrivals(tick)
         if len(at) >= 4 and at.max() - at.min() >= SPAN_OF_EXCHANGES:
@@ -275,26 +276,29 @@ class LowerHull:
 
     def __init__(self) -> None:
         self.count = 0
-        self._closed: deque[tuple[int, int]] = deque()
+        self._ticks, self._uppers = array("q"), array("q")  # of closed buckets: of a fast stream some hundred
         self._best = (0, 0)  # of the bucket that is still open, if ``count`` shows that there is one
         self._end = 0  # tick at which it ends
         self._hull: list[tuple[int, int]] = []
 
     def add_arrival(self, tick: int, upper: int) -> bool:
         """Take an arrival; whether it begins a new bucket."""
+        if tick >= END_OF_TICKS:
+            return False
         if tick < self._end:
             # Of another stream it may be a little older than what came before it: then it adds nothing.
             if upper < self._best[1] and tick >= self._end - BUCKET:
                 self._best = (tick, upper)
             return False
         if self.count:
-            self._closed.append(self._best)
+            self._ticks.append(self._best[0])
+            self._uppers.append(self._best[1])
             _extend(self._hull, self._best)
-        if self._closed and self._closed[0][0] < tick - WINDOW - WINDOW // 10:
-            while self._closed and self._closed[0][0] < (tick - WINDOW):
-                self._closed.popleft()
+        if self._ticks and self._ticks[0] < tick - WINDOW - WINDOW // 10:
+            kept = next((place for place, closed in enumerate(self._ticks) if closed >= tick - WINDOW), None)
+            del self._ticks[:kept], self._uppers[:kept]
             self._hull = []
-            for point in self._closed:
+            for point in zip(self._ticks, self._uppers, strict=True):
                 _extend(self._hull, point)
         self._best, self._end = (tick, upper), (tick // BUCKET + 1) * BUCKET
         self.count += 1
@@ -303,7 +307,7 @@ class LowerHull:
     @property
     def span(self) -> int:
         """Ticks (ns) from the oldest arrival to the newest bucket."""
-        return self._best[0] - self._closed[0][0] if self._closed else 0
+        return self._best[0] - self._ticks[0] if self._ticks else 0
 
     def points(self) -> list[tuple[int, int]]:
         """Return the hull's corners, oldest first."""
