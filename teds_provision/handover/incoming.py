@@ -388,12 +388,15 @@ class _Judge:
 
     def _stale_key(self, node: BundledNode) -> str:
         """Return why its key is not added to those that are held, "" if it is."""
-        held = self.held.get(node.uuid, {})
+        held, known = self.held.get(node.uuid), self.nodes.get(node.uuid)
+        if held is None:
+            if known is None or node.epoch >= known.epoch:
+                return ""
+            held = {}
         if node.kid in held:
             return ""
         if sum(state == "pending" for state, _ in held.values()) >= MAX_PENDING:
             return f"{MAX_PENDING} of its keys are already waiting for proof here"
-        known = self.nodes.get(node.uuid)
         active = max((epoch for state, epoch in held.values() if state == "active"), default=0)
         proven = max(known.epoch if known is not None else 0, active)
         pending = max((epoch for state, epoch in held.values() if state == "pending"), default=0)

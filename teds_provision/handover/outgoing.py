@@ -421,7 +421,11 @@ def _receivers(station: Station, order: ExportOrder) -> list[TrustRecord]:
 
 def _one_ca(station: Station, order: ExportOrder, nodes: Chosen) -> bytes:
     """Return the CA that the nodes keep: one bundle has one."""
-    found = {fingerprint(ca): ca for ca in {ca for _, ca in _with_ca(station, nodes)}}
+    own, kept = station.ca, set[bytes]()
+    for chunk in chunks(nodes):
+        others = station.keys.cas_among([node.uuid for node in chunk])
+        kept |= {own, *others.values()} if len(others) < len(chunk) else set(others.values())
+    found = {fingerprint(ca): ca for ca in kept}
     if order.ca is not None:
         found = {digits: ca for digits, ca in found.items() if digits.startswith(order.ca.lower())}
         if not found:
@@ -464,9 +468,12 @@ def _signature(station: Station, ca: bytes, receiver: TrustRecord) -> bytes:
 
 def _other_holders(station: Station, nodes: Chosen, receivers: tuple[TrustRecord, ...]) -> tuple[str, ...]:
     """Return the stations, other than the receivers, that hold any of these keys since an earlier copy."""
+    to = {record.fingerprint for record in receivers}
+    if station.keys.all_holders() <= to:  # there may be 100,000 rows, and stations are few
+        return ()
     chosen = {node.uuid for node in nodes}
     found = {holder.fingerprint for holder in station.keys.holders() if holder.uuid in chosen}
-    return tuple(sorted(found - {record.fingerprint for record in receivers}))
+    return tuple(sorted(found - to))
 
 
 def _is_same(row: Handover, content: str, now: datetime) -> bool:

@@ -31,6 +31,7 @@ MAX_PENDING = 8
 
 _NO_FLAGS: Final = KeyFlags()
 _COLUMNS: Final = "seq, uuid, epoch, key_id, state, slot, wrapped, source, created"
+_COLUMNS_IN_ORDER: Final = ", ".join(column.name for column in fields(KeyRecord))
 _FLAGS: Final = ", ".join(column.name for column in fields(KeyFlags))
 _flag_values = attrgetter(*(column.name for column in fields(KeyFlags)))
 _key_values, _holder_values = (attrgetter(*(column.name for column in fields(kind))) for kind in (KeyRecord, Holder))
@@ -134,14 +135,12 @@ class NodeKeys:
 
     def get_many(self, uuids: Sequence[bytes]) -> list[KeyRecord]:
         """Return the keys of a chunk of nodes, wrapped, in the order they came."""
-        return self._store.read(
-            _key, f"SELECT {_COLUMNS} FROM keys WHERE uuid IN ({places(uuids)}) ORDER BY seq", uuids
-        )
+        found = self._store.read_of_nodes(KeyRecord, f"SELECT {_COLUMNS_IN_ORDER} FROM keys", uuids)
+        return sorted(found, key=attrgetter("seq"))
 
     def slots_of(self, uuids: Sequence[bytes]) -> dict[bytes, int]:
         """Return the last slot given to the keys of each of these nodes (a chunk of them)."""
-        rows = self._store.execute(f"SELECT uuid, last FROM key_slots WHERE uuid IN ({places(uuids)})", uuids)
-        return {bytes(uuid): int(last) for uuid, last in rows}
+        return dict(self._store.read_of_nodes(_slot, "SELECT uuid, last FROM key_slots", uuids))
 
     def next_slot(self, uuid: bytes) -> int:
         """Return a slot number that this node never had; to be asked before wrapping a new key."""
@@ -391,8 +390,7 @@ class NodeKeys:
 
     def _flags_of(self, uuids: Sequence[bytes]) -> dict[bytes, KeyFlags]:
         """Return the flags of those of these nodes (a chunk of them) that have one."""
-        statement = f"SELECT uuid, {_FLAGS} FROM marks WHERE uuid IN ({places(uuids)})"
-        return dict(self._store.read(_flagged, statement, uuids))
+        return dict(self._store.read_of_nodes(_flagged, f"SELECT uuid, {_FLAGS} FROM marks", uuids))
 
     def all_flags(self, rows: str = "1") -> dict[bytes, KeyFlags]:
         """Return the flags of every node that has one; ``rows`` is a condition in SQL for the nodes that are meant."""
@@ -404,8 +402,9 @@ class NodeKeys:
         A node without any flag has no row.
         """
         columns = ("uuid", *fields(KeyFlags))
-        rows = ((uuid, *_flag_values(kept)) for uuid, kept in flags.items() if kept != _NO_FLAGS)
         without = [(uuid,) for uuid, kept in flags.items() if kept == _NO_FLAGS]
+        gone = {uuid for (uuid,) in without}
+        rows = ((uuid, *_flag_values(kept)) for uuid, kept in flags.items() if uuid not in gone)
         with self._store.together():
             self._store.execute_many("DELETE FROM marks WHERE uuid = ?", without)
             statement = f"INSERT OR REPLACE INTO marks(uuid, {_FLAGS}) VALUES({places(columns)})"
@@ -493,6 +492,10 @@ class NodeKeys:
         which, values = ("", ()) if uuid is None else ("WHERE uuid = ?", (uuid,))  # by the index: there may be 100,000
         return self._store.read(Holder, f"SELECT * FROM holders {which} ORDER BY uuid, since, fingerprint", values)
 
+    def all_holders(self) -> set[str]:
+        """Return the fingerprints of all stations that hold a key of any node."""
+        return {str(digits) for (digits,) in self._store.execute("SELECT DISTINCT fingerprint FROM holders")}
+
     def holders_of_key(self, record: KeyRecord) -> set[str]:
         """Return the stations that were noted as holders since this key came; earlier ones had the key before it."""
         return {holder.fingerprint for holder in self.holders(record.uuid) if holder.since >= record.created}
@@ -510,6 +513,10 @@ class NodeKeys:
 def _key_name(seq: int, *row: Any) -> tuple[bytes, str, int, str]:
     uuid, key_id, epoch, state = row
     return uuid, key_id, epoch, state
+
+
+def _slot(uuid: bytes, last: int) -> tuple[bytes, int]:
+    return bytes(uuid), int(last)
 
 
 def _key(seq: int, *row: Any) -> KeyRecord:

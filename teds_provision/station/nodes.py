@@ -65,8 +65,8 @@ class Nodes:
 
     def get_many(self, uuids: Sequence[bytes]) -> dict[bytes, NodeRecord]:
         """Return the records of a chunk of nodes, by UUID."""
-        statement = f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid IN ({places(uuids)})"
-        return {record.uuid: record for record in self._store.read(NodeRecord, statement, uuids)}
+        found = self._store.read_of_nodes(NodeRecord, f"SELECT {_NODE_COLUMNS} FROM nodes", uuids)
+        return {record.uuid: record for record in found}
 
     def all_shown_keys(self) -> Iterator[ExportEligibility]:
         """Give identity key and retirement of all nodes, by UUID, a chunk at a time."""
@@ -78,8 +78,8 @@ class Nodes:
 
     def exported_many(self, uuids: Sequence[bytes]) -> dict[bytes, ExportedNode]:
         """Return a bundle's facts about a chunk of nodes, by UUID."""
-        statement = f"SELECT {_EXPORTED_COLUMNS} FROM nodes WHERE uuid IN ({places(uuids)})"
-        return {exported.uuid: exported for exported in self._store.read(_exported, statement, uuids)}
+        found = self._store.read_of_nodes(_exported, f"SELECT {_EXPORTED_COLUMNS} FROM nodes", uuids)
+        return {exported.uuid: exported for exported in found}
 
     def put(self, record: NodeRecord) -> None:
         """Add or replace a node. Epoch and sequence never go back; raises KeyMismatchError for another identity key."""

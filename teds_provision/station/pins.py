@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from operator import attrgetter
 from typing import Final
 
@@ -14,13 +14,14 @@ from teds_provision.station.datasheets import Datasheets
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.nodes import Nodes
 from teds_provision.station.plant.plant import Plant
-from teds_provision.station.row_macs import MacRow, RowMacs, Values, changed
-from teds_provision.station.store.database import CHUNK, places
+from teds_provision.station.row_macs import MacRow, RowMacs, changed
+from teds_provision.station.store.database import CHUNK
 from teds_provision.station.store.records import ExportEligibility, NodeRecord, WhitelistEntry
 from teds_provision.station.store.row_sample import RowSample
 from teds_provision.station.store.store import Store
 
-_values = attrgetter(*(column.name for column in fields(WhitelistEntry)))
+_values_but_mac = attrgetter(*(column.name for column in fields(WhitelistEntry) if column.name != "mac"))
+_bound = attrgetter("uuid", "fingerprint", "assurance", "name")
 
 RECORD_AGAIN: Final = 600.0
 """Seconds in which a process records one wrong key of a UUID.
@@ -80,7 +81,9 @@ class Pins:
                 pins[node.uuid] = keys.fingerprint(node.point)
         for entry in entries:
             if entry.fingerprint is not None:
-                pins[entry.uuid] = _wholer(entry.fingerprint, pins.get(entry.uuid))
+                seen = pins.get(entry.uuid)
+                if entry.fingerprint != seen:
+                    pins[entry.uuid] = _wholer(entry.fingerprint, seen)
         return pins
 
     def check(self, uuid: bytes, point: bytes) -> None:
@@ -138,8 +141,8 @@ class Pins:
 
     def get_many(self, uuids: Sequence[bytes]) -> dict[bytes, WhitelistEntry]:
         """Return the entries of a chunk of nodes, by UUID."""
-        statement = f"SELECT * FROM whitelist WHERE uuid IN ({places(uuids)})"
-        return {entry.uuid: self._checked(entry) for entry in self._store.read(WhitelistEntry, statement, uuids)}
+        entries = self._store.read_of_nodes(WhitelistEntry, "SELECT * FROM whitelist", uuids)
+        return {entry.uuid: self._checked(entry) for entry in entries}
 
     def put(self, *entries: WhitelistEntry) -> None:
         """Add or replace entries of the whitelist (the vault opens); the caller has held keys against pinned ones."""
@@ -151,11 +154,15 @@ class Pins:
 
     def put_many(self, entries: Iterable[WhitelistEntry]) -> None:
         """Add or replace entries, each with its MAC, without a report to the plant; inside a transaction."""
-        self.restore(replace(entry, mac=self._row_macs.mac("whitelist", _bound(entry))) for entry in entries)
+        mac = self._row_macs.mac
+        self._put_rows((*_values_but_mac(entry), mac("whitelist", _bound(entry))) for entry in entries)
 
     def restore(self, entries: Iterable[WhitelistEntry]) -> None:
         """Add or replace entries with the MACs that they have: they come from a backup."""
-        self._store.execute_many("INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)", map(_values, entries))
+        self._put_rows((*_values_but_mac(entry), entry.mac) for entry in entries)
+
+    def _put_rows(self, rows: Iterable[tuple[object, ...]]) -> None:
+        self._store.execute_many("INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)", rows)
 
     def _report_pin(self, entry: WhitelistEntry) -> None:
         """Report a new pin of this station to the plant."""
@@ -217,7 +224,3 @@ def _wholer(pin: str | None, seen: str | None) -> str:
     if pin is None or (seen is not None and same_key(pin, seen)):
         return seen or ""
     return pin
-
-
-def _bound(entry: WhitelistEntry) -> Values:
-    return (entry.uuid, entry.fingerprint, entry.assurance, entry.name)

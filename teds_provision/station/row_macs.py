@@ -10,6 +10,7 @@ Not promised: a row that this station once made and removed since can be put bac
 
 from __future__ import annotations
 
+import hashlib
 import hmac
 from collections.abc import Callable, Iterator
 from typing import Final
@@ -20,6 +21,7 @@ from teds_provision.vault.base import Vault
 
 MAC_OCTETS: Final = 16
 KEY_OCTETS: Final = 32
+_BLOCK_OCTETS: Final = 64
 _SHOWN = 5
 Values = tuple[str | bytes | None, ...]
 MacRow = tuple[str, bytes | None, str, Values]
@@ -34,7 +36,7 @@ class RowMacs:
 
     def __init__(self, vault: Callable[[], Vault]) -> None:
         self._vault = vault
-        self._keyed: hmac.HMAC | None = None
+        self._keyed: _KeyedHash | None = None
         self.sources: tuple[Callable[[RowSample], Iterator[MacRow]], ...] = ()
         """Of each topic, those of its rows with a MAC that are in a sample: what doctor checks."""
 
@@ -49,11 +51,11 @@ class RowMacs:
 
     def use(self, key: bytes) -> None:
         """Make and check MACs with this key from now on."""
-        self._keyed = _keyed(key)
+        self._keyed = _KeyedHash(key)
 
     def is_key(self, key: bytes) -> bool:
         """Return True if this is the key in use."""
-        return self._keyed is not None and hmac.compare_digest(_keyed(key).digest(), self._keyed.digest())
+        return self._keyed is not None and hmac.compare_digest(_KeyedHash(key).mac(b""), self._keyed.mac(b""))
 
     def mac(self, kind: str, values: Values) -> bytes:
         """Return the MAC of a row of this kind; the vault opens if it is closed."""
@@ -65,11 +67,9 @@ class RowMacs:
             if value is None:  # not the empty text: a length that no value has
                 whole += b"\xff\xff\xff\xff"
             else:
-                octets = value if isinstance(value, bytes) else value.encode()
+                octets = value if type(value) is bytes else value.encode()  # type: ignore[union-attr]
                 whole += len(octets).to_bytes(4, "big") + octets
-        mac = self._keyed.copy()
-        mac.update(whole)
-        return mac.digest()[:MAC_OCTETS]
+        return self._keyed.mac(whole)[:MAC_OCTETS]
 
     def holds(self, mac: bytes | None, kind: str, values: Values) -> bool:
         """Return True if this is the MAC of such a row."""
@@ -96,9 +96,27 @@ class RowMacs:
                     yield name
 
 
-def _keyed(key: bytes) -> hmac.HMAC:
-    """Return an HMAC that has absorbed its key: half the cost of a short one; a handover makes two per node."""
-    return hmac.new(key, digestmod="sha256")
+class _KeyedHash:
+    """HMAC-SHA-256 whose two hashes have absorbed the key: a handover makes two or three MACs a node.
+
+    As RFC 2104 section 2 writes it: two thirds of the cost of a copied ``hmac.HMAC``, which is Python around the
+    same two hashes.
+    """
+
+    __slots__ = ("_inner", "_outer")
+
+    def __init__(self, key: bytes) -> None:
+        assert len(key) <= _BLOCK_OCTETS
+        padded = key.ljust(_BLOCK_OCTETS, b"\0")
+        self._inner = hashlib.sha256(bytes(octet ^ 0x36 for octet in padded))
+        self._outer = hashlib.sha256(bytes(octet ^ 0x5C for octet in padded))
+
+    def mac(self, octets: bytes) -> bytes:
+        """Return the MAC of these octets, 32 octets."""
+        inner, outer = self._inner.copy(), self._outer.copy()
+        inner.update(octets)
+        outer.update(inner.digest())
+        return outer.digest()
 
 
 def changed(what: list[str], cure: str) -> StoreChangedError:

@@ -378,3 +378,32 @@ def test_an_error_of_what_joins_a_step_is_that_steps_and_it_is_not_tried_again(w
             pass
     assert tries == ["a try"]
     assert station.nodes.named("left") is not None
+
+
+def test_rows_of_a_chunk_of_nodes_are_found_among_many_others_and_with_none_between(watched: StatementLog) -> None:
+    """One walk over the index where all between are asked for, look-ups where others are."""
+    station = watched.station
+    uuids = [number.to_bytes(10, "big") for number in range(400)]
+    with station.transaction():
+        for uuid in uuids:
+            station.nodes.put(NodeRecord(uuid, name=uuid.hex()))
+    absent = [(1000 + number).to_bytes(10, "big") for number in range(40)]
+    for asked in (uuids[:100], uuids[::7], uuids[:5], [*reversed(uuids[:50]), *absent], absent, []):
+        watched.statements.clear()
+        found = station.nodes.get_many(asked)
+        assert found.keys() == {uuid for uuid in asked if uuid in uuids}
+        assert all(record.name == uuid.hex() for uuid, record in found.items())
+    assert station.keys.get_many(uuids) == []
+
+
+def test_a_damaged_row_between_the_nodes_of_a_chunk_is_an_error_of_the_store(watched: StatementLog) -> None:
+    uuids = [number.to_bytes(10, "big") for number in range(40)]
+
+    def unreadable(uuid: bytes, name: str) -> bytes:
+        raise ValueError(name)
+
+    with watched.station.transaction():
+        for uuid in uuids:
+            watched.station.nodes.put(NodeRecord(uuid, name=uuid.hex()))
+    with pytest.raises(StoreError, match="damaged"):
+        watched.station._store.read_of_nodes(unreadable, "SELECT uuid, name FROM nodes", uuids)

@@ -5,6 +5,8 @@ Another program does it in the store's file. Not held, and not promised: a row t
 
 from __future__ import annotations
 
+import hashlib
+import hmac
 import os
 import sqlite3
 from collections.abc import Iterator
@@ -15,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.station.row_macs import KEY_OCTETS, MAC_OCTETS, RowMacs
 from teds_provision.station.station import Station
 from teds_provision.station.store.records import RevocationRecord, TrustRecord, WhitelistEntry
 from tests.plant.stations import Plant
@@ -174,3 +177,17 @@ def test_every_column_with_a_mac_is_among_these(home: Home) -> None:
         if column == "mac" or column.endswith("_mac")
     }
     assert found == {(table, mac_of(table)) for table in COLUMNS} | {(table, mac) for table, (_, mac) in OTHERS.items()}
+
+
+@pytest.mark.parametrize("length", [0, 1, 55, 63, 64, 65, 1000])
+def test_the_mac_of_a_row_is_hmac_over_its_kind_and_values(length: int) -> None:
+    """As RFC 2104 has it, however the hashes are kept: stores of earlier versions have such MACs."""
+    key, value = bytes(range(KEY_OCTETS)), "x" * length
+    macs = RowMacs(lambda: pytest.fail("the vault is not asked"))
+    macs.use(key)
+    whole = b"kind\0" + length.to_bytes(4, "big") + value.encode() + b"\xff\xff\xff\xff" + b"\0\0\0\x01\x07"
+    expected = hmac.new(key, whole, hashlib.sha256).digest()[:MAC_OCTETS]
+    for _ in range(2):
+        assert macs.mac("kind", (value, None, b"\x07")) == expected
+    assert macs.is_key(key)
+    assert not macs.is_key(bytes(KEY_OCTETS))

@@ -84,6 +84,8 @@ def _require_own(file: Path) -> None:
 
 CHUNK = 500
 """Rows that are looked up, read or written at once."""
+_FEW_NODES = 32
+"""So many nodes are looked up one by one."""
 _REMEMBERED = 100
 _Record = TypeVar("_Record")
 _Value = TypeVar("_Value")
@@ -204,6 +206,25 @@ class Database(Connection):
             if records is None:
                 records = self._remembered[asked] = tuple(self.read(make, statement, values))
             return records
+
+    def read_of_nodes(self, make: Callable[..., _Record], selection: str, uuids: Sequence[bytes]) -> list[_Record]:
+        """Make a record of every row of a chunk of nodes, by UUID; raises what :meth:`read` raises.
+
+        ``selection`` is a SELECT without a condition, its first column ``uuid`` that of an index. Of many nodes in a
+        row, as in a handover, mostly all between the first and the last are asked for, or none is here: then one walk
+        over the index costs half of the look-ups, or nothing.
+        """
+        if len(uuids) > _FEW_NODES:
+            most = len(uuids) + _FEW_NODES
+            wanted = set(uuids)
+            statement = f"{selection} WHERE uuid BETWEEN ? AND ? ORDER BY uuid LIMIT ?"
+            rows = self.execute(statement, (min(wanted), max(wanted), most))
+            if len(rows) < most:  # else there are others between them
+                try:
+                    return [make(*row) for row in rows if row[0] in wanted]
+                except (ValueError, TypeError, AttributeError) as error:
+                    raise self._damaged() from error
+        return self.read(make, f"{selection} WHERE uuid IN ({places(uuids)}) ORDER BY uuid", uuids)
 
     def stream(self, make: Callable[..., _Record], statement: str, after: int = 0) -> Iterator[_Record]:
         """Make records a chunk at a time, holding no lock between chunks; raises StoreError.
