@@ -120,6 +120,10 @@ run(["--help"])
     assert "The plant" not in help_text
 
 
+@pytest.mark.nightly(
+    "tests/test_core_alone.py::test_the_tests_of_the_core_pass holds a node from tap to verdict there, and "
+    "tests/cli/test_demo_ends.py::test_the_whole_story_as_make_demo_starts_it the demo"
+)
 def test_the_demo_shows_the_whole_story(core: Path) -> None:
     done = run(core, "-m", "teds_provision", "--json", "demo", patience=10 * PATIENCE)
     assert done.returncode == 0, done.stderr[-2000:]

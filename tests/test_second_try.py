@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.second_try import NOTES, Failure, Outcomes, refusal
+from tests import second_try
+from tests.second_try import NOTES, Failure, Outcomes, main, refusal
 
 pytestmark = pytest.mark.slow
 
@@ -29,25 +29,28 @@ def fails_once(name="seen"):
 
 
 class Suite:
-    """A temporary suite of one file, and how its run ended."""
+    """A temporary suite of one file, and how its run ended: in this process, or by the command of the gate."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, printed: pytest.CaptureFixture[str]) -> None:
         self.folder = folder
         self.code = -1
         self.printed = ""
+        self._captured = printed
 
     def run(self, text: str, *words: str) -> None:
+        self._write(text)
+        self.code = main(["-q", *words])
+        self.printed = "".join(self._captured.readouterr())
+
+    def run_as_the_gate_does(self, text: str, *words: str) -> None:
+        self._write(text)
+        command = [sys.executable, "-m", "tests.second_try", "-q", *words]
+        ended = subprocess.run(command, capture_output=True, text=True, check=False)
+        self.code, self.printed = ended.returncode, ended.stdout + ended.stderr
+
+    def _write(self, text: str) -> None:
         (self.folder / "pytest.ini").write_text("[pytest]\nmarkers = link\n")
         (self.folder / "test_it.py").write_text(ONCE + text)
-        ended = subprocess.run(
-            [sys.executable, "-m", "tests.second_try", "-q", *words],
-            cwd=self.folder,
-            env=os.environ | {"PYTHONPATH": str(ROOT), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_ADDOPTS": ""},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        self.code, self.printed = ended.returncode, ended.stdout + ended.stderr
 
     def note(self) -> str:
         file = self.folder / NOTES
@@ -55,13 +58,18 @@ class Suite:
 
 
 @pytest.fixture
-def suite(tmp_path: Path) -> Suite:
-    return Suite(tmp_path)
+def suite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Suite:
+    monkeypatch.chdir(tmp_path)
+    for name, value in (("PYTHONPATH", str(ROOT)), ("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1"), ("PYTEST_ADDOPTS", "")):
+        monkeypatch.setenv(name, value)
+    return Suite(tmp_path, capfd)
 
 
 def test_a_failure_in_the_first_run_only_is_cleared_and_printed(suite: Suite) -> None:
     """In a worker, as at the gate: the mark and the failure come through."""
-    suite.run("@pytest.mark.link\ndef test_it(): fails_once()\ndef test_other(): pass", "-p", "xdist", "-n", "2")
+    suite.run_as_the_gate_does(
+        "@pytest.mark.link\ndef test_it(): fails_once()\ndef test_other(): pass", "-p", "xdist", "-n", "2"
+    )
     assert suite.code == 0, suite.printed
     assert "NEEDED A SECOND TRY: test_it.py::test_it" in suite.note()
     assert "AssertionError: the machine was busy" in suite.note()
@@ -97,7 +105,9 @@ def test_both_runs_alone_must_pass(suite: Suite) -> None:
     ],
     ids=["process", "port", "process of the module"],
 )
-def test_a_process_or_port_of_the_test_is_noticed(suite: Suite, body: str) -> None:
+def test_a_process_or_port_of_the_test_is_noticed(suite: Suite, body: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One run alone is enough here."""
+    monkeypatch.setattr(second_try, "RUNS", 1)
     suite.run(body)
     assert suite.code == 0, suite.printed
     assert "NEEDED A SECOND TRY: test_it.py::test_it" in suite.note()

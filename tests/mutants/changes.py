@@ -8,10 +8,14 @@ holds, a number one off, a step or a refusal that is left out, the other of True
 from __future__ import annotations
 
 import ast
+import itertools
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+
+from tests.parsed import parsed
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "teds_provision"
@@ -78,13 +82,17 @@ class CPattern:
 class Module:
     """One module of the package: its text, its tree, and where each node lies in the text."""
 
-    def __init__(self, name: str, source: str) -> None:
+    def __init__(self, name: str, source: str, tree: ast.Module | None = None) -> None:
         self.name, self.source = name, source
-        self.tree = ast.parse(self.source)
-        self._begins = [0]
-        for line in self.source.splitlines(keepends=True):
-            self._begins.append(self._begins[-1] + len(line))
-        self._lines = self.source.splitlines(keepends=True)
+        self.tree = ast.parse(source) if tree is None else tree
+
+    @cached_property
+    def _lines(self) -> list[str]:
+        return self.source.splitlines(keepends=True)
+
+    @cached_property
+    def _begins(self) -> list[int]:
+        return list(itertools.accumulate(map(len, self._lines), initial=0))
 
     def span(self, node: ast.expr | ast.stmt) -> tuple[int, int]:
         """Return where a node begins and ends, in characters."""
@@ -96,9 +104,10 @@ class Module:
         text = self._lines[line - 1]
         return self._begins[line - 1] + (octets if text.isascii() else len(text.encode()[:octets].decode()))
 
-    def functions(self) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
-        """Yield every function with its name, that of its class before it."""
-        yield from _functions(self.tree, "")
+    @cached_property
+    def functions(self) -> list[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
+        """Every function with its name, that of its class before it; an outer one before those in it."""
+        return list(_functions(self.tree, ""))
 
     def mutant(
         self,
@@ -131,7 +140,7 @@ def modules(room: str = "") -> list[Module]:
     """Return every module of the package below ``room`` (``steps``, ``protocol/tim``, ``provisioning/agree.py``)."""
     place = PACKAGE / room
     paths = [place] if place.is_file() else sorted(place.rglob("*.py"))
-    return [Module(path.relative_to(ROOT).as_posix(), path.read_text()) for path in paths]
+    return [Module(path.relative_to(ROOT).as_posix(), path.read_text(), parsed(path)) for path in paths]
 
 
 def words_of(text: str) -> frozenset[str]:
@@ -158,7 +167,7 @@ def found(pattern: Pattern, where: list[Module]) -> list[Mutant]:
         )
         for module in where
         if pattern.function.rpartition(".")[2] in module.source
-        for function, tree in module.functions()
+        for function, tree in module.functions
         if function == pattern.function
         for node in ast.walk(tree)
         if isinstance(node, kind) and ast.unparse(node) == wanted  # to unparse all would take twice as long
@@ -181,7 +190,7 @@ def found_in_c(pattern: CPattern) -> list[Mutant]:
 
 def any_of(module: Module) -> list[Mutant]:
     """Return every mutant of a module that chance may draw."""
-    return [mutant for function, tree in module.functions() for mutant in _of_function(module, function, tree)]
+    return [mutant for function, tree in module.functions for mutant in _of_function(module, function, tree)]
 
 
 def _of_function(module: Module, function: str, tree: ast.FunctionDef | ast.AsyncFunctionDef) -> Iterator[Mutant]:

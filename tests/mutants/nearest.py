@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 from tests.mutants.changes import ROOT, Mutant, words_of
+from tests.parsed import parsed
 
 FAR = 9
 _AFTER_THE_REST = ("tests/system/", "tests/page/", "tests/faults/", "tests/fuzz/", "tests/strangers/", "tests/mutants/")
@@ -27,7 +28,7 @@ class Suite:
 
     @cached_property
     def _imports(self) -> dict[str, set[str]]:
-        return {name: set(self._of(name, text)) for name, text in self._text.items()}
+        return {name: set(self._of(name)) for name in self._paths}
 
     @cached_property
     def _distances(self) -> dict[str, dict[str, int]]:
@@ -74,12 +75,13 @@ class Suite:
                     queue.append(other)
         return seen
 
-    def _of(self, name: str, text: str) -> Iterable[str]:
+    def _of(self, name: str) -> Iterable[str]:
         """What a file imports, at its top or late; of a room also the modules that it takes from it by attribute."""
-        tree = ast.parse(text)
+        of_interest = (ast.Import, ast.ImportFrom, ast.Attribute)
+        nodes = [node for node in ast.walk(parsed(self._paths[name])) if isinstance(node, of_interest)]
         package = name if self._paths[name].name == "__init__.py" else name.rpartition(".")[0]
         rooms: dict[str, str] = {}
-        for node in ast.walk(tree):
+        for node in nodes:
             if isinstance(node, ast.Import):
                 yield from (alias.name for alias in node.names if alias.name in self._paths)
             elif isinstance(node, ast.ImportFrom):
@@ -92,7 +94,7 @@ class Suite:
                         yield inner
                     elif base in self._paths:
                         yield base
-        for node in ast.walk(tree):
+        for node in nodes:
             if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in rooms:
                 inner = f"{rooms[node.value.id]}.{node.attr}"
                 if inner in self._paths:
