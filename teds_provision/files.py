@@ -279,10 +279,10 @@ def _below(folder: str) -> Iterator[str]:
     with suppress(OSError), os.scandir(folder) as entries:
         here = sorted(entries, key=attrgetter("name"))
     for entry in here:
-        if _is_folder(entry):
-            yield from _below(entry.path)
-        elif entry.name.endswith(_JSON) and _is_file(entry):
+        if entry.name.endswith(_JSON) and _is_file(entry):  # nearly all of them
             yield entry.path
+        elif _is_folder(entry):
+            yield from _below(entry.path)
 
 
 def _is_folder(entry: os.DirEntry[str]) -> bool:

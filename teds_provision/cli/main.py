@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import gc
 import importlib
 import os
 import sys
@@ -197,6 +198,8 @@ def cli(ctx: click.Context, /, as_json: bool, **options: Any) -> None:
     Works over NFC, CAN and Bluetooth; then measures, publishes and drives actuators. Without a command: the station,
     who answers on its links now, what is wrong, and the next command.
     """
+    gc.freeze()  # the program itself is not looked through again
+    gc.enable()  # it was disabled while the program was imported
     ctx.obj = App(as_json=as_json, **options)
     if ctx.invoked_subcommand != "doctor":
         require_packages()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import pytest
 
@@ -86,3 +87,28 @@ def test_help_is_as_wide_as_click_makes_it(columns: str) -> None:
     )
     ours, _, clicks = python(code, COLUMNS=columns).out.partition(f"====={os.linesep}")
     assert ours == clicks
+
+
+def test_a_command_ends_without_a_search_for_circles() -> None:
+    code = (
+        "import atexit, gc, sys\n"
+        "atexit.register(lambda: print('kept', gc.get_freeze_count(), file=sys.stderr))\n"
+        "sys.argv = ['teds-provision', '--help']\n"
+        "from teds_provision.__main__ import main\n"
+        "main()\n"
+    )
+    word, count = python(code, COLUMNS="100").err.split()
+    assert word == "kept"
+    assert int(count) > 5_000
+
+
+def test_circles_are_searched_for_while_a_command_runs(tmp_path: Path) -> None:
+    code = (
+        "import gc, sys\n"
+        "from teds_provision.cli import context\n"
+        "context.App.station = lambda app: print('searched', gc.isenabled(), file=sys.stderr) or sys.exit(0)\n"
+        f"sys.argv = ['teds-provision', '--home', {str(tmp_path)!r}, 'nodes']\n"
+        "from teds_provision.__main__ import main\n"
+        "main()\n"
+    )
+    assert python(code).err.split() == ["searched", "True"]

@@ -604,6 +604,7 @@ PATTERNS = (
         "True",
         "tests/teds/test_codec_security.py",
     ),
+    Pattern("a command that runs long frees circles", "cli", "gc.enable()", "None", "tests/cli/test_startup.py"),
     Pattern(
         "a new image shows a valid value",
         "require_working_hardware",
