@@ -38,6 +38,7 @@ UNCALIBRATED = Path(__file__).parent / "angle.toml"  # PROFILE for boards withou
 PROVISION = ("provision", "--profile", str(UNCALIBRATED), "--yes")
 READERS = 8
 _WAIT = 120.0
+_ROUNDS = 5
 
 
 class Rows:
@@ -306,7 +307,7 @@ def _passed(line: dict[str, object]) -> bool:
 
 
 def eight_readers(rows: Rows) -> None:
-    """Time one ``--watch`` over eight readers against one reader; then eight commands on one store."""
+    """Time one ``--watch`` over eight readers against one reader, median of some; then eight commands on one store."""
     slow = ("--crypto-delay", str(SLOW * 1000))
 
     def side_by_side(home: Path, count: int) -> float:
@@ -314,22 +315,26 @@ def eight_readers(rows: Rows) -> None:
         with ExitStack() as stack:
             boards = [stack.enter_context(nodes("nfc", link, *slow)) for link in links]
             watch = started(home, *PROVISION, "--watch", *(word for link in links for word in ("--nfc", link)))
-            next_node(boards[0])  # everything is loaded and unlocked with the first board
+            next_node(boards[0])  # the vault is unlocked with the first board
             _next_board(watch)
-            began = time.perf_counter()
-            next_nodes(boards)
-            passed = sum(_next_board(watch) for _ in boards)
-            taken = time.perf_counter() - began
+            taken, passed = [], 0
+            next_nodes(boards)  # a node's process loads with its first board what it needs: not the station's share
+            passed += sum(_next_board(watch) for _ in boards)
+            for _ in range(_ROUNDS):
+                began = time.perf_counter()
+                next_nodes(boards)
+                passed += sum(_next_board(watch) for _ in boards)
+                taken.append(time.perf_counter() - began)
             watch.terminate()
             watch.communicate(timeout=_WAIT)
-            if passed != count:
-                raise SystemExit(f"{passed} of {count} boards passed")
-            return taken
+            if passed != (1 + _ROUNDS) * count:
+                raise SystemExit(f"{passed} of {(1 + _ROUNDS) * count} boards passed")
+            return statistics.median(taken)
 
     with station(quick=True) as home:
         alone, all_of_them = side_by_side(home, 1), side_by_side(home, READERS)
     rows.add(f"--watch, one reader, 80 ms node ({READERS}: {all_of_them:.2f} s)", alone, "s")
-    rows.add(f"--watch, {READERS} readers against one", all_of_them / alone, "×", aim=1.2)
+    rows.add(f"--watch, {READERS} readers against one", all_of_them / alone, "×", aim=1.15)
     with station(quick=True) as home, ExitStack() as stack:
         links = [f"udp:127.0.0.1:{free_port()}" for _ in range(READERS)]
         next_nodes([stack.enter_context(nodes("nfc", link, *slow)) for link in links])
