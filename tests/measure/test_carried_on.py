@@ -146,7 +146,7 @@ def test_if_no_source_address_is_named_the_next_free_one_is_used(hall: Hall) -> 
 
 
 def beside_by_itself(hall: Hall, a: str, g: str) -> float:
-    first, second = hall.begin(g, "--rate", 50), hall.begin(a, "--rate", 20)
+    first, second = hall.begin(g, "--rate", 10), hall.begin(a, "--rate", 5)  # what a busy node still sends in time
     for running in (first, second):
         running.wait_for('"event":"data"')
     acted = hall.station.run("--json", "set", g, 1, 0.05, "--hold", 0.1, "--can", hall.can)
@@ -164,7 +164,7 @@ def beside_by_itself(hall: Hall, a: str, g: str) -> float:
 
 
 def beside_refused(hall: Hall, a: str, g: str) -> float:
-    first = hall.begin(g, "--rate", 50)
+    first = hall.begin(g, "--rate", 10)
     first.wait_for('"event":"data"')
     named = ("--can", f"{hall.can}&source=0xF1")
     for words in (["measure", g], ["measure", a], ["set", g, 1, 0.05, "--hold", 0.1]):  # each would open sessions

@@ -9,7 +9,9 @@ import argparse
 import shutil
 import sys
 import tempfile
+import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,6 +28,7 @@ RATE = 100
 SHOWN = 20
 CHANNELS = 24
 LOOKS = 6
+CATCHING_UP = 30.0  # seconds for the page to take in what was measured before the end
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,8 @@ class Load:
 
     seconds: float
     heap: tuple[int, ...]
-    received: int  # points that the page took in
+    received: int  # points that the page took in, from its second report on
+    given: int  # points that the station gave out to whoever listens, since then: it thins bursts
     dropped: int  # messages that it was too slow for, by its own count
     drawn: int
     left_out: int  # drawings, by its own count
@@ -49,8 +53,9 @@ class Load:
     def __str__(self) -> str:
         heap = ", ".join(f"{octets / 1e6:.2f}" for octets in self.heap)
         return (
-            f"{self.seconds:.1f} s, {CHANNELS} channels, {SHOWN} drawn: {self.received} of {self.sampled} points came "
-            f"({self.dropped} messages dropped, as the page tells; {self.lost} points lost before the station), "
+            f"{self.seconds:.1f} s, {CHANNELS} channels, {SHOWN} drawn: {self.received} of {self.given} points came "
+            f"({self.dropped} messages dropped, as the page tells; {self.sampled} were sampled from the first on, and "
+            f"{self.lost} lost before the station), "
             f"drawn {self.drawn / self.seconds:.1f} times/s ({self.left_out} left out, as it tells), heap {heap} MB"
         )
 
@@ -65,9 +70,13 @@ def run(browser: Browser, lab: Lab, seconds: float) -> Load:
             "not provisioned",
             30,
         )
+        beside = Listener(lab)
+        beside.start()
         with opened(browser, lab, route="measure") as page:
             kept = station.request("POST", "/measurements", {"uuids": uuids, "rate": RATE})["id"]
-            until(lambda: counts_of(page)["received"] > RATE * SHOWN, "no points arrive", 30)
+            early = until(lambda: received_beyond(page, RATE * SHOWN), "no points arrive")
+            early = until(lambda: received_beyond(page, early), "no more points arrive")  # counted just now
+            before = beside.given  # the page was not there to see the first ones
             devtools = page.context.new_cdp_session(page)
             began, heaps = time.monotonic(), []
             for _ in range(LOOKS):
@@ -76,11 +85,35 @@ def run(browser: Browser, lab: Lab, seconds: float) -> Load:
             heaps.append(heap(devtools))
             sampled, lost = samples(station)
             station.request("DELETE", f"/measurements/{kept}", {})
-            page.wait_for_timeout(1500)  # the page reports once a second
-            counts, elapsed = counts_of(page), time.monotonic() - began
-    return Load(
-        elapsed, tuple(heaps), counts["received"], counts["dropped"], counts["drawn"], counts["skipped"], sampled, lost
-    )
+            elapsed, end = time.monotonic() - began, time.monotonic() + CATCHING_UP
+            while (counts := counts_of(page))["dropped"] == 0 and time.monotonic() < end:
+                if counts["received"] - early >= beside.given - before:
+                    break
+                page.wait_for_timeout(200)  # it reports once a second, and may be behind
+    points = counts["received"] - early, beside.given - before
+    return Load(elapsed, tuple(heaps), *points, counts["dropped"], counts["drawn"], counts["skipped"], sampled, lost)
+
+
+class Listener(threading.Thread):
+    """A client beside the page: counts the points that the station gives out."""
+
+    def __init__(self, lab: Lab) -> None:
+        super().__init__(daemon=True)
+        self._lab = lab
+        self.given = 0
+
+    def run(self) -> None:
+        """Count until the station ends."""
+        with suppress(Exception):  # the connection ends as the station does
+            for message in client.connect(home=self._lab.station.home).live():
+                if message["type"] == "values":
+                    self.given += sum(len(times) for times, _ in message["channels"].values())
+
+
+def received_beyond(page: Page, count: int) -> int:
+    """Return how many points the page has taken in, 0 if not more than ``count``."""
+    received = counts_of(page)["received"]
+    return received if received > count else 0
 
 
 def counts_of(page: Page) -> dict[str, int]:

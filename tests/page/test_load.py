@@ -25,4 +25,4 @@ def test_twenty_channels_at_100_hz_lose_nothing_unreported_and_need_no_more_memo
     assert seen.grown < 3_000_000, seen
     assert seen.drawn > 0, seen
     if seen.dropped == 0:
-        assert seen.received > 0.95 * seen.sampled, seen
+        assert seen.received > 0.95 * seen.given > 0, seen
