@@ -33,7 +33,7 @@ from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import call
 from tests.e2e.desk import ANGLE
 from tests.handover.desk import trust
-from tests.measure.hall import Hall
+from tests.measure.rig import Rig
 
 PACKAGE = str(Path(__file__).resolve().parent.parent / "teds_provision")
 
@@ -81,16 +81,16 @@ def _quiet(_notice: Notice) -> None:
 def verbs(folder: Path) -> Iterator[tuple[str, Counter[str]]]:
     """Run each verb on a station with one provisioned node on its bus, and count."""
     folder.mkdir()
-    hall = Hall(folder, {"a": ANGLE})
+    rig = Rig(folder, {"a": ANGLE})
     try:
-        home = hall.station.home
+        home = rig.station.home
         with (
             closing(make_station(folder / "other", "other")) as other,
             closing(Station.open(home, ask=lambda *_: PASSPHRASE)) as own,
         ):
             trust(own, other, "other")
-        hall.nodes["a"].start()
-        uuid, link = hall.nodes["a"].uuid, ("--can", hall.can, "--via", "can")
+        rig.nodes["a"].start()
+        uuid, link = rig.nodes["a"].uuid, ("--can", rig.can, "--via", "can")
         commands: tuple[tuple[object, ...], ...] = (
             ("identify", *link),
             ("verify", uuid, *link),
@@ -104,7 +104,7 @@ def verbs(folder: Path) -> Iterator[tuple[str, Counter[str]]]:
             assert done.code == 0, done
             yield str(words[0]), calls
     finally:
-        hall.close()
+        rig.close()
 
 
 def main() -> None:

@@ -49,7 +49,7 @@ OF_THE_CALLER = OF_TERMINALS | {"AMENT_PREFIX_PATH", "CYCLONEDDS_URI", "NOTIFY_S
 IN_MEMORY = Path("/dev/shm", f"tp{os.getuid()}")
 ROOM = 8 << 30  # octets free there; a run of all tests needs less than a tenth of it
 LONGEST_TEMPORARY = 20  # characters: tests bind Unix sockets below it, whose whole path has 107 at most
-SHARED = ("hall", "bench", "lab")  # fixtures of a module whose value says ``visited``
+SHARED = ("rig", "bench", "lab")  # fixtures of a module whose value says ``visited``
 
 # Of the checks of health that one alone is about time: examples that a busy machine was slow to make are good examples.
 settings.register_profile("desk", deadline=None, print_blob=True, suppress_health_check=[HealthCheck.too_slow])

@@ -178,7 +178,7 @@ from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.station.store.records import KeptMeasurement
 from teds_provision.station.store.records import NodeRecord
 from tests.bench import make_station
-from tests.measure.hall import provisioned
+from tests.measure.rig import provisioned
 
 folder = Path(sys.argv[1])
 station = make_station(folder / "home")

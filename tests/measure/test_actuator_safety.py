@@ -23,7 +23,7 @@ from teds_provision.links.can.port import CanPort
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ROOT, Running
 from tests.links.can.hub import Hub
-from tests.measure.hall import Hall, events
+from tests.measure.rig import Rig, events
 from tests.measure.sinks.test_ros1 import Master, master  # noqa: F401  the fixture
 from tests.measure.sinks.test_ros1 import pytestmark as what_ros_needs
 from tests.ncap.service import Service, verdict, verified
@@ -39,8 +39,8 @@ CUT = 2 * DEAD_MAN
 
 
 @contextmanager
-def hall_on(folder: Path, can: str = "") -> Iterator[Hall]:
-    made = Hall(folder, {"g": "gripper"})
+def rig_on(folder: Path, can: str = "") -> Iterator[Rig]:
+    made = Rig(folder, {"g": "gripper"})
     try:
         made.can = can or made.can
         made.nodes["g"].start()
@@ -50,8 +50,8 @@ def hall_on(folder: Path, can: str = "") -> Iterator[Hall]:
 
 
 @pytest.fixture
-def hall(tmp_path: Path) -> Iterator[Hall]:
-    with hall_on(tmp_path) as made:
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    with rig_on(tmp_path) as made:
         yield made
 
 
@@ -63,8 +63,8 @@ def wire() -> Iterator[Hub]:
 
 
 @pytest.fixture
-def cut_hall(tmp_path: Path, wire: Hub) -> Iterator[Hall]:
-    with hall_on(tmp_path, wire.spec) as made:
+def cut_rig(tmp_path: Path, wire: Hub) -> Iterator[Rig]:
+    with rig_on(tmp_path, wire.spec) as made:
         yield made
 
 
@@ -76,8 +76,8 @@ class Journal:
     dead_man: float = DEAD_MAN
 
     @classmethod
-    def of(cls, hall: Hall, dead_man: float = DEAD_MAN) -> Journal:
-        process = hall.nodes["g"].process
+    def of(cls, rig: Rig, dead_man: float = DEAD_MAN) -> Journal:
+        process = rig.nodes["g"].process
         assert process is not None
         return cls(process, dead_man)
 
@@ -127,31 +127,31 @@ def time_of(line: dict[str, Any]) -> float:
     return datetime.fromisoformat(line["time"]).timestamp()
 
 
-def begin_set(hall: Hall, dead_man: float = DEAD_MAN) -> Running:
+def begin_set(rig: Rig, dead_man: float = DEAD_MAN) -> Running:
     """Hold its opening by command. Begun again where the machine is so busy that the dead-man runs out at once."""
-    words = ["set", hall.nodes["g"].uuid, 1, 0.05, "--dead-man", int(dead_man * 1000), "--can", hall.can]
-    journal, acting = Journal.of(hall), hall.station.start("--json", *words)
+    words = ["set", rig.nodes["g"].uuid, 1, 0.05, "--dead-man", int(dead_man * 1000), "--can", rig.can]
+    journal, acting = Journal.of(rig), rig.station.start("--json", *words)
 
     def moves() -> bool:
         nonlocal acting
         acting.read(0.05)
         if acting.process.poll() is not None:
-            acting = hall.station.start("--json", *words)
+            acting = rig.station.start("--json", *words)
         return '"applied"' in acting.out and bool(lines := journal.states()) and not lines[-1]["safe"]
 
     until(moves, lambda: (acting.out, acting.err, journal.states()[-5:]))
     return acting
 
 
-def test_a_station_that_is_killed_leaves_it_safe(hall: Hall) -> None:
-    acting = begin_set(hall)
+def test_a_station_that_is_killed_leaves_it_safe(rig: Rig) -> None:
+    acting = begin_set(rig)
     killed = time.time()
     acting.process.kill()
-    Journal.of(hall).is_safe(killed)
+    Journal.of(rig).is_safe(killed)
 
 
-def test_a_station_that_hangs_leaves_it_safe_and_moves_nothing_when_it_wakes(hall: Hall) -> None:
-    acting, journal = begin_set(hall), Journal.of(hall)
+def test_a_station_that_hangs_leaves_it_safe_and_moves_nothing_when_it_wakes(rig: Rig) -> None:
+    acting, journal = begin_set(rig), Journal.of(rig)
     stopped = time.time()
     acting.signal(signal.SIGSTOP)
     journal.is_safe(stopped)
@@ -163,18 +163,18 @@ def test_a_station_that_hangs_leaves_it_safe_and_moves_nothing_when_it_wakes(hal
     assert all(line["safe"] for line in journal.states()[count:]), "a late order moves nothing"
 
 
-def test_a_link_that_is_cut_leaves_it_safe_and_the_command_says_so(cut_hall: Hall, wire: Hub) -> None:
-    acting, journal = begin_set(cut_hall), Journal.of(cut_hall)
+def test_a_link_that_is_cut_leaves_it_safe_and_the_command_says_so(cut_rig: Rig, wire: Hub) -> None:
+    acting, journal = begin_set(cut_rig), Journal.of(cut_rig)
     cut = time.time()
     wire.lose = lambda _identifier, _data: True
     journal.is_safe(cut)
     assert acting.end().code == 5
 
 
-def test_one_lost_frame_stops_nothing(cut_hall: Hall, wire: Hub) -> None:
+def test_one_lost_frame_stops_nothing(cut_rig: Rig, wire: Hub) -> None:
     """A value is repeated after a quarter of the dead-man: its second sending still comes in time."""
     long = 4 * DEAD_MAN  # so that a busy machine has three quarters of it
-    acting, journal = begin_set(cut_hall, long), Journal.of(cut_hall)
+    acting, journal = begin_set(cut_rig, long), Journal.of(cut_rig)
     lost: list[int] = []
 
     def lose_a_first_frame(identifier: int, data: bytes) -> bool:
@@ -192,9 +192,9 @@ def test_one_lost_frame_stops_nothing(cut_hall: Hall, wire: Hub) -> None:
     assert acting.end().code == 0
 
 
-def test_a_value_without_an_answer_is_given_up_at_the_dead_man(cut_hall: Hall, wire: Hub) -> None:
+def test_a_value_without_an_answer_is_given_up_at_the_dead_man(cut_rig: Rig, wire: Hub) -> None:
     """Replies are lost: a value leaves three times at most, then none until a Clock has had its answer."""
-    acting, journal = begin_set(cut_hall), Journal.of(cut_hall)
+    acting, journal = begin_set(cut_rig), Journal.of(cut_rig)
     cut = time.time()
     wire.lose = lambda identifier, _data: identifier >> 8 == 0x18DAF1
     asked = len(wire.frames)
@@ -284,18 +284,18 @@ def publishers() -> Iterator[list[subprocess.Popen[bytes]]]:
         process.wait()
 
 
-def listen(hall: Hall, ros: Ros1 | Ros2) -> Running:
-    words = [hall.nodes["g"].uuid, "--rate", 20, *ros.words, "--dead-man", int(DEAD_MAN * 1000)]
-    running = hall.begin(*words, environment=ros.environment)
+def listen(rig: Rig, ros: Ros1 | Ros2) -> Running:
+    words = [rig.nodes["g"].uuid, "--rate", 20, *ros.words, "--dead-man", int(DEAD_MAN * 1000)]
+    running = rig.begin(*words, environment=ros.environment)
     running.wait_for('"event":"data"')
     return running
 
 
 def test_by_topics_consumer_node_and_station_may_die(
-    hall: Hall, ros: Ros1 | Ros2, publishers: list[subprocess.Popen[bytes]]
+    rig: Rig, ros: Ros1 | Ros2, publishers: list[subprocess.Popen[bytes]]
 ) -> None:
-    journal, running = Journal.of(hall), listen(hall, ros)
-    driven = CanPort(f"{hall.can}&source=0xF6")
+    journal, running = Journal.of(rig), listen(rig, ros)
+    driven = CanPort(f"{rig.can}&source=0xF6")
     try:
         with driven.listen_frames(lambda frame: frame.identifier >> 16 == 0x18EF) as ear:
             publishers.append(ros.publish())
@@ -334,9 +334,9 @@ def test_by_topics_consumer_node_and_station_may_die(
     "tests/measure/test_actuator_safety.py::test_by_topics_consumer_node_and_station_may_die[ros1]: by topics"
 )
 def test_by_topics_the_bus_may_be_cut(
-    cut_hall: Hall, wire: Hub, ros: Ros1 | Ros2, publishers: list[subprocess.Popen[bytes]]
+    cut_rig: Rig, wire: Hub, ros: Ros1 | Ros2, publishers: list[subprocess.Popen[bytes]]
 ) -> None:
-    journal, running = Journal.of(cut_hall), listen(cut_hall, ros)
+    journal, running = Journal.of(cut_rig), listen(cut_rig, ros)
     publishers.append(ros.publish())
     journal.moves()
     cut = time.time()
@@ -351,10 +351,10 @@ def test_by_topics_the_bus_may_be_cut(
     journal.is_safe(ended)
 
 
-def test_the_ros_child_may_die(hall: Hall, master: Master, publishers: list[subprocess.Popen[bytes]]) -> None:  # noqa: F811
+def test_the_ros_child_may_die(rig: Rig, master: Master, publishers: list[subprocess.Popen[bytes]]) -> None:  # noqa: F811
     master.start()
     ros = Ros1(master)
-    journal, running = Journal.of(hall), listen(hall, ros)
+    journal, running = Journal.of(rig), listen(rig, ros)
     publishers.append(ros.publish())
     journal.moves()
     [child] = children(running.process.pid, "ros1_child.py")
@@ -383,46 +383,46 @@ HELD = 1.0  # the daemon's dead-man, seconds
 
 
 @contextmanager
-def held(hall: Hall, *words: object) -> Iterator[Service]:
+def held(rig: Rig, *words: object) -> Iterator[Service]:
     """Yield a daemon that holds the gripper's opening for half a minute."""
-    hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
-    service = Service(hall.desk, hall.station).start(*words)
-    uuid = hall.nodes["g"].uuid
+    rig.desk.links = type(rig.desk.links)(rig.desk.links.nfc, rig.can)
+    service = Service(rig.desk, rig.station).start(*words)
+    uuid = rig.nodes["g"].uuid
     assert verdict(verified(service, uuid)) == "authentic"
     with service.client() as asked:
         asked.request("PUT", f"/nodes/{uuid}/channels/1", {"value": 0.05, "hold": 30})
-    Journal.of(hall).moves()
+    Journal.of(rig).moves()
     yield service
 
 
-def test_a_daemon_that_is_killed_leaves_it_safe(hall: Hall) -> None:
-    with held(hall) as service:
+def test_a_daemon_that_is_killed_leaves_it_safe(rig: Rig) -> None:
+    with held(rig) as service:
         killed = time.time()
         service.kill()
-        Journal.of(hall, HELD).is_safe(killed)
+        Journal.of(rig, HELD).is_safe(killed)
 
 
-def test_the_dead_man_of_a_daemon_is_the_one_that_it_was_started_with(hall: Hall) -> None:
-    with held(hall, "--dead-man", 8000) as service:
+def test_the_dead_man_of_a_daemon_is_the_one_that_it_was_started_with(rig: Rig) -> None:
+    with held(rig, "--dead-man", 8000) as service:
         with service.client() as asked:
             assert asked.request("GET", "/status")["dead_man"] == 8000
         killed = time.time()
         service.kill()
-        journal = Journal.of(hall, 8.0)
+        journal = Journal.of(rig, 8.0)
         journal.is_safe(killed)
         safe = [time_of(line) - killed for line in journal.states() if line["safe"] and time_of(line) > killed]
         assert safe[0] > HELD + BUSY, "its last value was fed at most a quarter of the dead-man before"
 
 
-def test_a_daemon_whose_bus_is_cut_leaves_it_safe_and_holds_again_when_asked(cut_hall: Hall, wire: Hub) -> None:
-    with held(cut_hall) as service:
-        journal = Journal.of(cut_hall, HELD)
+def test_a_daemon_whose_bus_is_cut_leaves_it_safe_and_holds_again_when_asked(cut_rig: Rig, wire: Hub) -> None:
+    with held(cut_rig) as service:
+        journal = Journal.of(cut_rig, HELD)
         cut = time.time()
         wire.lose = lambda _identifier, _data: True
         journal.is_safe(cut)
         wire.lose = lambda _identifier, _data: False
         back = time.time()
-        path = f"/nodes/{cut_hall.nodes['g'].uuid}/channels/1"
+        path = f"/nodes/{cut_rig.nodes['g'].uuid}/channels/1"
         with service.client() as asked:
 
             def taken() -> Any:
@@ -435,10 +435,10 @@ def test_a_daemon_whose_bus_is_cut_leaves_it_safe_and_holds_again_when_asked(cut
         service.end()
 
 
-def test_who_asks_no_more_lets_go(hall: Hall) -> None:
+def test_who_asks_no_more_lets_go(rig: Rig) -> None:
     """The page is closed, the script died: nobody asks again, and the daemon lets go at the end of the hold."""
-    with held(hall) as service, service.client() as asked:
+    with held(rig) as service, service.client() as asked:
         began = time.time()
-        asked.request("PUT", f"/nodes/{hall.nodes['g'].uuid}/channels/1", {"value": 0.05, "hold": 0.5})
-        Journal.of(hall, 0.5).is_safe(began)
+        asked.request("PUT", f"/nodes/{rig.nodes['g'].uuid}/channels/1", {"value": 0.05, "hold": 0.5})
+        Journal.of(rig, 0.5).is_safe(began)
         service.end()

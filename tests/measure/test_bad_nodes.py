@@ -16,7 +16,7 @@ import pytest
 
 from tests.e2e.desk import ANGLE
 from tests.measure.faulty_node import FAULTS
-from tests.measure.hall import FAULTY, Hall, events, of, states
+from tests.measure.rig import FAULTY, Rig, events, of, states
 
 pytestmark = pytest.mark.link
 RATE = 20
@@ -60,26 +60,26 @@ class NodeEvents:
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, NodeEvents]]:
     """What was seen of all of them; once more where the machine itself disturbed the two that must not be disturbed."""
-    hall = Hall(tmp_path_factory.mktemp("bad"), {**dict.fromkeys(FAULTS, ANGLE), "out_of_range": "gripper"})
+    rig = Rig(tmp_path_factory.mktemp("bad"), {**dict.fromkeys(FAULTS, ANGLE), "out_of_range": "gripper"})
     try:
         for number in range(TRIES):
-            found = measured_together(hall, hall.folder / f"bad{number}.jsonl")
+            found = measured_together(rig, rig.folder / f"bad{number}.jsonl")
             if all(found[name].is_undisturbed for name in ("good", "junk")):
                 break
         yield found
     finally:
-        hall.close()
+        rig.close()
 
 
-def measured_together(hall: Hall, file: Path) -> dict[str, NodeEvents]:
+def measured_together(rig: Rig, file: Path) -> dict[str, NodeEvents]:
     """Return every node under one measurement, until all that takes its time has happened."""
-    process = hall.desk.start(hall.can, *(f"{fault}={hall.nodes[fault].folder}" for fault in FAULTS), program=FAULTY)
+    process = rig.desk.start(rig.can, *(f"{fault}={rig.nodes[fault].folder}" for fault in FAULTS), program=FAULTY)
     process.wait_for('"ready": true')
-    uuids = {hall.nodes[fault].uuid: fault for fault in FAULTS}
-    running = hall.begin(*uuids, "--rate", RATE, "--to", file)
+    uuids = {rig.nodes[fault].uuid: fault for fault in FAULTS}
+    running = rig.begin(*uuids, "--rate", RATE, "--to", file)
     running.wait_for('"event":"data"')
     until = time.monotonic() + SECONDS
-    while time.monotonic() < until or not _all_told(running.out, hall.nodes["forgets"].uuid):
+    while time.monotonic() < until or not _all_told(running.out, rig.nodes["forgets"].uuid):
         running.read(0.1)
         assert time.monotonic() < until + 60, running.out[-3000:]
     running.signal(signal.SIGTERM)

@@ -21,7 +21,7 @@ from teds_provision.measure.sinks.mcap.recover import recover
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, PASSPHRASE, Running, limited
 from tests.links.can.hub import Hub
-from tests.measure.hall import Hall, events, of, states
+from tests.measure.rig import Rig, events, of, states
 from tests.pace import PATIENCE
 from tests.places import free_tcp_port
 
@@ -29,8 +29,8 @@ pytestmark = pytest.mark.link
 
 
 @pytest.fixture
-def hall(tmp_path: Path) -> Iterator[Hall]:
-    made = Hall(tmp_path, {"a": ANGLE})
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path, {"a": ANGLE})
     try:
         yield made
     finally:
@@ -50,12 +50,12 @@ def rows(file: Path) -> int:
     return sum(1 for line in file.read_text().splitlines() if not line.startswith("#")) - 1
 
 
-def test_a_bus_that_dies_is_opened_again_when_it_is_back(hall: Hall) -> None:
+def test_a_bus_that_dies_is_opened_again_when_it_is_back(rig: Rig) -> None:
     port = free_tcp_port()  # not one that the system may deal out to others while it is closed
     hub = Hub(port=port)
     try:
-        hall.nodes["a"].start(can=hub.spec)
-        running = hall.begin(hall.nodes["a"].uuid, "--rate", 20, can=hub.spec)
+        rig.nodes["a"].start(can=hub.spec)
+        running = rig.begin(rig.nodes["a"].uuid, "--rate", 20, can=hub.spec)
         running.wait_for('"event":"data"')
         hub.close()
         running.wait_for('"state":"lost"')
@@ -75,10 +75,10 @@ def test_a_bus_that_dies_is_opened_again_when_it_is_back(hall: Hall) -> None:
     assert times == sorted(times)
 
 
-def test_a_full_disk_ends_that_recording_and_nothing_else(hall: Hall, tmp_path: Path) -> None:
-    hall.nodes["a"].start()
+def test_a_full_disk_ends_that_recording_and_nothing_else(rig: Rig, tmp_path: Path) -> None:
+    rig.nodes["a"].start()
     file = tmp_path / "full.csv"
-    running = hall.begin(hall.nodes["a"].uuid, "--rate", 500, "--to", file, program=limited(200_000))
+    running = rig.begin(rig.nodes["a"].uuid, "--rate", 500, "--to", file, program=limited(200_000))
     running.wait_for("cannot be written", 90)
     data = running.out.count('"event":"data"')
     wait_for_count(running, '"event":"data"', data + 5)
@@ -93,10 +93,10 @@ def test_a_full_disk_ends_that_recording_and_nothing_else(hall: Hall, tmp_path: 
     assert all(row["a/angle [rad]"] for row in whole), "whole up to there"
 
 
-def test_a_reader_that_stalls_holds_up_no_recording(hall: Hall, tmp_path: Path) -> None:
-    hall.nodes["a"].start()
+def test_a_reader_that_stalls_holds_up_no_recording(rig: Rig, tmp_path: Path) -> None:
+    rig.nodes["a"].start()
     file = tmp_path / "run.csv"
-    running = hall.begin(hall.nodes["a"].uuid, "--rate", 500, "--to", file)
+    running = rig.begin(rig.nodes["a"].uuid, "--rate", 500, "--to", file)
     running.wait_for('"event":"data"')
     until = time.monotonic() + PATIENCE  # its lines are not read from here on: the pipe is full after a second
     before = rows(file)
@@ -109,16 +109,16 @@ def test_a_reader_that_stalls_holds_up_no_recording(hall: Hall, tmp_path: Path) 
     assert events(outcome.out)[-1]["event"] == "end"
 
 
-def test_a_terminal_that_is_closed_ends_the_recording_in_order_and_lets_the_node_go(hall: Hall, tmp_path: Path) -> None:
-    node, file = hall.nodes["a"].start(), tmp_path / "run.mcap"
+def test_a_terminal_that_is_closed_ends_the_recording_in_order_and_lets_the_node_go(rig: Rig, tmp_path: Path) -> None:
+    node, file = rig.nodes["a"].start(), tmp_path / "run.mcap"
     near, far = pty.openpty()
 
     def of_its_own() -> None:
         os.setsid()
         fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
-    words = [sys.executable, "-m", "teds_provision", "--home", hall.station.home, "--passphrase-fd", "9", "measure"]
-    words += [node.uuid, "--can", hall.can, "--rate", "50", "--to", file]
+    words = [sys.executable, "-m", "teds_provision", "--home", rig.station.home, "--passphrase-fd", "9", "measure"]
+    words += [node.uuid, "--can", rig.can, "--rate", "50", "--to", file]
     given = f"exec {shlex.join(map(str, words))} 9<<< {shlex.quote(PASSPHRASE)}"
     environment = clean_environment(TERM="xterm")
     measure = subprocess.Popen(
@@ -140,14 +140,14 @@ def test_a_terminal_that_is_closed_ends_the_recording_in_order_and_lets_the_node
         measure.kill()
         measure.wait()
     assert recover(file).was_whole
-    assert hall.ask("mode", node.uuid)["mode"] == "configuration"
+    assert rig.ask("mode", node.uuid)["mode"] == "configuration"
 
 
-def test_a_measurement_that_ignores_sighup_goes_on(hall: Hall) -> None:
-    node = hall.nodes["a"].start()
+def test_a_measurement_that_ignores_sighup_goes_on(rig: Rig) -> None:
+    node = rig.nodes["a"].start()
     held = "import runpy, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN); sys.argv[0] = 'teds-provision'; "
     program = (sys.executable, "-c", f"{held}runpy.run_module('teds_provision', run_name='__main__')")
-    running = hall.begin(node.uuid, "--rate", 20, program=program, fork=False)
+    running = rig.begin(node.uuid, "--rate", 20, program=program, fork=False)
     running.wait_for('"event":"data"')
     running.signal(signal.SIGHUP)
     data = running.out.count('"event":"data"')

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.measure.hall import Hall, events, of
+from tests.measure.rig import Rig, events, of
 from tests.places import free_tcp_port
 
 pytestmark = pytest.mark.link
 
 
 @pytest.fixture(scope="module")
-def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
-    made = Hall(tmp_path_factory.mktemp("words"), {"g": "gripper"})
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    made = Rig(tmp_path_factory.mktemp("words"), {"g": "gripper"})
     try:
         made.nodes["g"].start()
         yield made
@@ -24,8 +24,8 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
         made.close()
 
 
-def test_what_is_wrong_is_reported_with_what_to_do(hall: Hall, tmp_path: Path) -> None:
-    g, nothing = hall.nodes["g"].uuid, tmp_path / "nothing.toml"
+def test_what_is_wrong_is_reported_with_what_to_do(rig: Rig, tmp_path: Path) -> None:
+    g, nothing = rig.nodes["g"].uuid, tmp_path / "nothing.toml"
     nothing.write_text("")
     cases = [
         (("measure", g, "--mqtt", "http://x"), 2, "is not a broker URL"),
@@ -47,20 +47,20 @@ def test_what_is_wrong_is_reported_with_what_to_do(hall: Hall, tmp_path: Path) -
     ]
     wrong = []
     for words, code, text in cases:
-        outcome = hall.station.start("--json", *words, "--can", hall.can).end()
+        outcome = rig.station.start("--json", *words, "--can", rig.can).end()
         last_event = json.dumps(events(outcome.out)[-1:], ensure_ascii=False)
         if outcome.code != code or text not in last_event or "Traceback" in outcome.err:
             wrong.append((words, outcome.code, last_event))
     assert wrong == []
 
 
-def test_a_command_without_a_link_takes_no_address_of_the_service_that_met_the_node(hall: Hall) -> None:
+def test_a_command_without_a_link_takes_no_address_of_the_service_that_met_the_node(rig: Rig) -> None:
     """The last place had the source address of the service: 7, "in use", beside it."""
-    g = hall.nodes["g"].uuid
-    service = hall.station.start("--json", "ncap", "run", "--measure", "all", "--can", hall.can)
+    g = rig.nodes["g"].uuid
+    service = rig.station.start("--json", "ncap", "run", "--measure", "all", "--can", rig.can)
     try:
         service.wait_for('"running"')
-        driven = hall.station.start("--json", "set", g, "1", "0.05", "--hold", "0.1").end()
+        driven = rig.station.start("--json", "set", g, "1", "0.05", "--hold", "0.1").end()
         assert (driven.code, events(driven.out)[-1]) == (0, {"event": "end", "safe": True}), driven.out
     finally:
         service.close()
@@ -69,17 +69,17 @@ def test_a_command_without_a_link_takes_no_address_of_the_service_that_met_the_n
 @pytest.mark.parametrize(
     "words", [("measure", "recover"), ("measure", "recover", "."), ("measure", "recover", "none.mcap")]
 )
-def test_recover_names_what_it_is(hall: Hall, words: tuple[str, ...]) -> None:
+def test_recover_names_what_it_is(rig: Rig, words: tuple[str, ...]) -> None:
     code, message = {2: (2, "Name exactly one recording"), 3: (3, "none.mcap")}[2 if len(words) == 2 else 3]
     message = "is a folder" if words[-1] == "." else message
-    outcome = hall.station.start("--json", *words).end()
+    outcome = rig.station.start("--json", *words).end()
     assert outcome.code == code
     assert message in outcome.out
 
 
-def test_a_broker_that_is_not_there_is_reported_and_what_it_cost(hall: Hall) -> None:
+def test_a_broker_that_is_not_there_is_reported_and_what_it_cost(rig: Rig) -> None:
     place = f"mqtt://127.0.0.1:{free_tcp_port()}"
-    lines = hall.measure(hall.nodes["g"].uuid, "--rate", 10, "--duration", 5, "--mqtt", place, code=5)
+    lines = rig.measure(rig.nodes["g"].uuid, "--rate", 10, "--duration", 5, "--mqtt", place, code=5)
     event = next(line for line in lines if line["event"] == "sink")
     assert (event["state"], event["sink"]) == ("waiting", place)
     assert "nothing is listening at 127.0.0.1" in event["why"]

@@ -17,7 +17,7 @@ from teds_provision.measure.blocks import ClockSet, GroupRows
 from teds_provision.measure.clock import STEP, HostClock, WallClock
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Running
-from tests.measure.hall import Hall, events, of
+from tests.measure.rig import Rig, events, of
 from tests.measure.sinks.parts import ANGLE as FACTS
 from tests.measure.sinks.parts import ARM, STATION
 from tests.measure.sinks.test_live import Carrier
@@ -50,8 +50,8 @@ def clock(tmp_path: Path) -> SystemClock:
 
 
 @pytest.fixture
-def hall(tmp_path: Path) -> Iterator[Hall]:
-    made = Hall(tmp_path / "hall", {"a": ANGLE})
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path / "rig", {"a": ANGLE})
     try:
         yield made
     finally:
@@ -90,15 +90,15 @@ def wait_for_data(running: Running, more: int = 5) -> None:
 
 
 def test_a_clock_that_was_wrong_at_the_start_is_followed_when_it_is_set(
-    hall: Hall, clock: SystemClock, tmp_path: Path
+    rig: Rig, clock: SystemClock, tmp_path: Path
 ) -> None:
     """An hour behind, then right, then put back by ten seconds: three parts, in each of which the stamps agree."""
-    hall.nodes["a"].start()
+    rig.nodes["a"].start()
     clock.put(-HOUR)
     files = [tmp_path / f"run.{suffix}" for suffix in ("csv", "jsonl", "mcap")]
     to = [word for file in files for word in ("--to", file)]
     began = time.time()
-    running = hall.begin(hall.nodes["a"].uuid, "--rate", 20, *to, environment=clock.environment)
+    running = rig.begin(rig.nodes["a"].uuid, "--rate", 20, *to, environment=clock.environment)
     wait_for_data(running)
     for seconds, way in ((0.0, "set forward by 3600.0"), (-10.0, "set back by 10.0")):
         clock.put(seconds)
@@ -122,22 +122,22 @@ def test_a_clock_that_was_wrong_at_the_start_is_followed_when_it_is_set(
     assert header[11:21] == time.strftime("%Y-%m-%d", time.gmtime(began)), "the start, by the clock that is right"
 
 
-def test_the_daemon_follows_it_too(hall: Hall, clock: SystemClock, tmp_path: Path) -> None:
-    hall.nodes["a"].start()
+def test_the_daemon_follows_it_too(rig: Rig, clock: SystemClock, tmp_path: Path) -> None:
+    rig.nodes["a"].start()
     clock.put(-HOUR)
-    service = Service(hall.desk, hall.station, "--record", tmp_path / "kept")
-    service.process = running = hall.station.start(
-        "--json", "ncap", "run", "--can", hall.can, "--record", tmp_path / "kept", environment=clock.environment
+    service = Service(rig.desk, rig.station, "--record", tmp_path / "kept")
+    service.process = running = rig.station.start(
+        "--json", "ncap", "run", "--can", rig.can, "--record", tmp_path / "kept", environment=clock.environment
     )
     running.wait_for('"ready"')
     with service.client() as asked:
-        asked.request("POST", "/measurements", {"uuids": [hall.nodes["a"].uuid], "rate": 20, "sinks": ["mine.csv"]})
-        until(lambda: asked.node(hall.nodes["a"].uuid)["channels"][0]["last"], "no value comes")
+        asked.request("POST", "/measurements", {"uuids": [rig.nodes["a"].uuid], "rate": 20, "sinks": ["mine.csv"]})
+        until(lambda: asked.node(rig.nodes["a"].uuid)["channels"][0]["last"], "no value comes")
         clock.put(0.0)
         running.wait_for("The system clock was set forward by 3600.0")
 
         def right() -> bool:
-            return abs(asked.node(hall.nodes["a"].uuid)["channels"][0]["last"]["time"] - time.time()) < 5
+            return abs(asked.node(rig.nodes["a"].uuid)["channels"][0]["last"]["time"] - time.time()) < 5
 
         until(right, "the page's value has the time of the wrong clock")
 

@@ -16,14 +16,14 @@ from teds_provision.node.flash_file import FlashFile
 from teds_provision.teds.codec.access_code import AccessCode
 from teds_provision.teds.codec.frame import frame, unframe
 from tests.e2e.desk import ANGLE
-from tests.measure.hall import Hall, of, states
+from tests.measure.rig import Rig, of, states
 
 pytestmark = pytest.mark.link
 
 
 @pytest.fixture(scope="module")
-def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
-    made = Hall(tmp_path_factory.mktemp("hall"), {"a": ANGLE, "g": "gripper", "u": f"keyed:{ANGLE}"})
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    made = Rig(tmp_path_factory.mktemp("rig"), {"a": ANGLE, "g": "gripper", "u": f"keyed:{ANGLE}"})
     try:
         for node in made.nodes.values():
             node.start()
@@ -32,12 +32,12 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
         made.close()
 
 
-def test_a_group_whose_datasheets_suffice_together_is_measured(hall: Hall, tmp_path: Path) -> None:
+def test_a_group_whose_datasheets_suffice_together_is_measured(rig: Rig, tmp_path: Path) -> None:
     file = tmp_path / "task.toml"
     file.write_text('[angle]\nrange = ">= 300 deg"\n\n["grip force"]\nrange = ">= 100 N"\n')
-    uuids = [hall.nodes[name].uuid for name in "ag"]
-    lines = hall.measure(*uuids, "--rate", 10, "--duration", 1, "--require", file)
-    assert of(lines, hall.nodes["a"].uuid)
+    uuids = [rig.nodes[name].uuid for name in "ag"]
+    lines = rig.measure(*uuids, "--rate", 10, "--duration", 1, "--require", file)
+    assert of(lines, rig.nodes["a"].uuid)
     assert {fit["result"] for fit in lines[-1]["fits"] if fit["channel"] is not None} == {"passed"}
 
 
@@ -51,12 +51,12 @@ runpy.run_module("teds_provision", run_name="__main__")
 """
 
 
-def test_no_value_is_handed_on_before_it_is_known_what_it_means(hall: Hall, tmp_path: Path) -> None:
+def test_no_value_is_handed_on_before_it_is_known_what_it_means(rig: Rig, tmp_path: Path) -> None:
     """On a busy machine data came before the sinks knew the channels: a part without units, a topic without a mark."""
-    file, uuids = tmp_path / "run.csv", {"a": hall.nodes["a"].uuid, "u": hall.nodes["u"].uuid}
+    file, uuids = tmp_path / "run.csv", {"a": rig.nodes["a"].uuid, "u": rig.nodes["u"].uuid}
     late = {"program": (sys.executable, "-c", LATE), "fork": False}
     words = ("--rate", 100, "--duration", 2, "--unsigned", "--to", file)
-    lines = hall.measure(*uuids.values(), *words, "--to", file.with_suffix(".jsonl"), **late)
+    lines = rig.measure(*uuids.values(), *words, "--to", file.with_suffix(".jsonl"), **late)
     parts = [Path(file).read_text().splitlines() for file in lines[-1]["files"] if file.endswith(".csv")]
     facts = [json.loads(line.partition(": ")[2]) for part in parts for line in part if line.startswith("# channel: ")]
     assert facts
@@ -71,25 +71,25 @@ def test_no_value_is_handed_on_before_it_is_known_what_it_means(hall: Hall, tmp_
         assert of(lines, uuid)[0]["name"] == "angle"
 
 
-def test_a_requirement_that_one_of_them_lacks_stops_all_before_anything_is_claimed(hall: Hall, tmp_path: Path) -> None:
+def test_a_requirement_that_one_of_them_lacks_stops_all_before_anything_is_claimed(rig: Rig, tmp_path: Path) -> None:
     file = tmp_path / "task.toml"
     file.write_text('["grip force"]\nrange = ">= 5 kN"\n')
-    uuids = [hall.nodes[name].uuid for name in "ag"]
-    lines = hall.measure(*uuids, "--rate", 10, "--duration", 1, "--require", file, code=6)
+    uuids = [rig.nodes[name].uuid for name in "ag"]
+    lines = rig.measure(*uuids, "--rate", 10, "--duration", 1, "--require", file, code=6)
     assert not [line for line in lines if line["event"] == "data"]
     assert set(states(lines)) == {"waiting", "refused"}
     assert "grip force" in lines[-1]["error"]["message"]
     assert any(fit["result"] == "failed" for fit in lines[-1]["fits"])
     for uuid in uuids:
-        assert hall.ask("mode", uuid)["mode"] == "configuration"
+        assert rig.ask("mode", uuid)["mode"] == "configuration"
 
 
-def test_raw_values_of_an_unsigned_datasheet_come_only_if_requested_and_are_marked(hall: Hall) -> None:
-    uuid, file = hall.nodes["u"].uuid, hall.folder / "unsigned.csv"
-    lines = hall.measure(uuid, "--rate", 20, "--duration", 1, code=4)
+def test_raw_values_of_an_unsigned_datasheet_come_only_if_requested_and_are_marked(rig: Rig) -> None:
+    uuid, file = rig.nodes["u"].uuid, rig.folder / "unsigned.csv"
+    lines = rig.measure(uuid, "--rate", 20, "--duration", 1, code=4)
     assert not of(lines)
     assert lines[-1]["error"]["code"] == "not-authentic"
-    lines = hall.measure(uuid, "--rate", 20, "--duration", 1, "--unsigned", "--to", file,
+    lines = rig.measure(uuid, "--rate", 20, "--duration", 1, "--unsigned", "--to", file,
                          "--to", file.with_suffix(".mcap"), "--to", file.with_suffix(".jsonl"))  # fmt: skip
     assert of(lines)
     for line in of(lines):
@@ -112,32 +112,32 @@ def test_raw_values_of_an_unsigned_datasheet_come_only_if_requested_and_are_mark
         channels = [metadata.metadata for metadata in found.iter_metadata() if metadata.name == "channel"]
     assert all(json.loads(stream.metadata["channels"])[0]["unsigned"] is True for stream in streams)
     assert [channel["unsigned"] for channel in channels] == ["true"]
-    signed = of(hall.measure(hall.nodes["a"].uuid, "--rate", 20, "--duration", 1, "--unsigned"))
+    signed = of(rig.measure(rig.nodes["a"].uuid, "--rate", 20, "--duration", 1, "--unsigned"))
     assert all("unsigned" not in line and None not in line["value"] for line in signed)
 
 
-def test_a_restart_of_the_node_is_seen_by_c_and_sample_states_what_its_values_rest_on(hall: Hall) -> None:
+def test_a_restart_of_the_node_is_seen_by_c_and_sample_states_what_its_values_rest_on(rig: Rig) -> None:
     """Two processes: c of Open goes on within a power-up, whoever asks, and is another one after it."""
-    node = hall.nodes["a"]
-    hall.ask("verify", "a", "--via", "can")
-    assert [hall.ask("sample", "a")["from"] for _ in range(3)] == ["session"] * 3, "no restart"
+    node = rig.nodes["a"]
+    rig.ask("verify", "a", "--via", "can")
+    assert [rig.ask("sample", "a")["from"] for _ in range(3)] == ["session"] * 3, "no restart"
     for _ in range(2):
         node.kill()
         node.start()
-        assert [hall.ask("sample", "a")["from"] for _ in range(2)] == ["kept"] * 2, "nobody has read the rest since"
-        (listed,) = hall.station.ask("nodes", node.uuid)["nodes"]
+        assert [rig.ask("sample", "a")["from"] for _ in range(2)] == ["kept"] * 2, "nobody has read the rest since"
+        (listed,) = rig.station.ask("nodes", node.uuid)["nodes"]
         assert (listed["verdict"], listed["reading"]["from"]) == ("authentic", "kept")
-        hall.ask("verify", "a", "--via", "can")
-        assert hall.ask("sample", "a")["from"] == "session"
+        rig.ask("verify", "a", "--via", "can")
+        assert rig.ask("sample", "a")["from"] == "session"
 
 
 def test_a_teds_that_was_changed_in_flash_ends_the_measurement_that_began_by_the_kept_copy(
-    hall: Hall, tmp_path: Path
+    rig: Rig, tmp_path: Path
 ) -> None:
     """It had been "authentic" for ever: the kept copy stood in for octets that nobody read."""
-    node, file = hall.nodes["g"], tmp_path / "run.csv"
+    node, file = rig.nodes["g"], tmp_path / "run.csv"
     node.kill()
-    flash = FlashFile(hall.folder / "g")
+    flash = FlashFile(rig.folder / "g")
     state = flash.load()
     block = (1, AccessCode.CALIBRATION)
     body = bytearray(unframe(state.blocks[block]))
@@ -146,16 +146,16 @@ def test_a_teds_that_was_changed_in_flash_ends_the_measurement_that_began_by_the
     flash.release()
     node.start()
     try:
-        lines = hall.measure(node.uuid, "--rate", 10, "--duration", 30, "--to", file, code=4)
+        lines = rig.measure(node.uuid, "--rate", 10, "--duration", 30, "--to", file, code=4)
         assert "data" in {line["event"] for line in lines}, "it was measured at once, by the signed copy"
         assert "refused" in states(lines)
         assert "do not count" in lines[-1]["error"]["message"]
         assert any("refused" in line and "do not count" in line for line in file.read_text().splitlines())
-        (listed,) = hall.station.ask("nodes", node.uuid)["nodes"]
+        (listed,) = rig.station.ask("nodes", node.uuid)["nodes"]
         assert (listed["verdict"], listed["reading"]["by"]) == ("not authentic", "measure")
-        refused = hall.station.refuses("sample", node.uuid, "--can", node.bus, code=4)
+        refused = rig.station.refuses("sample", node.uuid, "--can", node.bus, code=4)
         assert "TEDS 5 of channel 1 is missing or changed" in refused["message"]
     finally:
-        flash = FlashFile(hall.folder / "g")
+        flash = FlashFile(rig.folder / "g")
         flash.commit(replace(flash.load(), blocks=state.blocks))
         flash.release()

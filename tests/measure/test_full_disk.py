@@ -21,7 +21,7 @@ from teds_provision.measure.sinks import files as recording
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.mcap.recover import recover
 from tests.e2e.desk import ANGLE, PROGRAM, Running
-from tests.measure.hall import Hall, events, of
+from tests.measure.rig import Rig, events, of
 from tests.measure.sinks.parts import ANGLE as FACTS
 from tests.measure.sinks.parts import STATION, block
 from tests.measure.test_clock_set import stamps, wait_for_data
@@ -60,8 +60,8 @@ def fill(folder: Path) -> None:
 
 
 @pytest.fixture
-def hall(tmp_path: Path) -> Iterator[Hall]:
-    made = Hall(tmp_path / "hall", {"a": ANGLE})
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path / "rig", {"a": ANGLE})
     made.nodes["a"].start()
     try:
         yield made
@@ -69,10 +69,10 @@ def hall(tmp_path: Path) -> Iterator[Hall]:
         made.close()
 
 
-def test_measure_goes_on_when_there_is_room_again(hall: Hall, tmp_path: Path) -> None:
+def test_measure_goes_on_when_there_is_room_again(rig: Rig, tmp_path: Path) -> None:
     disk = SmallDisk(tmp_path / "disk")
     to = [word for suffix in SUFFIXES for word in ("--to", disk.folder / f"run.{suffix}")]
-    running = hall.begin(hall.nodes["a"].uuid, "--rate", 400, *to, program=disk.program)
+    running = rig.begin(rig.nodes["a"].uuid, "--rate", 400, *to, program=disk.program)
     wait_for_data(running)
     folder = disk.seen_by(running)
     until(lambda: all((folder / f"run.{suffix}").stat().st_size > 4000 for suffix in SUFFIXES))
@@ -114,15 +114,15 @@ def test_measure_goes_on_when_there_is_room_again(hall: Hall, tmp_path: Path) ->
         assert line["why"].encode() in (kept / f"run.2.{suffix}").read_bytes(), "the part says what is missing"
 
 
-def test_the_daemon_begins_a_new_part_when_there_is_room_again(hall: Hall, tmp_path: Path) -> None:
+def test_the_daemon_begins_a_new_part_when_there_is_room_again(rig: Rig, tmp_path: Path) -> None:
     disk = SmallDisk(tmp_path / "disk")
-    service = Service(hall.desk, hall.station)
-    words = ["--json", "ncap", "run", "--can", hall.can, "--record", disk.folder]
-    service.process = running = hall.station.start(*words, program=disk.program)
+    service = Service(rig.desk, rig.station)
+    words = ["--json", "ncap", "run", "--can", rig.can, "--record", disk.folder]
+    service.process = running = rig.station.start(*words, program=disk.program)
     running.wait_for('"ready"')
     folder = disk.seen_by(running)
     with service.client() as asked:
-        asked.request("POST", "/measurements", {"uuids": [hall.nodes["a"].uuid], "rate": 100})
+        asked.request("POST", "/measurements", {"uuids": [rig.nodes["a"].uuid], "rate": 100})
 
         def sink() -> dict[str, object]:
             return dict(next(iter(asked.status()["sinks"]), {}))
@@ -131,7 +131,7 @@ def test_the_daemon_begins_a_new_part_when_there_is_room_again(hall: Hall, tmp_p
         fill(folder)
         until(lambda: sink()["state"] == "waiting", "the full disk is not told")
         assert "The disk is full since" in str(sink()["detail"])
-        assert "The disk is full since" in hall.station.run("ncap", "status").out
+        assert "The disk is full since" in rig.station.run("ncap", "status").out
         until(lambda: sink()["dropped"], "what is lost is not counted")
         (folder / "ballast").unlink()
         until(lambda: sink()["state"] == "running", "it does not go on")

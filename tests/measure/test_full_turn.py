@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.desk import ANGLE
-from tests.measure import hall as halls
-from tests.measure.hall import Hall
+from tests.measure import rig as rigs
+from tests.measure.rig import Rig
 
 pytestmark = pytest.mark.link
 
 
-def hall_with(folder: Path, monkeypatch: pytest.MonkeyPatch, calibration: str) -> Hall:
-    monkeypatch.setitem(halls.CALIBRATIONS, ANGLE, calibration)
-    return Hall(folder / "hall", {"a": ANGLE})
+def rig_with(folder: Path, monkeypatch: pytest.MonkeyPatch, calibration: str) -> Rig:
+    monkeypatch.setitem(rigs.CALIBRATIONS, ANGLE, calibration)
+    return Rig(folder / "rig", {"a": ANGLE})
 
 
 def values_of(path: Path) -> list[str]:
@@ -26,11 +26,11 @@ def values_of(path: Path) -> list[str]:
 
 
 def test_a_zero_offset_of_90_degrees_loses_no_angle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    hall = hall_with(tmp_path, monkeypatch, "# zero-offset: 90\nraw,value [degree]\n0,0\n65536,360\n")
+    rig = rig_with(tmp_path, monkeypatch, "# zero-offset: 90\nraw,value [degree]\n0,0\n65536,360\n")
     try:
-        hall.nodes["a"].start()  # a ramp over the whole turn every 2 s
+        rig.nodes["a"].start()  # a ramp over the whole turn every 2 s
         run = tmp_path / "run.csv"
-        end = hall.measure("a", "--rate", 100, "--duration", 2.5, "--to", run, "--unit", "shown")[-1]
+        end = rig.measure("a", "--rate", 100, "--duration", 2.5, "--to", run, "--unit", "shown")[-1]
         assert end["unit"] == "shown"
         assert "angle [°]" in run.read_text()
         (stream,) = end["nodes"][0]["streams"]
@@ -40,20 +40,20 @@ def test_a_zero_offset_of_90_degrees_loses_no_angle(tmp_path: Path, monkeypatch:
         sixteenth = 360 / 16  # 125 ms of the ramp: a machine that is held up for less leaves none out
         assert {int(value / sixteenth) for value in values} == set(range(16))
         assert "invalid 0" in run.read_text().splitlines()[-1]
-        (sampled,) = hall.ask("sample", "a")["samples"]
+        (sampled,) = rig.ask("sample", "a")["samples"]
         assert sampled["valid"]
     finally:
-        hall.close()
+        rig.close()
 
 
 def test_what_is_not_valid_is_counted_in_every_summary_and_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hall = hall_with(tmp_path, monkeypatch, "# high-limit: 180\nraw,value [degree]\n0,0\n65535,359.9\n")
+    rig = rig_with(tmp_path, monkeypatch, "# high-limit: 180\nraw,value [degree]\n0,0\n65535,359.9\n")
     try:
-        hall.nodes["a"].start("--source", "ramp:1")
+        rig.nodes["a"].start("--source", "ramp:1")
         run, lines = tmp_path / "run.csv", tmp_path / "run.jsonl"
-        summary = hall.measure("a", "--rate", 100, "--duration", 2, "--to", run, "--to", lines)
+        summary = rig.measure("a", "--rate", 100, "--duration", 2, "--to", run, "--to", lines)
         (stream,) = summary[-1]["nodes"][0]["streams"]
         limit = "above its high limit, 180 °"
         assert stream["invalid_why"] == [{"channel": 1, "why": limit, "count": stream["invalid"]}]
@@ -63,7 +63,7 @@ def test_what_is_not_valid_is_counted_in_every_summary_and_says_why(
         last = [json.loads(line) for line in lines.read_text().splitlines()][-1]
         assert (last["event"], last["invalid"]) == ("status", stream["invalid"])
         assert last["invalid_why"] == stream["invalid_why"]
-        person = hall.station.run("measure", "a", "--rate", 100, "--duration", 1, "--can", hall.can)
+        person = rig.station.run("measure", "a", "--rate", 100, "--duration", 1, "--can", rig.can)
         assert f"of channel 1: {limit}" in person.out + person.err
     finally:
-        hall.close()
+        rig.close()

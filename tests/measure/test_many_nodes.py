@@ -11,15 +11,15 @@ import pytest
 from teds_provision.links.can.isotp import FUNCTIONAL
 from teds_provision.links.can.port import CanPort
 from tests.e2e.desk import ANGLE
-from tests.measure.hall import Hall, crowd, of, states
+from tests.measure.rig import Rig, crowd, of, states
 
 pytestmark = [pytest.mark.link, pytest.mark.realtime]  # who began with the others is known by when it was heard
 NODES = 50
 
 
 @pytest.fixture(scope="module")
-def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
-    made = Hall(tmp_path_factory.mktemp("many"), {f"n{number}": ANGLE for number in range(NODES)})
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    made = Rig(tmp_path_factory.mktemp("many"), {f"n{number}": ANGLE for number in range(NODES)})
     try:
         crowd(made.can, [node.folder for node in made.nodes.values()], made.desk)
         made.station.ask("group", "create", "crowd", *(node.uuid for node in made.nodes.values()))
@@ -28,10 +28,10 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
         made.close()
 
 
-def test_fifty_nodes_are_measured_at_once(hall: Hall) -> None:
-    uuids = [node.uuid for node in hall.nodes.values()]
+def test_fifty_nodes_are_measured_at_once(rig: Rig) -> None:
+    uuids = [node.uuid for node in rig.nodes.values()]
     asked, stop = [0], threading.Event()
-    port = CanPort(f"{hall.can}&source=0xF7")
+    port = CanPort(f"{rig.can}&source=0xF7")
 
     def count() -> None:
         with port.listen_frames(lambda frame: frame.identifier == FUNCTIONAL | 0xF1) as ear:
@@ -42,7 +42,7 @@ def test_fifty_nodes_are_measured_at_once(hall: Hall) -> None:
     listening.start()
     try:
         began = time.monotonic()
-        lines = hall.measure("crowd", "--rate", 5, "--duration", 3)
+        lines = rig.measure("crowd", "--rate", 5, "--duration", 3)
         seconds = time.monotonic() - began
     finally:
         stop.set()

@@ -18,7 +18,7 @@ import pytest
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.spec import parse_spec
 from tests.e2e.desk import PROGRAM
-from tests.measure.hall import Hall, events
+from tests.measure.rig import Rig, events
 
 pytestmark = pytest.mark.link
 NOTHING_ASKED = (
@@ -75,8 +75,8 @@ class Adapter:
 
 
 @pytest.fixture
-def hall(tmp_path: Path) -> Iterator[Hall]:
-    made = Hall(tmp_path, types={"a": "magnetic-angular-position-sensor"})
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path, types={"a": "magnetic-angular-position-sensor"})
     made.can = made.desk.links.can  # classic frames: slcan has no other ones
     made.nodes["a"].start(can=made.can)
     try:
@@ -85,15 +85,15 @@ def hall(tmp_path: Path) -> Iterator[Hall]:
         made.close()
 
 
-def test_a_pulled_adapter_is_reported_as_itself_before_anything_is_asked_over_it(hall: Hall) -> None:
+def test_a_pulled_adapter_is_reported_as_itself_before_anything_is_asked_over_it(rig: Rig) -> None:
     """`measure` said: No message from the node came.
 
     With a lease of 60 s, and the datasheet read later, nothing is asked over the bus for 20 s: silence shows first.
     """
-    adapter = Adapter(hall.can)
+    adapter = Adapter(rig.can)
     try:
         where = f"slcan:{adapter.name}?sleep_after_open=0"
-        running = hall.begin("a", "--rate", 50, can=where, program=(PROGRAM[0], "-c", NOTHING_ASKED))
+        running = rig.begin("a", "--rate", 50, can=where, program=(PROGRAM[0], "-c", NOTHING_ASKED))
         running.wait_for('"event":"data"')
         adapter.pull()
         running.wait_for('"state":"lost"')

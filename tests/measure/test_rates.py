@@ -23,7 +23,7 @@ from teds_provision.measure.request import MeasurementRequest
 from teds_provision.station.station import Station
 from tests.bench import make_station
 from tests.e2e.desk import ANGLE
-from tests.measure.hall import FAULTY, Hall, provisioned
+from tests.measure.rig import FAULTY, Rig, provisioned
 
 HIGH = 1e9
 
@@ -86,11 +86,11 @@ def test_one_rate_for_all_is_no_faster_than_the_slowest_channel(station: tuple[S
 
 @pytest.mark.link
 def test_a_run_that_lost_values_gives_the_command_for_a_lower_rate(tmp_path: Path) -> None:
-    hall = Hall(tmp_path, {"gaps": "gripper"})
+    rig = Rig(tmp_path, {"gaps": "gripper"})
     try:
-        node = hall.nodes["gaps"]
-        hall.desk.start(hall.can, f"gaps={node.folder}", program=FAULTY).wait_for('"ready": true')
-        lines = hall.measure(node.uuid, "--rate", 50, "--duration", 2)
+        node = rig.nodes["gaps"]
+        rig.desk.start(rig.can, f"gaps={node.folder}", program=FAULTY).wait_for('"ready": true')
+        lines = rig.measure(node.uuid, "--rate", 50, "--duration", 2)
         end = lines[-1]
         assert end["nodes"][0]["streams"][0]["lost"] > 0
         assert end["lower_rate"]["rate"] == 20, "four fifths of what came through"
@@ -98,12 +98,12 @@ def test_a_run_that_lost_values_gives_the_command_for_a_lower_rate(tmp_path: Pat
         assert words[0] == "teds-provision"
         assert words[-2:] == ["--rate", "20"]
         assert words.count("--rate") == 1, "the one that lost values is gone"
-        outcome = hall.station.start(*words[1:-2], "--rate", 20).end()  # and it works
+        outcome = rig.station.start(*words[1:-2], "--rate", 20).end()  # and it works
         assert outcome.code == 0, outcome
         again = [word for word in words[1:-2] if word != "--json"]
-        human = hall.station.start(*again, "--rate=20").end()
+        human = rig.station.start(*again, "--rate=20").end()
         assert re.search(
             r"Values were lost\. A lower rate may help: teds-provision .*measure .* --rate 10", human.out
         ), human
     finally:
-        hall.close()
+        rig.close()

@@ -11,23 +11,23 @@ import pytest
 from teds_provision.client import ApiError, Client
 from tests.bench import make_station
 from tests.e2e.desk import Station
-from tests.measure.hall import Hall
-from tests.measure.test_actuator_safety import BUSY, HELD, Journal, hall_on
+from tests.measure.rig import Rig
+from tests.measure.test_actuator_safety import BUSY, HELD, Journal, rig_on
 from tests.ncap.service import Service, verdict, verified
 from tests.pace import until
 
 pytestmark = [pytest.mark.realtime, pytest.mark.link]
 
 
-def south_of(hall: Hall) -> Station:
+def south_of(rig: Rig) -> Station:
     """Return a second station with its own key, to which the first one has copied the keys of all nodes."""
-    make_station(hall.folder / "stations" / "south", "south").close()
-    north, south, bundle = hall.station, hall.desk.station("south"), hall.folder / "keys.jwe"
+    make_station(rig.folder / "stations" / "south", "south").close()
+    north, south, bundle = rig.station, rig.desk.station("south"), rig.folder / "keys.jwe"
     for station, other, name in ((north, south, "south"), (south, north, "bench")):
-        key = hall.folder / f"{name}.pem"
+        key = rig.folder / f"{name}.pem"
         key.write_text(other.ask("init")["public_key"])
         station.ask("trust", "add", name, key, "--yes")
-    ca = hall.folder / "bench.ca.pem"
+    ca = rig.folder / "bench.ca.pem"
     ca.write_text(north.ask("init")["ca"]["public_key"])
     south.ask("trust", "add", "bench-ca", ca, "--role", "ca", "--yes")
     north.ask("export-keys", "--to", "south", "--all", "--output", bundle, "--yes")
@@ -47,21 +47,21 @@ def moved(asked: Client, uuid: str, value: float) -> Any:
 
 def test_the_second_station_takes_an_actuator_over_once_the_first_is_dead(tmp_path: Path) -> None:
     """No lease and no office between them: the node's claim refuses the second, its dead-man lets go of the first."""
-    with hall_on(tmp_path) as hall:
-        hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
-        uuid = hall.nodes["g"].uuid
-        first, second = Service(hall.desk, hall.station), Service(hall.desk, south_of(hall))
+    with rig_on(tmp_path) as rig:
+        rig.desk.links = type(rig.desk.links)(rig.desk.links.nfc, rig.can)
+        uuid = rig.nodes["g"].uuid
+        first, second = Service(rig.desk, rig.station), Service(rig.desk, south_of(rig))
         first.start(), second.start()
         assert [verdict(verified(service, uuid)) for service in (first, second)] == ["authentic", "authentic"]
         with first.client() as north, second.client() as south:
             assert until(lambda: moved(north, uuid, 0.05), "the first never held it")
-            Journal.of(hall).moves()
+            Journal.of(rig).moves()
             assert moved(south, uuid, 0.02) is None, "two stations move one actuator"
             first.kill()
             killed = time.time()
             assert until(lambda: moved(south, uuid, 0.02), "it was never taken over")
             seconds = time.time() - killed
-        journal = Journal.of(hall, HELD)
+        journal = Journal.of(rig, HELD)
         journal.is_safe(killed)
         journal.moves(killed)
         print(f"taken over {seconds:.2f} s after kill -9")

@@ -15,9 +15,9 @@ import pytest
 from teds_provision import client
 from teds_provision.trace.recorder import read_trace
 from tests.e2e.desk import ROOT
-from tests.measure.hall import Hall
+from tests.measure.rig import Rig
 from tests.measure.sinks.test_ros1 import Master, master, pytestmark  # noqa: F401  the fixture, and what it needs
-from tests.measure.test_actuator_safety import DEAD_MAN, TOPIC, Journal, Ros1, Ros2, children, hall_on, ros_of
+from tests.measure.test_actuator_safety import DEAD_MAN, TOPIC, Journal, Ros1, Ros2, children, rig_on, ros_of
 from tests.ncap.service import Service, verdict, verified
 from tests.pace import until
 
@@ -25,8 +25,8 @@ Publishers = list[subprocess.Popen[bytes]]
 
 
 @pytest.fixture
-def hall(tmp_path: Path) -> Iterator[Hall]:
-    with hall_on(tmp_path) as made:
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    with rig_on(tmp_path) as made:
         yield made
 
 
@@ -61,11 +61,11 @@ def publishers() -> Iterator[Publishers]:
 
 
 @contextmanager
-def listening(hall: Hall, ros: Ros1 | Ros2, *words: object, measured: bool = True, **more: Any) -> Iterator[Service]:
+def listening(rig: Rig, ros: Ros1 | Ros2, *words: object, measured: bool = True, **more: Any) -> Iterator[Service]:
     """Yield a daemon that publishes to this ROS, and measures the gripper with a dead-man of half a second."""
-    hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
-    service = Service(hall.desk, hall.station, (*ros.words, *words)).start(environment=ros.environment)
-    uuid = hall.nodes["g"].uuid
+    rig.desk.links = type(rig.desk.links)(rig.desk.links.nfc, rig.can)
+    service = Service(rig.desk, rig.station, (*ros.words, *words)).start(environment=ros.environment)
+    uuid = rig.nodes["g"].uuid
     assert verdict(verified(service, uuid)) == "authentic"
     if measured:
         with service.client() as asked:
@@ -87,9 +87,9 @@ def set_points(ros: Ros1 | Ros2, value: float) -> subprocess.Popen[bytes]:
 
 
 @pytest.mark.realtime
-def test_set_points_move_it_and_whatever_dies_it_is_safe(hall: Hall, ros: Ros1 | Ros2, publishers: Publishers) -> None:
-    with listening(hall, ros) as service:
-        journal = Journal.of(hall)
+def test_set_points_move_it_and_whatever_dies_it_is_safe(rig: Rig, ros: Ros1 | Ros2, publishers: Publishers) -> None:
+    with listening(rig, ros) as service:
+        journal = Journal.of(rig)
         publishers.append(ros.publish())
         journal.moves()
         # The consumer dies.
@@ -109,22 +109,22 @@ def test_set_points_move_it_and_whatever_dies_it_is_safe(hall: Hall, ros: Ros1 |
 
 
 def test_beyond_the_limits_nothing_moves_and_the_node_says_why(
-    hall: Hall, either_ros: Ros1 | Ros2, publishers: Publishers
+    rig: Rig, either_ros: Ros1 | Ros2, publishers: Publishers
 ) -> None:
-    with listening(hall, either_ros) as service, service.client() as asked:
+    with listening(rig, either_ros) as service, service.client() as asked:
         publishers.append(set_points(either_ros, 5.0))
-        until(lambda: "limits" in (asked.node(hall.nodes["g"].uuid)["measuring"] or {}).get("why", ""), "no word of it")
-        assert all(line["safe"] for line in Journal.of(hall).states())
+        until(lambda: "limits" in (asked.node(rig.nodes["g"].uuid)["measuring"] or {}).get("why", ""), "no word of it")
+        assert all(line["safe"] for line in Journal.of(rig).states())
         service.end()
 
 
 def test_a_request_and_a_topic_do_not_pull_at_one_actuator(
-    hall: Hall, either_ros: Ros1 | Ros2, publishers: Publishers
+    rig: Rig, either_ros: Ros1 | Ros2, publishers: Publishers
 ) -> None:
     """Who came first has it: the other one is refused and told, and has it when the first one lets go."""
-    path = f"/nodes/{hall.nodes['g'].uuid}/channels/1"
-    with listening(hall, either_ros) as service, service.client() as asked:
-        journal = Journal.of(hall)
+    path = f"/nodes/{rig.nodes['g'].uuid}/channels/1"
+    with listening(rig, either_ros) as service, service.client() as asked:
+        journal = Journal.of(rig)
         asked.request("PUT", path, {"value": 0.02, "hold": 60})
         journal.moves()
         publishers.append(set_points(either_ros, 0.05))
@@ -148,15 +148,15 @@ def test_a_request_and_a_topic_do_not_pull_at_one_actuator(
 
 
 def test_off_the_whitelist_it_is_let_go_and_measured_on(
-    hall: Hall, either_ros: Ros1 | Ros2, publishers: Publishers
+    rig: Rig, either_ros: Ros1 | Ros2, publishers: Publishers
 ) -> None:
     """A person takes it off the list by a command beside the daemon, while a topic drives it."""
-    uuid = hall.nodes["g"].uuid
-    with listening(hall, either_ros, "--detection", "transparent") as service, service.client() as asked:
-        journal = Journal.of(hall)
+    uuid = rig.nodes["g"].uuid
+    with listening(rig, either_ros, "--detection", "transparent") as service, service.client() as asked:
+        journal = Journal.of(rig)
         publishers.append(either_ros.publish())
         journal.moves()
-        hall.station.ask("whitelist", "remove", uuid, "--yes")
+        rig.station.ask("whitelist", "remove", uuid, "--yes")
         until(lambda: journal.states()[-1]["safe"], "it still moves")
         until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured on")
         time.sleep(2 * DEAD_MAN)
@@ -165,19 +165,19 @@ def test_off_the_whitelist_it_is_let_go_and_measured_on(
 
 
 @pytest.mark.parametrize("how", ["daemon", "measurement", pytest.param("whitelist", marks=OFF_THE_LIST)])
-def test_without_leave_no_topic_is_listened_to(hall: Hall, master: Master, publishers: Publishers, how: str) -> None:  # noqa: F811
+def test_without_leave_no_topic_is_listened_to(rig: Rig, master: Master, publishers: Publishers, how: str) -> None:  # noqa: F811
     master.start()
     ros = Ros1(master)
     if how == "whitelist":
-        hall.station.ask("whitelist", "remove", hall.nodes["g"].uuid, "--yes")
+        rig.station.ask("whitelist", "remove", rig.nodes["g"].uuid, "--yes")
     words = {"daemon": ["--no-actuators"], "whitelist": ["--detection", "transparent"]}.get(how, [])
     more = {"actuators": False} if how == "measurement" else {}
-    with listening(hall, ros, *words, **more) as service:
+    with listening(rig, ros, *words, **more) as service:
         until(lambda: "/bench/g/opening" in master.published(), "no topic")
         assert TOPIC not in master.heard()
         publishers.append(ros.publish())
         time.sleep(2 * DEAD_MAN)
-        assert all(line["safe"] for line in Journal.of(hall).states())
+        assert all(line["safe"] for line in Journal.of(rig).states())
         service.end()
 
 
@@ -186,9 +186,9 @@ def test_without_leave_no_topic_is_listened_to(hall: Hall, master: Master, publi
     "measurement has it: "
     "tests/page/test_flows.py::test_who_measures_says_whether_topics_may_move_actuators_and_when_these_are_safe"
 )
-def test_a_measurement_without_a_dead_man_has_the_daemons(hall: Hall, master: Master) -> None:  # noqa: F811
+def test_a_measurement_without_a_dead_man_has_the_daemons(rig: Rig, master: Master) -> None:  # noqa: F811
     master.start()
-    with listening(hall, Ros1(master), "--dead-man", 700, dead_man=None) as service, service.client() as asked:
+    with listening(rig, Ros1(master), "--dead-man", 700, dead_man=None) as service, service.client() as asked:
         [measurement] = asked.request("GET", "/measurements")["measurements"]
         assert (measurement["actuators"], measurement["dead_man"]) == (True, 700)
         status = asked.request("GET", "/status")
@@ -200,12 +200,12 @@ def test_two_measurements_are_two_nodes_of_ros_and_neither_ends_the_other(tmp_pa
     """ROS 1 shuts a node down whose name another one takes."""
     master.start()
     ros = Ros1(master)
-    hall = Hall(tmp_path, {"g": "gripper", "h": "gripper"})
+    rig = Rig(tmp_path, {"g": "gripper", "h": "gripper"})
     try:
-        for node in hall.nodes.values():
+        for node in rig.nodes.values():
             node.start()
-        with listening(hall, ros, measured=False) as service, service.client() as asked:
-            for name, node in hall.nodes.items():
+        with listening(rig, ros, measured=False) as service, service.client() as asked:
+            for name, node in rig.nodes.items():
                 verified(service, node.uuid)
                 asked.request("POST", "/groups", {"name": f"group {name}", "uuids": [node.uuid]})
                 asked.request("POST", "/measurements", {"group": f"group {name}", "rate": 20})
@@ -226,14 +226,14 @@ def test_two_measurements_are_two_nodes_of_ros_and_neither_ends_the_other(tmp_pa
             assert len(began) == 2
             service.end()
     finally:
-        hall.close()
+        rig.close()
 
 
-def test_a_trace_has_frames_and_opened_messages_of_every_session(hall: Hall, tmp_path: Path) -> None:
+def test_a_trace_has_frames_and_opened_messages_of_every_session(rig: Rig, tmp_path: Path) -> None:
     file = tmp_path / "daemon.trace"
-    hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
-    service = Service(hall.desk, hall.station, ("--trace", file)).start()
-    uuid = hall.nodes["g"].uuid
+    rig.desk.links = type(rig.desk.links)(rig.desk.links.nfc, rig.can)
+    service = Service(rig.desk, rig.station, ("--trace", file)).start()
+    uuid = rig.nodes["g"].uuid
     verified(service, uuid)
     with service.client() as asked:
         asked.request("POST", "/measurements", {"uuids": [uuid], "rate": 20})
@@ -244,5 +244,5 @@ def test_a_trace_has_frames_and_opened_messages_of_every_session(hall: Hall, tmp
     opened = {record.command.partition(" (")[0] for record in records if record.sealed and record.opened is not None}
     assert {"Subscribe", "Clock", "Stop"} <= opened, opened
     assert any(record.layer == "frame" for record in records)
-    refused = hall.station.refuses("ncap", "run", "--trace", file, code=2)
+    refused = rig.station.refuses("ncap", "run", "--trace", file, code=2)
     assert str(file) in refused["message"], "a trace is never written over"

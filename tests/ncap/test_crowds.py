@@ -17,7 +17,7 @@ from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
 from teds_provision.station.station import Station
 from tests.cli.shell import PROGRAM
 from tests.e2e.desk import ANGLE
-from tests.measure.hall import Hall, events
+from tests.measure.rig import Rig, events
 from tests.ncap.service import Service, until, verdict
 from tests.strangers.attackers import Attacker, always_new, silent_strangers
 from tests.strangers.wire import of_spec
@@ -61,34 +61,34 @@ def test_nodes_that_left_and_are_not_known_are_forgotten_but_the_latest() -> Non
 
 
 @pytest.fixture(scope="module")
-def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
-    made = Hall(tmp_path_factory.mktemp("crowds"), {"a": ANGLE})
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    made = Rig(tmp_path_factory.mktemp("crowds"), {"a": ANGLE})
     yield made
     made.close()
 
 
 @pytest.mark.link
-def test_a_node_of_the_whitelist_does_not_wait_for_strangers(hall: Hall, tmp_path: Path) -> None:
+def test_a_node_of_the_whitelist_does_not_wait_for_strangers(rig: Rig, tmp_path: Path) -> None:
     """Forty that answer nothing but Identify had kept every worker for minutes."""
-    group, port = of_spec(hall.desk.links.can)
-    service = Service(hall.desk, hall.station, ("--detection", "transparent"))
+    group, port = of_spec(rig.desk.links.can)
+    service = Service(rig.desk, rig.station, ("--detection", "transparent"))
     with Attacker(group, port, silent_strangers(STRANGERS)):
         asked = service.start(program=PROGRAM).client()
         until(lambda: sum(node["present"] for node in asked.nodes()) == len(STRANGERS))
-        hall.nodes["a"].start(can=hall.desk.links.can)
-        until(lambda: asked.node(hall.nodes["a"].uuid)["verified"])
-        assert verdict(asked.node(hall.nodes["a"].uuid)) == "authentic"
+        rig.nodes["a"].start(can=rig.desk.links.can)
+        until(lambda: asked.node(rig.nodes["a"].uuid)["verified"])
+        assert verdict(asked.node(rig.nodes["a"].uuid)) == "authentic"
         waiting = sum(node["verdict"] is None and node["problem"] is None for node in asked.nodes())
         assert waiting > len(STRANGERS) / 2, "the strangers still waited when it had been looked at"
     service.end()
-    hall.nodes["a"].kill()
+    rig.nodes["a"].kill()
 
 
 @pytest.mark.link
-def test_the_count_of_strangers_is_reported_now_and_then(hall: Hall) -> None:
+def test_the_count_of_strangers_is_reported_now_and_then(rig: Rig) -> None:
     """Each new UUID was a line of the log: with five a second half a million a day."""
-    group, port = of_spec(hall.desk.links.can)
-    service = Service(hall.desk, hall.station, ("--detection", "whitelist"))
+    group, port = of_spec(rig.desk.links.can)
+    service = Service(rig.desk, rig.station, ("--detection", "whitelist"))
     requests: list[bytes] = []
     with Attacker(group, port, always_new(STRANGERS, requests)):
         asked = service.start(program=PROGRAM).client()
@@ -100,10 +100,10 @@ def test_the_count_of_strangers_is_reported_now_and_then(hall: Hall) -> None:
 
 
 @pytest.mark.link
-def test_reads_of_a_node_that_does_not_answer_hold_up_no_other_request(hall: Hall) -> None:
+def test_reads_of_a_node_that_does_not_answer_hold_up_no_other_request(rig: Rig) -> None:
     """Six of them, with a token that may only read, had stopped the whole API: status, other tokens, set points."""
-    service = Service(hall.desk, hall.station, ("--detection", "whitelist"))
-    node = hall.nodes["a"].start(can=hall.desk.links.can)
+    service = Service(rig.desk, rig.station, ("--detection", "whitelist"))
+    node = rig.nodes["a"].start(can=rig.desk.links.can)
     asked = service.start(program=PROGRAM).client()
     until(lambda: asked.node(node.uuid)["verified"])
     reader = {"Authorization": f"Bearer {service.token('reader', '--read-only')}"}

@@ -18,7 +18,7 @@ from teds_provision.teds.profile import shipped_profiles
 from tests.bench import PASSPHRASE, make_station
 from tests.e2e.desk import Running
 from tests.handover.desk import trust
-from tests.measure.hall import Hall, HallNode, events, provisioned
+from tests.measure.rig import Rig, RigNode, events, provisioned
 from tests.measure.test_actuator_safety import Journal, Ros2, time_of
 from tests.ncap.service import Service, unix, verdict, verified
 from tests.pace import until
@@ -48,16 +48,16 @@ DECISIONS = {
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
     """Yield a gripper that station `crane` signed and handed over as a copy to `bench`, which trusts it."""
-    hall = Hall(tmp_path_factory.mktemp("today"), {})
-    crane = make_station(hall.folder / "crane", "crane")
-    bench = Station.open(hall.station.home, ask=lambda prompt, confirm: PASSPHRASE)
+    rig = Rig(tmp_path_factory.mktemp("today"), {})
+    crane = make_station(rig.folder / "crane", "crane")
+    bench = Station.open(rig.station.home, ask=lambda prompt, confirm: PASSPHRASE)
     try:
         trust(bench, crane)
         trust(crane, bench)
-        uuid = provisioned(crane, hall.folder / "handed", "gripper", "g", hall.desk.new_uuid())
-        bundle = hall.folder / "handed.jwe"
+        uuid = provisioned(crane, rig.folder / "handed", "gripper", "g", rig.desk.new_uuid())
+        bundle = rig.folder / "handed.jwe"
         export_bundle(crane, plan_export(crane, ExportOrder(("bench",), (bytes.fromhex(uuid),))), bundle)
         plan = plan_import(bench, bundle.read_bytes())
         assert isinstance(plan, ImportPlan)
@@ -65,18 +65,18 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
     finally:
         crane.close()
         bench.close()
-    hall.nodes["g"] = HallNode(hall, hall.folder / "handed", uuid).start()
-    hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
-    yield hall
-    hall.close()
+    rig.nodes["g"] = RigNode(rig, rig.folder / "handed", uuid).start()
+    rig.desk.links = type(rig.desk.links)(rig.desk.links.nfc, rig.can)
+    yield rig
+    rig.close()
 
 
 _HOMES = count()
 
 
 @pytest.fixture
-def hall(made: Hall) -> Iterator[Hall]:
-    """Yield the hall with a home in which nothing was decided yet."""
+def rig(made: Rig) -> Iterator[Rig]:
+    """Yield the rig with a home in which nothing was decided yet."""
     before = made.station
     made.station = made.copy(f"home{next(_HOMES)}")
     with made.visited():
@@ -84,9 +84,9 @@ def hall(made: Hall) -> Iterator[Hall]:
     made.station = before
 
 
-def decide(hall: Hall, decision: Decision) -> float:
+def decide(rig: Rig, decision: Decision) -> float:
     """Run the command of a decision; returns when it had ended (unix)."""
-    hall.station.ask(*(word.format(uuid=hall.nodes["g"].uuid) for word in decision.words))
+    rig.station.ask(*(word.format(uuid=rig.nodes["g"].uuid) for word in decision.words))
     return time.time()
 
 
@@ -110,11 +110,11 @@ def require_safe(journal: Journal, decided: float) -> None:
 
 
 @pytest.mark.parametrize("decision", DECISIONS.values(), ids=DECISIONS)
-def test_measure_ends_with_the_reason_and_marks_its_recording(hall: Hall, decision: Decision, tmp_path: Path) -> None:
+def test_measure_ends_with_the_reason_and_marks_its_recording(rig: Rig, decision: Decision, tmp_path: Path) -> None:
     file = tmp_path / "run.csv"
-    running = hall.begin(hall.nodes["g"].uuid, "--rate", 20, "--to", file)
+    running = rig.begin(rig.nodes["g"].uuid, "--rate", 20, "--to", file)
     running.wait_for('"event":"data"')
-    decided = decide(hall, decision)
+    decided = decide(rig, decision)
     outcome = running.end()
     require_in_time(decided)
     assert outcome.code == decision.code, outcome
@@ -122,7 +122,7 @@ def test_measure_ends_with_the_reason_and_marks_its_recording(hall: Hall, decisi
     [refused] = [line for line in lines if line["event"] == "status" and line.get("state") == "refused"]
     assert decision.why in refused["why"]
     [left] = [line for line in lines if line["event"] == "left"]
-    assert (left["uuid"], left["why"]) == (hall.nodes["g"].uuid, refused["why"]), "as ncap has it"
+    assert (left["uuid"], left["why"]) == (rig.nodes["g"].uuid, refused["why"]), "as ncap has it"
     assert decision.why in lines[-1]["error"]["message"]
     assert decision.why in file.read_text()
 
@@ -143,20 +143,20 @@ IN_THE_GATE = {("trust removed", "uuids"), ("revoked", "match"), ("unlisted", "u
     ],
 )
 def test_ncap_releases_the_node_moves_it_no_more_and_marks_its_recording(
-    hall: Hall, decision: Decision, selected: str
+    rig: Rig, decision: Decision, selected: str
 ) -> None:
-    uuid = hall.nodes["g"].uuid
-    recorded = hall.station.home / "recorded"
-    service = Service(hall.desk, hall.station).start("--record", recorded, "--dead-man", 10_000)
+    uuid = rig.nodes["g"].uuid
+    recorded = rig.station.home / "recorded"
+    service = Service(rig.desk, rig.station).start("--record", recorded, "--dead-man", 10_000)
     assert verdict(verified(service, uuid)) == "authentic"
-    journal = Journal.of(hall)
+    journal = Journal.of(rig)
     with service.client() as asked:
         what: dict[str, Any] = {"uuids": [uuid]} if selected == "uuids" else {"match": "all"}
         asked.request("POST", "/measurements", {**what, "rate": 20})
         until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured")
         asked.request("PUT", f"/nodes/{uuid}/channels/1", {"value": 0.05, "hold": 60})
         journal.moves()
-        decided = decide(hall, decision)
+        decided = decide(rig, decision)
         assert service.process is not None
         process = service.process
         [left] = until(lambda: left_of(process), lambda: process.out)
@@ -171,26 +171,26 @@ def test_ncap_releases_the_node_moves_it_no_more_and_marks_its_recording(
     assert any(decision.why.encode() in file.read_bytes() for file in recordings), recordings
 
 
-def test_a_node_that_is_listed_again_does_not_wait_for_the_next_try(hall: Hall) -> None:
+def test_a_node_that_is_listed_again_does_not_wait_for_the_next_try(rig: Rig) -> None:
     """A measurement by UUID waited out its pause, up to 30 s; and the page kept the unit of an edited profile."""
-    uuid = hall.nodes["g"].uuid
-    [entry] = [entry for entry in hall.station.ask("whitelist", "list")["whitelist"] if entry["uuid"] == uuid]
-    service = Service(hall.desk, hall.station).start()
+    uuid = rig.nodes["g"].uuid
+    [entry] = [entry for entry in rig.station.ask("whitelist", "list")["whitelist"] if entry["uuid"] == uuid]
+    service = Service(rig.desk, rig.station).start()
     assert verdict(verified(service, uuid)) == "authentic"
     with service.client() as asked:
         asked.request("POST", "/measurements", {"uuids": [uuid], "rate": 20})
         until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured")
-        decide(hall, DECISIONS["unlisted"])
+        decide(rig, DECISIONS["unlisted"])
         # 1, 2 and 4 s are over
         until(lambda: "again in 8 s" in (asked.node(uuid)["measuring"] or {}).get("why", ""))
         units = [channel["shown"]["unit"] for channel in asked.node(uuid)["channels"]]
-        hall.station.ask("whitelist", "add", uuid, "--fingerprint", entry["fingerprint"])
+        rig.station.ask("whitelist", "add", uuid, "--fingerprint", entry["fingerprint"])
         listed = time.monotonic()
         until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured again")
         assert time.monotonic() - listed < LIMIT + SLACK
 
         assert "um" not in units
-        folder = hall.station.home / "profiles"
+        folder = rig.station.home / "profiles"
         folder.mkdir(exist_ok=True)
         text = (shipped_profiles() / "gripper.toml").read_text()
         text = text.replace('unit = "mm"\n', 'unit = "mm"\ndisplay-unit = "um"\n', 1)
@@ -200,12 +200,12 @@ def test_a_node_that_is_listed_again_does_not_wait_for_the_next_try(hall: Hall) 
 
 
 @pytest.mark.parametrize("decision", DECISIONS.values(), ids=DECISIONS)
-def test_set_ends_and_its_actuator_is_safe(hall: Hall, decision: Decision) -> None:
-    words = ["set", hall.nodes["g"].uuid, 1, 0.05, "--dead-man", 10_000, "--can", hall.can]
-    acting, journal = hall.station.start("--json", *words), Journal.of(hall)
+def test_set_ends_and_its_actuator_is_safe(rig: Rig, decision: Decision) -> None:
+    words = ["set", rig.nodes["g"].uuid, 1, 0.05, "--dead-man", 10_000, "--can", rig.can]
+    acting, journal = rig.station.start("--json", *words), Journal.of(rig)
     acting.wait_for('"applied"')
     journal.moves()
-    decided = decide(hall, decision)
+    decided = decide(rig, decision)
     outcome = acting.end()
     require_in_time(decided)
     assert outcome.code == decision.code, outcome
@@ -213,18 +213,18 @@ def test_set_ends_and_its_actuator_is_safe(hall: Hall, decision: Decision) -> No
     require_safe(journal, decided)
 
 
-def test_a_consumer_that_goes_on_moves_nothing_after_its_signer_lost_trust(hall: Hall) -> None:
+def test_a_consumer_that_goes_on_moves_nothing_after_its_signer_lost_trust(rig: Rig) -> None:
     """`measure --ros2`: set points by a topic end with the trust, though their publisher lives."""
     pytest.importorskip("cyclonedds")
     with ros_domain() as domain:
         ros = Ros2(domain)
-        words = [hall.nodes["g"].uuid, "--rate", 20, *ros.words, "--dead-man", 10_000]
-        running = hall.begin(*words, environment=ros.environment)
+        words = [rig.nodes["g"].uuid, "--rate", 20, *ros.words, "--dead-man", 10_000]
+        running = rig.begin(*words, environment=ros.environment)
         running.wait_for('"event":"data"')
-        journal, publisher = Journal.of(hall), ros.publish()
+        journal, publisher = Journal.of(rig), ros.publish()
         try:
             journal.moves()
-            decided = decide(hall, DECISIONS["trust removed"])
+            decided = decide(rig, DECISIONS["trust removed"])
             assert running.end().code == 4
             require_in_time(decided)
             require_safe(journal, decided)
@@ -233,14 +233,14 @@ def test_a_consumer_that_goes_on_moves_nothing_after_its_signer_lost_trust(hall:
             publisher.wait()
 
 
-def test_a_node_that_was_taken_out_of_service_is_not_tried_for_ever_by_a_frozen_measurement(hall: Hall) -> None:
-    uuid = hall.nodes["g"].uuid
-    service = Service(hall.desk, hall.station).start()
+def test_a_node_that_was_taken_out_of_service_is_not_tried_for_ever_by_a_frozen_measurement(rig: Rig) -> None:
+    uuid = rig.nodes["g"].uuid
+    service = Service(rig.desk, rig.station).start()
     assert verdict(verified(service, uuid)) == "authentic"
     with service.client() as asked:
         asked.request("POST", "/measurements", {"match": "type:gripper", "frozen": True, "rate": 20})
         until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured")
-        hall.station.ask("decommission", uuid, "--force", "--yes", "--can", hall.can, "--timeout", 2)
+        rig.station.ask("decommission", uuid, "--force", "--yes", "--can", rig.can, "--timeout", 2)
         [measurement] = until(
             lambda: [known for known in asked.measurements() if not known["uuids"]], asked.measurements
         )

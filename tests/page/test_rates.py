@@ -11,7 +11,7 @@ import pytest
 from teds_provision import client
 from tests.bench import PASSPHRASE
 from tests.e2e.desk import ANGLE
-from tests.measure.hall import FAULTY
+from tests.measure.rig import FAULTY
 from tests.pace import until
 
 from .lab import Lab, opened

@@ -34,7 +34,7 @@ from teds_provision.vault.passphrase import THROWAWAY
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Links
 from tests.faults.desk import own_links
-from tests.measure.hall import provisioned
+from tests.measure.rig import provisioned
 from tests.pace import PATIENCE
 from tests.zygote import FIRST_FD, Child, Zygote
 

@@ -23,7 +23,7 @@ Connection = psycopg.Connection[tuple[Any, ...]]
 
 
 @dataclass
-class Hall:
+class Rig:
     """A database with a victim, who has a page and a parcel to a third station, and a thief."""
 
     database: Database
@@ -58,17 +58,17 @@ def send(connection: Connection, to: Login, content: bytes = b"sealed", days: in
 
 
 @pytest.fixture(scope="module")
-def hall(database: Database) -> Hall:
+def rig(database: Database) -> Rig:
     victim, thief, third = (database.member() for _ in range(3))
     with victim.connect() as connection:
         append(connection, 1, b"", page("the victim's first page"))
         parcel = send(connection, third)
-    return Hall(database, victim, thief, third, parcel)
+    return Rig(database, victim, thief, third, parcel)
 
 
 @pytest.fixture(scope="module")
-def own(hall: Hall) -> Iterator[Connection]:
-    with hall.thief.connect() as connection:
+def own(rig: Rig) -> Iterator[Connection]:
+    with rig.thief.connect() as connection:
         yield connection
 
 
@@ -171,48 +171,48 @@ def test_a_stolen_login_may_not(attempt: str, thief: Connection) -> None:
         thief.execute(statement)
 
 
-def test_a_thief_does_not_become_another_station(thief: Connection, hall: Hall) -> None:
-    for statement in (f"set role {hall.victim.role}", f"set session authorization {hall.victim.role}"):
+def test_a_thief_does_not_become_another_station(thief: Connection, rig: Rig) -> None:
+    for statement in (f"set role {rig.victim.role}", f"set session authorization {rig.victim.role}"):
         with pytest.raises(DENIED), thief.transaction():
             thief.execute(statement)
 
 
-def test_a_thief_does_not_end_others(thief: Connection, hall: Hall) -> None:
-    with hall.victim.connect() as victim:
+def test_a_thief_does_not_end_others(thief: Connection, rig: Rig) -> None:
+    with rig.victim.connect() as victim:
         pid = victim.info.backend_pid
         with pytest.raises(DENIED):
             thief.execute("select pg_terminate_backend(%s)", (pid,))
         assert victim.execute("select 1").fetchone() == (1,)
 
 
-def test_a_thief_sees_no_parcel_of_others_and_takes_none_away(thief: Connection, hall: Hall) -> None:
+def test_a_thief_sees_no_parcel_of_others_and_takes_none_away(thief: Connection, rig: Rig) -> None:
     assert thief.execute("select id from registry.parcel").fetchall() == []
     assert thief.execute("delete from registry.parcel").rowcount == 0
-    with hall.third.connect() as third:
-        assert [str(row[0]) for row in third.execute("select id from registry.parcel")] == [hall.parcel]
+    with rig.third.connect() as third:
+        assert [str(row[0]) for row in third.execute("select id from registry.parcel")] == [rig.parcel]
 
 
-def test_a_thief_sends_in_his_own_name_only(thief: Connection, hall: Hall) -> None:
-    name = send(thief, hall.victim)
+def test_a_thief_sends_in_his_own_name_only(thief: Connection, rig: Rig) -> None:
+    name = send(thief, rig.victim)
     row = thief.execute("select sender from registry.parcel where id = %s", (name,)).fetchone()
-    assert row == (bytes.fromhex(hall.thief.fingerprint),)
+    assert row == (bytes.fromhex(rig.thief.fingerprint),)
 
 
-def test_a_parcel_of_anothers_id_is_not_replaced(thief: Connection, hall: Hall) -> None:
+def test_a_parcel_of_anothers_id_is_not_replaced(thief: Connection, rig: Rig) -> None:
     with pytest.raises(errors.UniqueViolation):
-        send(thief, hall.third, b"forged", parcel=hall.parcel)
+        send(thief, rig.third, b"forged", parcel=rig.parcel)
 
 
-def test_a_thief_writes_junk_into_his_own_chain_and_nowhere_else(hall: Hall) -> None:
-    login = hall.database.member()
+def test_a_thief_writes_junk_into_his_own_chain_and_nowhere_else(rig: Rig) -> None:
+    login = rig.database.member()
     with login.connect() as connection:
         assert append(connection, 1, b"", page("junk")) == 1
         rows = connection.execute("select station from registry.page where n = 1 and jws like '%%junk%%'").fetchall()
     assert rows == [(bytes.fromhex(login.fingerprint),)]
 
 
-def test_the_own_search_path_does_not_reach_the_functions(hall: Hall) -> None:
-    login = hall.database.member()
+def test_the_own_search_path_does_not_reach_the_functions(rig: Rig) -> None:
+    login = rig.database.member()
     with login.connect() as connection:
         connection.execute("set search_path = pg_temp, public, registry")
         first = page()
@@ -221,9 +221,9 @@ def test_the_own_search_path_does_not_reach_the_functions(hall: Hall) -> None:
         assert row == (digest(first),)
 
 
-def test_pages_follow_each_other_and_the_same_again_is_done(hall: Hall) -> None:
+def test_pages_follow_each_other_and_the_same_again_is_done(rig: Rig) -> None:
     first, second = page(), page()
-    with hall.database.member().connect() as connection:
+    with rig.database.member().connect() as connection:
         assert append(connection, 1, b"", first) == 1
         assert append(connection, 1, b"", first) == 1
         with pytest.raises(psycopg.Error) as other:
@@ -240,8 +240,8 @@ def test_pages_follow_each_other_and_the_same_again_is_done(hall: Hall) -> None:
     ]
 
 
-def test_a_page_is_appended_at_read_committed_only(hall: Hall) -> None:
-    with hall.database.member().connect() as connection:
+def test_a_page_is_appended_at_read_committed_only(rig: Rig) -> None:
+    with rig.database.member().connect() as connection:
         connection.execute("set default_transaction_isolation = 'serializable'")
         with pytest.raises(psycopg.Error) as refused:
             append(connection, 1, b"", page())
@@ -253,37 +253,37 @@ def test_more_than_a_mebibyte_is_no_page(thief: Connection) -> None:
         append(thief, 1, b"", page("x" * (1 << 20)))
 
 
-def test_spam_ends_at_256_mebibytes(hall: Hall) -> None:
-    spammer = hall.database.member()
-    hall.database.sql(  # what waits already, without sending it
+def test_spam_ends_at_256_mebibytes(rig: Rig) -> None:
+    spammer = rig.database.member()
+    rig.database.sql(  # what waits already, without sending it
         "insert into registry.parcel select gen_random_uuid(), station, station, "
         "decode(repeat('00', 67108864), 'hex'), now() + interval '1 day' from registry.member, generate_series(1, 4) "
         f"where role = '{spammer.role}'"
     )
     try:
         with spammer.connect() as connection, pytest.raises(psycopg.Error) as full:
-            send(connection, hall.victim)
+            send(connection, rig.victim)
         assert full.value.sqlstate == "TE004"
     finally:
-        hall.database.sql(f"delete from registry.parcel where sender = '\\x{spammer.fingerprint}'")
+        rig.database.sql(f"delete from registry.parcel where sender = '\\x{spammer.fingerprint}'")
 
 
-def test_a_parcel_waits_31_days_at_most(thief: Connection, hall: Hall) -> None:
+def test_a_parcel_waits_31_days_at_most(thief: Connection, rig: Rig) -> None:
     with pytest.raises(psycopg.Error) as refused:
-        send(thief, hall.victim, days=32)
+        send(thief, rig.victim, days=32)
     assert refused.value.sqlstate == "TE004"
 
 
-def test_what_others_ask_is_not_seen(thief: Connection, hall: Hall) -> None:
-    with hall.victim.connect() as victim:
+def test_what_others_ask_is_not_seen(thief: Connection, rig: Rig) -> None:
+    with rig.victim.connect() as victim:
         victim.execute("select 'a word of the victim'")
         rows = thief.execute("select query from pg_stat_activity").fetchall()
     assert not any("a word of the victim" in (text or "") for (text,) in rows)
 
 
-def test_what_is_allowed_does_no_harm(own: Connection, hall: Hall) -> None:
+def test_what_is_allowed_does_no_harm(own: Connection, rig: Rig) -> None:
     """NOTIFY, a lock on a table, time-outs of his own: the victim works on."""
-    with own.transaction(force_rollback=True), hall.victim.connect() as victim:
+    with own.transaction(force_rollback=True), rig.victim.connect() as victim:
         own.execute("notify teds, 'x'")
         own.execute("set local statement_timeout = 0")
         own.execute("lock table registry.page in access share mode")
@@ -293,8 +293,8 @@ def test_what_is_allowed_does_no_harm(own: Connection, hall: Hall) -> None:
         assert append(victim, head[0] + 1, head[1], page()) == head[0] + 1
 
 
-def test_no_login_has_more_than_six_connections(hall: Hall) -> None:
-    login = hall.database.member()
+def test_no_login_has_more_than_six_connections(rig: Rig) -> None:
+    login = rig.database.member()
     held = [login.connect() for _ in range(6)]
     try:
         with pytest.raises(psycopg.OperationalError, match="too many connections"):
@@ -313,45 +313,45 @@ def test_no_login_has_more_than_six_connections(hall: Hall) -> None:
     ],
 )
 def test_a_login_without_tls_with_another_secret_or_elsewhere_is_refused(
-    hall: Hall, more: dict[str, str], why: str
+    rig: Rig, more: dict[str, str], why: str
 ) -> None:
-    hall.database.cluster.psql("revoke connect on database postgres from public")
+    rig.database.cluster.psql("revoke connect on database postgres from public")
     with pytest.raises(psycopg.OperationalError, match=why):
-        hall.thief.connect(**more)
+        rig.thief.connect(**more)
 
 
-def test_the_verifier_does_not_log_in(hall: Hall) -> None:
-    login = hall.database.member()
+def test_the_verifier_does_not_log_in(rig: Rig) -> None:
+    login = rig.database.member()
     with pytest.raises(psycopg.OperationalError):
         login.connect(password=verifier(login.secret))
 
 
-def test_a_closed_station_neither_writes_nor_reads_parcels_and_its_connections_end(hall: Hall) -> None:
-    login = hall.database.member()
-    with hall.victim.connect() as victim:
+def test_a_closed_station_neither_writes_nor_reads_parcels_and_its_connections_end(rig: Rig) -> None:
+    login = rig.database.member()
+    with rig.victim.connect() as victim:
         send(victim, login)
     connection = login.connect()
-    hall.database.sql(f"update registry.member set open = false where role = '{login.role}'")
+    rig.database.sql(f"update registry.member set open = false where role = '{login.role}'")
     with pytest.raises(psycopg.Error) as closed:
         append(connection, 1, b"", page())
     assert closed.value.sqlstate == "TE001"
     assert connection.execute("select id from registry.parcel").fetchall() == []
-    hall.database.sql(close_sql(login.fingerprint))
+    rig.database.sql(close_sql(login.fingerprint))
     with pytest.raises(psycopg.OperationalError):
         connection.execute("select 1")
     with pytest.raises(psycopg.OperationalError, match="not permitted to log in"):
         login.connect()
 
 
-def test_a_member_reads_all_pages_and_a_reader_all_but_parcels(thief: Connection, hall: Hall) -> None:
+def test_a_member_reads_all_pages_and_a_reader_all_but_parcels(thief: Connection, rig: Rig) -> None:
     assert thief.execute("select count(*) from registry.page where jws like '%%victim''s first%%'").fetchone() == (1,)
     query = "set role teds_reader; select count(*) > 0 from registry.page; select count(*) from registry.parcel"
     with pytest.raises(Exception, match="permission denied for table parcel"):
-        hall.database.sql(query)
+        rig.database.sql(query)
 
 
-def test_each_member_has_its_roster_row_and_a_rolled_back_one_is_put_back(hall: Hall) -> None:
-    with hall.victim.connect() as victim, hall.third.connect() as third:
+def test_each_member_has_its_roster_row_and_a_rolled_back_one_is_put_back(rig: Rig) -> None:
+    with rig.victim.connect() as victim, rig.third.connect() as third:
         victim.execute("select registry.post_roster(3, 'the third')")
         third.execute("select registry.post_roster(2, 'an older one')")
         third.execute("select registry.post_roster(1, 'one rolled back')")
@@ -386,25 +386,25 @@ def test_a_newer_schema_is_not_touched(cluster: Cluster) -> None:
         database.sql(registry_sql(database.registry))
 
 
-def test_a_member_that_is_added_again_gets_its_new_password_and_keeps_its_chain(hall: Hall) -> None:
-    login = hall.database.member()
+def test_a_member_that_is_added_again_gets_its_new_password_and_keeps_its_chain(rig: Rig) -> None:
+    login = rig.database.member()
     with login.connect() as connection:
         append(connection, 1, b"", page())
-    newer = Login(hall.database, login.fingerprint)
-    hall.database.sql(member_sql(newer.fingerprint, verifier(newer.secret)))
+    newer = Login(rig.database, login.fingerprint)
+    rig.database.sql(member_sql(newer.fingerprint, verifier(newer.secret)))
     with newer.connect() as connection:
         assert connection.execute("select n from registry.member where role = session_user").fetchone() == (1,)
     with pytest.raises(psycopg.OperationalError):
         login.connect()
 
 
-def test_mending_takes_rows_off_and_the_chain_goes_on(hall: Hall) -> None:
-    login = hall.database.member()
+def test_mending_takes_rows_off_and_the_chain_goes_on(rig: Rig) -> None:
+    login = rig.database.member()
     first, forged, second = page(), page("forged"), page()
     with login.connect() as connection:
         append(connection, 1, b"", first)
         append(connection, 2, digest(first), forged)
-        hall.database.sql(mend_sql(login.fingerprint, 2))
+        rig.database.sql(mend_sql(login.fingerprint, 2))
         assert append(connection, 2, digest(first), second) == 2
-        hall.database.sql(mend_sql(login.fingerprint, 1))
+        rig.database.sql(mend_sql(login.fingerprint, 1))
         assert append(connection, 1, b"", first) == 1

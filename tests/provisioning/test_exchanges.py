@@ -32,7 +32,7 @@ from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.sheet import Sheet
 from tests.answers import Answers
 from tests.bench import Board, MemoryLink, make_station, on_reader, talk
-from tests.measure.hall import CALIBRATIONS
+from tests.measure.rig import CALIBRATIONS
 from tests.provisioning.exchanges import AGAIN, AGREED, CLAIMED, FIRST, IDENTIFIED, OPENED, asked, in_order
 
 ANGLE = "magnetic-angular-position-sensor"

@@ -34,7 +34,7 @@ from teds_provision.teds.sheet import Sheet
 from tests.answers import Answers
 from tests.bench import Board, on_reader, talk
 from tests.e2e.desk import ANGLE
-from tests.measure.hall import CALIBRATIONS
+from tests.measure.rig import CALIBRATIONS
 
 GRIPPER, FORCE = "gripper", "load-cell"
 

@@ -23,7 +23,7 @@ from typing import Any
 
 from teds_provision.client import Client
 from tests.e2e.desk import ANGLE
-from tests.measure.hall import Hall
+from tests.measure.rig import Rig
 from tests.measure.test_clock_set import SystemClock, stamps
 from tests.measure.test_full_disk import SmallDisk, fill
 from tests.measure.test_pulled_adapter import Adapter
@@ -96,10 +96,10 @@ class Soak:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.hall = Hall(folder / "hall", {"a": ANGLE, "b": ANGLE, "s": ANGLE})
+        self.rig = Rig(folder / "rig", {"a": ANGLE, "b": ANGLE, "s": ANGLE})
         self.serial = free_bus()
-        for name, bus in (("a", self.hall.can), ("b", self.hall.can), ("s", self.serial)):
-            self.hall.nodes[name].start(can=bus)
+        for name, bus in (("a", self.rig.can), ("b", self.rig.can), ("s", self.serial)):
+            self.rig.nodes[name].start(can=bus)
         self.clock, self.disk = SystemClock(folder), SmallDisk(folder / "disk")
         self.port = folder / "adapter"
         self.adapter: Adapter | None = None
@@ -111,13 +111,13 @@ class Soak:
             "--detection",
             "transparent",
             "--can",
-            self.hall.can,
+            self.rig.can,
             "--can",
             f"slcan:{self.port}?sleep_after_open=0",
         ]
         words += ["--record", str(self.disk.folder)]
-        self.service = Service(self.hall.desk, self.hall.station)
-        self.running = self.hall.station.start(
+        self.service = Service(self.rig.desk, self.rig.station)
+        self.running = self.rig.station.start(
             *words, program=self.disk.program, environment=self.clock.environment, fork=False
         )
         self.service.process = self.running
@@ -148,7 +148,7 @@ class Soak:
         """Whether a value of each of these nodes came within the last two seconds, by the service's own clock."""
         with self.asked() as client:
             for name in names:
-                last = client.node(self.hall.nodes[name].uuid)["channels"][0].get("last")
+                last = client.node(self.rig.nodes[name].uuid)["channels"][0].get("last")
                 if last is None or abs(last["time"] - time.time() - self.offset) > 2.0:
                     return False
         return True
@@ -168,7 +168,7 @@ class Soak:
     def begin(self) -> None:
         """Measure all three."""
         with self.asked() as client:
-            uuids = [node.uuid for node in self.hall.nodes.values()]
+            uuids = [node.uuid for node in self.rig.nodes.values()]
             client.request("POST", "/measurements", {"uuids": uuids, "rate": 50})
         self.measured("begin")
 
@@ -205,7 +205,7 @@ class Soak:
 
     def crowd(self) -> None:
         """Thousands of nodes that nobody made."""
-        crowd, began, over = Crowd(self.hall.can), time.monotonic(), threading.Event()
+        crowd, began, over = Crowd(self.rig.can), time.monotonic(), threading.Event()
 
         def discover() -> None:
             with self.asked() as client:
@@ -247,7 +247,7 @@ class Soak:
         self._reader.join()
         if self.adapter is not None:
             self.adapter.pull()
-        self.hall.close()
+        self.rig.close()
 
 
 def main(arguments: list[str]) -> int:

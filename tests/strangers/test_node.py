@@ -19,7 +19,7 @@ from teds_provision.node.flash_file import FlashFile
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import ChannelKind, Sheet
 from tests.e2e.desk import ANGLE, Running
-from tests.measure.hall import Hall, events, of, ran
+from tests.measure.rig import Rig, events, of, ran
 from tests.pace import succeeds, until
 from tests.strangers.wire import of_spec
 
@@ -29,9 +29,9 @@ KINDS = {ChannelKind.SENSOR: "sensor", ChannelKind.EVENT_SENSOR: "event sensor",
 
 @dataclass
 class StrangerNode:
-    """A node of the hall, played by a stranger's firmware."""
+    """A node of the rig, played by a stranger's firmware."""
 
-    hall: Hall
+    rig: Rig
     name: str
     fd: bool
     address: int
@@ -39,15 +39,15 @@ class StrangerNode:
 
     @property
     def can(self) -> str:
-        return self.hall.can if self.fd else self.hall.desk.links.can
+        return self.rig.can if self.fd else self.rig.desk.links.can
 
     @property
     def uuid(self) -> str:
-        return self.hall.nodes[self.name].uuid
+        return self.rig.nodes[self.name].uuid
 
     def plan(self, fault: str = "", **more: Any) -> Path:
         """Return the file that says who it is and what is wrong with it."""
-        file = FlashFile(self.hall.folder / self.name)
+        file = FlashFile(self.rig.folder / self.name)
         flash, document = file.load(), json.loads(file.path.read_text())
         file.release()
         sheet = Sheet.from_image(Image(flash.uuid, dict(flash.blocks)))
@@ -61,19 +61,19 @@ class StrangerNode:
             for channel in sheet.channels
             if channel.kind is not None and channel.sample is not None
         }
-        group, port = of_spec(self.hall.desk.links.can)
+        group, port = of_spec(self.rig.desk.links.can)
         given = {
             "bus": {"group": group, "port": port, "fd": self.fd, "address": self.address},
             "uuid": flash.uuid.hex(), "key": flash.key.hex() if flash.key else "", "epoch": flash.epoch,
             "sequence": flash.sequence, "identity": document["key"], "channels": channels, "fault": fault,
             "teds": {f"{channel},{code}": octets.hex() for (channel, code), octets in flash.blocks.items()}, **more,
         }  # fmt: skip
-        plan = self.hall.folder / f"{self.name}.json"
+        plan = self.rig.folder / f"{self.name}.json"
         plan.write_text(json.dumps(given))
         return plan
 
     def start(self, fault: str = "", *, program: str = "tests.strangers.node", **more: Any) -> StrangerNode:
-        self.process = self.hall.desk.start(self.plan(fault, **more), program=(sys.executable, "-m", program))
+        self.process = self.rig.desk.start(self.plan(fault, **more), program=(sys.executable, "-m", program))
         self.process.wait_for('"ready": true')
         return self
 
@@ -90,15 +90,15 @@ class StrangerNode:
 
 
 @pytest.fixture(scope="module")
-def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
-    made = Hall(tmp_path_factory.mktemp("strangers"), {"a": ANGLE, "g": "gripper"})
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    made = Rig(tmp_path_factory.mktemp("strangers"), {"a": ANGLE, "g": "gripper"})
     yield made
     made.close()
 
 
 @contextmanager
-def played(hall: Hall, name: str, address: int, *, fd: bool) -> Iterator[StrangerNode]:
-    made = StrangerNode(hall, name, fd, address)
+def played(rig: Rig, name: str, address: int, *, fd: bool) -> Iterator[StrangerNode]:
+    made = StrangerNode(rig, name, fd, address)
     try:
         yield made
     finally:
@@ -112,26 +112,26 @@ CLASSIC = pytest.mark.nightly(
 
 
 @pytest.fixture(params=[pytest.param(False, marks=CLASSIC), True], ids=["classic", "fd"])
-def angle(hall: Hall, request: pytest.FixtureRequest) -> Iterator[StrangerNode]:
-    with played(hall, "a", 0x31, fd=request.param) as made:
+def angle(rig: Rig, request: pytest.FixtureRequest) -> Iterator[StrangerNode]:
+    with played(rig, "a", 0x31, fd=request.param) as made:
         yield made
 
 
 @pytest.fixture
-def fd_angle(hall: Hall) -> Iterator[StrangerNode]:
-    with played(hall, "a", 0x31, fd=True) as made:
+def fd_angle(rig: Rig) -> Iterator[StrangerNode]:
+    with played(rig, "a", 0x31, fd=True) as made:
         yield made
 
 
 @pytest.fixture
-def classic_angle(hall: Hall) -> Iterator[StrangerNode]:
-    with played(hall, "a", 0x31, fd=False) as made:
+def classic_angle(rig: Rig) -> Iterator[StrangerNode]:
+    with played(rig, "a", 0x31, fd=False) as made:
         yield made
 
 
 @pytest.fixture
-def gripper(hall: Hall) -> Iterator[StrangerNode]:
-    with played(hall, "g", 0x32, fd=True) as made:
+def gripper(rig: Rig) -> Iterator[StrangerNode]:
+    with played(rig, "g", 0x32, fd=True) as made:
         yield made
 
 
@@ -141,13 +141,13 @@ def steps(line: dict[str, Any]) -> set[int]:
 
 
 def measured(node: StrangerNode, *words: object, code: int = 0) -> list[dict[str, Any]]:
-    return node.hall.measure(node.uuid, *words, can=node.can, code=code)
+    return node.rig.measure(node.uuid, *words, can=node.can, code=code)
 
 
 @pytest.mark.realtime  # the bound of the clock is what the best exchange took
 def test_it_is_verified_sampled_and_measured(angle: StrangerNode) -> None:
     angle.start()
-    station = angle.hall.station
+    station = angle.rig.station
     assert station.ask("verify", angle.uuid, "--via", "can", "--can", angle.can)["verdict"] == "authentic"
     assert station.ask("mode", angle.uuid, "--can", angle.can)["mode"] == "configuration"
     [taken] = station.ask("sample", angle.uuid, "--can", angle.can)["samples"]
@@ -180,13 +180,13 @@ def test_a_stranger_among_our_own(fd_angle: StrangerNode, gripper: StrangerNode)
     """Two strangers' nodes and two of our stations on one bus: none disturbs another."""
     fd_angle.start()
     gripper.start()
-    other = fd_angle.hall.copy("twin")
+    other = fd_angle.rig.copy("twin")
 
     def disturbed() -> list[object]:
         """Return what was lost or late; a machine that is busy costs that, once."""
-        first = fd_angle.hall.begin(fd_angle.uuid, gripper.uuid, "--rate", 40, "--trigger")
+        first = fd_angle.rig.begin(fd_angle.uuid, gripper.uuid, "--rate", 40, "--trigger")
         first.wait_for('"event":"data"')
-        second = fd_angle.hall.begin(fd_angle.uuid, "--rate", 25, can=f"{fd_angle.can}&source=0xF3", station=other)
+        second = fd_angle.rig.begin(fd_angle.uuid, "--rate", 25, can=f"{fd_angle.can}&source=0xF3", station=other)
         second.wait_for('"index":20')
         found: list[object] = []
         for running in (second, first):
@@ -203,7 +203,7 @@ def test_a_stranger_among_our_own(fd_angle: StrangerNode, gripper: StrangerNode)
 
 def test_a_strangers_actuator_is_set_and_left_safe(gripper: StrangerNode) -> None:
     gripper.start()
-    station = gripper.hall.station
+    station = gripper.rig.station
 
     def let_go_too_soon() -> bool:
         """Return True if it was not fed for twice its dead-man: by a command that the machine did not run, once."""
@@ -226,7 +226,7 @@ def test_a_strangers_actuator_is_set_and_left_safe(gripper: StrangerNode) -> Non
 
 def test_a_node_that_is_reset_in_the_middle_is_measured_on(fd_angle: StrangerNode) -> None:
     fd_angle.start()
-    running = fd_angle.hall.begin(fd_angle.uuid, "--rate", 50)
+    running = fd_angle.rig.begin(fd_angle.uuid, "--rate", 50)
     running.wait_for('"index":20')
     fd_angle.end()
     fd_angle.start()
@@ -251,7 +251,7 @@ FAULTS = {
 def test_a_fault_is_counted_and_no_value_is_false(classic_angle: StrangerNode, fault: str) -> None:
     """Classic frames, four a message, so that segments can be missing."""
     node = classic_angle.start(fault)
-    running = node.hall.begin(node.uuid, "--rate", 400, "--duration", 2, can=node.can)
+    running = node.rig.begin(node.uuid, "--rate", 400, "--duration", 2, can=node.can)
     outcome = running.end()
     lines = events(outcome.out)
     assert {step for line in of(lines) for step in steps(line)} <= {2, 3}, "2.5 ms between two instants"
@@ -264,7 +264,7 @@ def test_a_fault_is_counted_and_no_value_is_false(classic_angle: StrangerNode, f
 def test_what_a_slow_node_sends_from_the_future_is_bad_too(classic_angle: StrangerNode) -> None:
     """It sent one message a turn: on a busy machine turns took longer than messages, and all of them had come true."""
     node = classic_angle.start("from the future", pause=0.05)
-    outcome = node.hall.begin(node.uuid, "--rate", 400, "--duration", 2, can=node.can).end()
+    outcome = node.rig.begin(node.uuid, "--rate", 400, "--duration", 2, can=node.can).end()
     [stream] = events(outcome.out)[-1]["nodes"][0]["streams"]
     assert stream["bad"] > stream["messages"], (stream, outcome.err)
 
@@ -274,7 +274,7 @@ def test_no_sample_has_the_time_of_a_clock_that_lies(fd_angle: StrangerNode, fau
     """`sample` gave the hour at which the node had started, or ended with a bug."""
     fd_angle.start(fault, program="tests.strangers.liar")
     before = time.time()
-    [taken] = fd_angle.hall.station.ask("sample", fd_angle.uuid, "--can", fd_angle.can)["samples"]
+    [taken] = fd_angle.rig.station.ask("sample", fd_angle.uuid, "--can", fd_angle.can)["samples"]
     assert before - 1 < taken["time"] < time.time() + 1
 
 
@@ -303,7 +303,7 @@ def test_a_node_that_contradicts_itself_is_reported(fd_angle: StrangerNode, faul
     else:
         assert of(lines) == []
     # What it was asked for is ended, and not left to go on until the lease does.
-    asked = fd_angle.hall.station.ask("mode", fd_angle.uuid, "--can", f"{fd_angle.can}&source=0xF5")
+    asked = fd_angle.rig.station.ask("mode", fd_angle.uuid, "--can", f"{fd_angle.can}&source=0xF5")
     assert asked["mode"] == "configuration"
 
 
@@ -312,14 +312,14 @@ def test_a_node_that_is_busy_for_ever_is_reported_and_delays_no_other(
 ) -> None:
     fd_angle.start("busy for ever", program="tests.strangers.liar")
     gripper.start()
-    hall = fd_angle.hall
-    lines = events(hall.begin(fd_angle.uuid, gripper.uuid, "--rate", 20, "--duration", 1).end().out)
+    rig = fd_angle.rig
+    lines = events(rig.begin(fd_angle.uuid, gripper.uuid, "--rate", 20, "--duration", 1).end().out)
     assert ran([line for line in lines if line.get("uuid") == gripper.uuid]) == ["running", "ended"]
     whys = [line["why"] for line in lines if line["event"] == "status" and line["uuid"] == fd_angle.uuid]
     assert any("it is busy" in why and "again in 1 s, giving up in" in why for why in whys), whys
     # Its datasheet is read all the same, without proof.
     words = ["verify", fd_angle.uuid, "--via", "can", "--can", fd_angle.can]
-    verified = hall.station.ask(*words, code=5)
+    verified = rig.station.ask(*words, code=5)
     assert verified["verdict"] == "unproven"
     assert "it is busy" in next(check["why"] for check in verified["checks"] if check["name"] == "session")
     # Where it is alone, it is given up at the end of --timeout, and no later than a last try takes.

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from tests.e2e.desk import ANGLE
-from tests.measure.hall import Hall, events, of, states
+from tests.measure.rig import Rig, events, of, states
 from tests.pace import until
 from tests.strangers.test_node import StrangerNode
 from tests.strangers.troublemaker import TROUBLES
@@ -63,23 +63,23 @@ class NodeEvents:
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, NodeEvents]]:
     names = {f"t{number}": name for number, name in enumerate(ORDER)}
-    hall = Hall(tmp_path_factory.mktemp("troubles"), dict.fromkeys(names, ANGLE))
+    rig = Rig(tmp_path_factory.mktemp("troubles"), dict.fromkeys(names, ANGLE))
     try:
-        nodes = {name: StrangerNode(hall, place, True, 0x41 + int(place[1:])) for place, name in names.items()}
+        nodes = {name: StrangerNode(rig, place, True, 0x41 + int(place[1:])) for place, name in names.items()}
         others = [nodes[name].uuid for name in ("", VICTIM)]
         plans = [node.plan("" if name == VICTIM else name, others=others) for name, node in nodes.items()]
-        crowd = hall.desk.start(*plans, program=(sys.executable, "-m", "tests.strangers.troublemaker"))
+        crowd = rig.desk.start(*plans, program=(sys.executable, "-m", "tests.strangers.troublemaker"))
         crowd.wait_for('"ready": true')
         found: dict[str, NodeEvents] = {}
         for names_of, words in (([name for name in ORDER if name not in FREE], ()), (["", *FREE], ("--kind", "free"))):
-            found |= measured(hall, {name: nodes[name].uuid for name in names_of}, *words)
+            found |= measured(rig, {name: nodes[name].uuid for name in names_of}, *words)
         yield found
     finally:
-        hall.close()
+        rig.close()
 
 
-def measured(hall: Hall, uuids: dict[str, str], *words: object) -> dict[str, NodeEvents]:
-    running = hall.begin(*uuids.values(), "--rate", RATE, *words)
+def measured(rig: Rig, uuids: dict[str, str], *words: object) -> dict[str, NodeEvents]:
+    running = rig.begin(*uuids.values(), "--rate", RATE, *words)
 
     def enough() -> bool:
         running.read(0.1)

@@ -13,14 +13,14 @@ from rosbags.highlevel import AnyReader
 
 from tests.cli.shell import call
 from tests.e2e.desk import ANGLE
-from tests.measure.hall import Hall
+from tests.measure.rig import Rig
 
 pytestmark = pytest.mark.link
 
 
 @pytest.fixture(scope="module")
-def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
-    made = Hall(tmp_path_factory.mktemp("hall"), {"a": ANGLE, "b": ANGLE})
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    made = Rig(tmp_path_factory.mktemp("rig"), {"a": ANGLE, "b": ANGLE})
     try:
         for node in made.nodes.values():
             node.start()
@@ -30,10 +30,10 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
 
 
 @pytest.mark.realtime  # a value that comes more than 0.1 s late is in the recording, and in no row of the grid
-def test_two_nodes_are_one_grid_which_pandas_reads(hall: Hall, tmp_path: Path) -> None:
+def test_two_nodes_are_one_grid_which_pandas_reads(rig: Rig, tmp_path: Path) -> None:
     grid, whole = tmp_path / "run.csv", tmp_path / "run.mcap"
-    uuids = [node.uuid for node in hall.nodes.values()]
-    hall.measure(*uuids, "--rate", 50, "--to", grid, "--to", whole, "--wide", "--duration", 2)
+    uuids = [node.uuid for node in rig.nodes.values()]
+    rig.measure(*uuids, "--rate", 50, "--to", grid, "--to", whole, "--wide", "--duration", 2)
     table = pd.read_csv(grid, comment="#")
     assert table.columns[0] == "time"
     assert set(table.columns[1:]) == {"a/angle [rad]", "b/angle [rad]"}

@@ -1,4 +1,4 @@
-"""A hall of nodes that are provisioned already: made in this process in a moment, run by processes of their own."""
+"""A test rig: a station and nodes that it has provisioned, made in this process in a moment; each runs as a process."""
 
 from __future__ import annotations
 
@@ -52,25 +52,25 @@ def provisioned(station: Station, folder: Path, type_: str, name: str, uuid: byt
 
 
 @dataclass
-class HallNode:
-    """A node of the hall; ``process`` while it runs."""
+class RigNode:
+    """A node of the rig; ``process`` while it runs."""
 
-    hall: Hall
+    rig: Rig
     folder: Path
     uuid: str
     process: Running | None = None
     bus: str = ""
 
-    def start(self, *words: object, can: str = "", fault: str = "") -> HallNode:
+    def start(self, *words: object, can: str = "", fault: str = "") -> RigNode:
         """Power on: the product's node, or one with a fault."""
-        bus = self.bus = can or self.bus or self.hall.can
+        bus = self.bus = can or self.bus or self.rig.can
         program: tuple[str, ...]
         given: list[object]
         if fault:
             program, given = FAULTY, [fault, bus, self.folder, *words]
         else:
             program, given = (), ["--json", "node", "run", self.folder, "--can", bus, "--source", "ramp:2", *words]
-        self.process = self.hall.desk.start(*given, **({"program": program} if program else {}))
+        self.process = self.rig.desk.start(*given, **({"program": program} if program else {}))
         self.process.wait_for('"ready": true')
         return self
 
@@ -92,12 +92,12 @@ class HallNode:
 
 
 @dataclass
-class Hall:
+class Rig:
     """A station and its nodes on one bus; commands are processes."""
 
     folder: Path
     types: dict[str, str] = field(default_factory=lambda: {"a": ANGLE, "g": "gripper"})
-    nodes: dict[str, HallNode] = field(default_factory=dict, init=False)
+    nodes: dict[str, RigNode] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         prepared = self.folder / "stations"
@@ -108,7 +108,7 @@ class Hall:
         try:
             for name, type_ in self.types.items():
                 uuid = provisioned(with_keys, self.folder / name, type_, name, self.desk.new_uuid())
-                self.nodes[name] = HallNode(self, self.folder / name, uuid)
+                self.nodes[name] = RigNode(self, self.folder / name, uuid)
         finally:
             with_keys.close()
         self.station: Commands = self.desk.station()
@@ -119,7 +119,7 @@ class Hall:
 
     @contextmanager
     def visited(self) -> Iterator[None]:
-        """One test in a hall that several share, however it ends: what it began ends, who was powered is so again."""
+        """One test in a rig that several share, however it ends: what it began ends, who was powered is so again."""
         powered = [node for node in self.nodes.values() if node.runs]
         there = list(self.desk.running)
         try:
