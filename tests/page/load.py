@@ -68,7 +68,6 @@ def run(browser: Browser, lab: Lab, seconds: float) -> Load:
         until(
             lambda: all((station.node(uuid)["verdict"] or {}).get("verdict") == "authentic" for uuid in uuids),
             "not provisioned",
-            30,
         )
         beside = Listener(lab)
         beside.start()
