@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from teds_provision.errors import AddressConflictError, LinkError, NoNodeError
 from teds_provision.links.discovery import Sighting
@@ -22,6 +23,7 @@ TWIN = 0.5  # seconds in which the node itself may answer as well, where one tha
 
 
 Place = tuple[str, int]
+_Key = TypeVar("_Key", Place, int)
 
 
 @dataclass
@@ -37,6 +39,8 @@ class Presence:
     _wrong: dict[bytes, dict[Place, float]] = field(default_factory=dict)
     _conflicts: dict[Place, tuple[float, AddressConflictError]] = field(default_factory=dict)
     _announced: dict[bytes, tuple[Place, Callable[[], None], Callable[[], None]]] = field(default_factory=dict)
+    _placed: dict[Place, set[bytes]] = field(default_factory=dict)  # of those the nodes at each place,
+    _digested: dict[int, set[bytes]] = field(default_factory=dict)  # and by the CRC that an Announce has of a UUID
     _missing: dict[bytes, int] = field(default_factory=dict)
     _unseen: set[bytes] = field(default_factory=set)  # those that a thread waited for, and that were not seen since
     _welcome: frozenset[int] = frozenset()  # CRCs of UUIDs that are measured as soon as they come
@@ -88,23 +92,31 @@ class Presence:
 
         ``moved`` (else ``notify``): when it answers at another place. Both are hints: any device can send them.
         """
+        place = (sighting.port.place, sighting.address)
         with self._turn:
-            self._announced[sighting.uuid] = ((sighting.port.place, sighting.address), notify, moved or notify)
+            self._drop_announced(sighting.uuid)
+            self._announced[sighting.uuid] = (place, notify, moved or notify)
+            self._placed.setdefault(place, set()).add(sighting.uuid)
+            self._digested.setdefault(uuid_crc(sighting.uuid), set()).add(sighting.uuid)
 
     def let_announce(self, uuid: bytes) -> None:
         """Stop notices about it."""
         with self._turn:
-            self._announced.pop(uuid, None)
+            self._drop_announced(uuid)
+
+    def _drop_announced(self, uuid: bytes) -> None:
+        kept = self._announced.pop(uuid, None)
+        if kept is not None:
+            _discard(self._placed, kept[0], uuid)
+            _discard(self._digested, uuid_crc(uuid), uuid)
 
     def announced(self, place: str, announce: Announce) -> None:
         """Take what a look-out heard; a hint that anyone can send."""
         with self._turn:
-            uuids = [
-                notify
-                for uuid, (where, notify, _) in self._announced.items()
-                if where == (place, announce.address) or (where[0] == place and uuid_crc(uuid) == announce.crc)
-            ]
-        for notify in uuids:
+            named = {uuid for uuid in self._digested.get(announce.crc, ()) if self._announced[uuid][0][0] == place}
+            meant = named | self._placed.get((place, announce.address), set())
+            notices = [self._announced[uuid][1] for uuid in meant]
+        for notify in notices:
             notify()
 
     def is_awaited(self, announce: Announce) -> bool:
@@ -218,3 +230,10 @@ class Presence:
             hint="Check its power, the bit rate and the address; teds-provision identify --via can lists the"
             " nodes that answer.",
         )
+
+
+def _discard(index: dict[_Key, set[bytes]], key: _Key, uuid: bytes) -> None:
+    """Take a node out of an index; a key without nodes goes."""
+    index[key].discard(uuid)
+    if not index[key]:
+        del index[key]

@@ -82,6 +82,7 @@ class Measurement:
     began: Callable[[], None] = lambda: None
     lent: set[bytes] = field(default_factory=set)
     supervisors: list[NodeSupervisor] = field(default_factory=list, init=False)
+    _by_uuid: dict[bytes, NodeSupervisor] = field(default_factory=dict, init=False)
     ready: threading.Event = field(default_factory=threading.Event, init=False)  # nodes may join
 
     def run(self, stop: threading.Event, duration: float | None = None) -> MeasurementEnd:
@@ -91,7 +92,10 @@ class Measurement:
         """
         self._host, self._lock = HostClock(), threading.Lock()
         self._setting = threading.Lock()  # of the clock: until it is free, no block goes on; taken after _lock
-        self._known: dict[tuple[str, int], ChannelFacts] = {}
+        self._known: dict[str, dict[int, ChannelFacts]] = {}  # by node and channel
+        self._chosen: dict[str, dict[int, str]] = {}  # names of topics, likewise
+        for (uuid, number), name in self.facts.names.items():
+            self._chosen.setdefault(uuid, {})[number] = name
         self._grids: dict[str, Grid] = {}  # "": of all nodes together; else by UUID, each node's own
         self._for_grid: deque[Block] = deque()
         self._shown: dict[int, str] = {}  # by id, for two may have one name: the last notice about each sink,
@@ -118,6 +122,7 @@ class Measurement:
             NodeSupervisor(self.station, self.buses, uuid, self.request, self._host, events, self._common_start)
             for uuid in self.uuids
         ]
+        self._by_uuid = {supervisor.uuid: supervisor for supervisor in self.supervisors}
         for supervisor in self.supervisors:
             if supervisor.uuid not in self.lent:
                 supervisor.start()
@@ -265,6 +270,7 @@ class Measurement:
                 self.station, self.buses, uuid, self.request, self._host, self._events, self._common_start
             )
             self.supervisors = [*self.supervisors, supervisor]
+            self._by_uuid[uuid] = supervisor
         if not self._ending:
             supervisor.start()
         return supervisor
@@ -296,13 +302,13 @@ class Measurement:
         self.lent.discard(uuid)
 
     def _supervisor_of(self, uuid: bytes) -> NodeSupervisor | None:
-        return next((supervisor for supervisor in self.supervisors if supervisor.uuid == uuid), None)
+        return self._by_uuid.get(uuid)
 
     def command(self, command: SetPointCommand) -> None:
         """Pass on a set point that came by a sink."""
-        for supervisor in self.supervisors:
-            if supervisor.uuid.hex() == command.uuid:
-                supervisor.command(command)
+        supervisor = self._supervisor_of(bytes.fromhex(command.uuid))
+        if supervisor is not None:
+            supervisor.command(command)
 
     # -- from the threads of nodes and bus ---------------------------------------------------------------------------
 
@@ -320,21 +326,23 @@ class Measurement:
     def _with_names(self, facts: Sequence[ChannelFacts]) -> Sequence[ChannelFacts]:
         """Return the facts of a node that joins, with the present names of its topics: they may be newer than ours."""
         uuids = {channel_facts.uuid for channel_facts in facts}
-        names = {(uuid.hex(), channel): name for (uuid, channel), name in self.station.measurements.names.items()}
-        own = {key: name for key, name in names.items() if key[0] in uuids}
-        others = {key: name for key, name in self.facts.names.items() if key[0] not in uuids}
-        if dict(self.facts.names) != others | own:
-            self.facts = replace(self.facts, names=others | own)
-        chosen = {uuid: tuple((number, name) for (key, number), name in own.items() if key == uuid) for uuid in uuids}
-        return [replace(channel_facts, chosen=chosen[channel_facts.uuid]) for channel_facts in facts]
+        chosen = {uuid: self.station.measurements.names_of(bytes.fromhex(uuid)) for uuid in uuids}
+        if any(self._chosen.get(uuid, {}) != names for uuid, names in chosen.items()):
+            self._chosen |= chosen
+            every = {(uuid, number): name for uuid, names in self._chosen.items() for number, name in names.items()}
+            self.facts = replace(self.facts, names=every)
+        return [replace(channel_facts, chosen=tuple(chosen[channel_facts.uuid].items())) for channel_facts in facts]
 
     def _describe(self, facts: Sequence[ChannelFacts]) -> None:
         if self._open:
             facts = self._with_names(facts)
         with self._lock:
-            before = dict(self._known)
-            self._known.update((channel_facts.key, channel_facts) for channel_facts in facts)
-            if self._known != before and any(sink.wants_rows for sink in self.sinks):
+            changed = False
+            for channel_facts in facts:
+                known = self._known.setdefault(channel_facts.uuid, {})
+                changed = changed or known.get(channel_facts.number) != channel_facts
+                known[channel_facts.number] = channel_facts
+            if changed and any(sink.wants_rows for sink in self.sinks):
                 for uuid in {channel_facts.uuid for channel_facts in facts} if self._open else {""}:
                     self._grids[uuid] = self._new_grid(uuid)
         for sink in self.sinks:
@@ -343,13 +351,14 @@ class Measurement:
 
     def _new_grid(self, uuid: str) -> Grid:
         """Return a grid for the streams of one node, or of all of them (``""``)."""
-        chosen = [supervisor for supervisor in self.supervisors if uuid in ("", supervisor.uuid.hex())]
+        supervisor = self._supervisor_of(bytes.fromhex(uuid))
+        chosen = [supervisor] if supervisor is not None else [] if uuid else self.supervisors
         spans = [
             heard.receiver.plan.span for supervisor in chosen for heard in list(supervisor.streams.running.values())
         ]
         patience = max(spans, default=0) / 1e9 + 2 * BEAT
-        known = [facts for _, facts in sorted(self._known.items()) if facts.kind != "actuator"]
-        sensors = [facts for facts in known if uuid in ("", facts.uuid)]
+        nodes = [self._known.get(uuid, {})] if uuid else [known for _, known in sorted(self._known.items())]
+        sensors = [facts for node in nodes for _, facts in sorted(node.items()) if facts.kind != "actuator"]
         return Grid(uuid or self.facts.group or "all", sensors, patience=patience)
 
     def _report(self, report: NodeReport) -> None:

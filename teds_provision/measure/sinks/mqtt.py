@@ -191,16 +191,17 @@ class MqttSink(ThreadedSink):
         """Announce facts that are new or changed, and those of a node whose topics have been renamed."""
         changed = [channel_facts.key for channel_facts in facts if self._facts.get(channel_facts.key) != channel_facts]
         self._facts.update((channel_facts.key, channel_facts) for channel_facts in facts)
-        self._topics.learn(facts)
+        own = {channel_facts.uuid for channel_facts in facts}
+        touched = {uuid for uuid in self._topics.learn(facts) if uuid in own or uuid in self._parts_of_topics}
         self._units.update(
             (channel_facts.key, display_unit(channel_facts.units) if channel_facts.units else None)
             for channel_facts in facts
         )
-        names = {uuid: self._topics.node(uuid) for uuid, _ in self._facts}
-        renamed = {uuid for uuid, name in self._parts_of_topics.items() if names[uuid] != name}
-        taken = set(names.values())
-        self._left += [name for uuid in renamed if (name := self._parts_of_topics[uuid]) not in taken]
-        self._parts_of_topics = names
+        before = {uuid: self._parts_of_topics[uuid] for uuid in touched if uuid in self._parts_of_topics}
+        self._parts_of_topics |= {uuid: self._topics.node(uuid) for uuid in touched}
+        renamed = {uuid for uuid, name in before.items() if self._parts_of_topics[uuid] != name}
+        taken = set(self._parts_of_topics.values()) if renamed else set()
+        self._left += [before[uuid] for uuid in renamed if before[uuid] not in taken]
         self._owed_entities |= dict.fromkeys(changed)
         if renamed:
             self._owed_entities |= dict.fromkeys(key for key in self._facts if key[0] in renamed)

@@ -61,6 +61,9 @@ class Topics:
                     hint="Use letters, digits and single _, beginning with a letter; / between parts.",
                 )
         self._whole = {f"/{name}": key for key, name in self._chosen.items() if key[1]}
+        self._numbers: dict[str, set[int]] = {}  # of each node: what of it has a chosen name, 0 for its own part
+        for uuid, number in self._chosen:
+            self._numbers.setdefault(uuid, set()).add(number)
         self._channels: dict[str, dict[int, str]] = {}  # of each node: name of each channel as it calls itself
         self._known = {uuid: slug(name) for uuid, name in station.nodes.items()}  # what each node is called itself
         self._strangers: dict[str, str] = {}
@@ -69,27 +72,40 @@ class Topics:
         self._made: dict[str, dict[int, str]] = {}
         self._name_nodes()
 
-    def learn(self, facts: Iterable[ChannelFacts]) -> None:
-        """Learn facts of channels; a node that the station does not know gives its name up to one that it does."""
-        strangers = len(self._strangers)
+    def learn(self, facts: Iterable[ChannelFacts]) -> Set[str]:
+        """Learn facts of channels; return the nodes that may have another name now.
+
+        A node that the station does not know gives its name up to one that it does.
+        """
+        strangers, touched = len(self._strangers), set[str]()
         for channel_facts in facts:
+            touched.add(channel_facts.uuid)
             if channel_facts.unverified:
                 self._name_unverified(channel_facts.uuid, slug(channel_facts.node))
             else:
                 self._unverified.pop(channel_facts.uuid, None)
                 if channel_facts.uuid not in self._known:
                     self._strangers[channel_facts.uuid] = slug(channel_facts.node)
-            if channel_facts.chosen is not None:
+            if channel_facts.chosen is not None and self._has_others(channel_facts.uuid, dict(channel_facts.chosen)):
                 # Names that were chosen while the node was not measured; they change no other node's
                 self._chosen = {key: name for key, name in self._chosen.items() if key[0] != channel_facts.uuid}
                 self._chosen |= {(channel_facts.uuid, number): name.strip("/") for number, name in channel_facts.chosen}
                 self._whole = {f"/{name}": key for key, name in self._chosen.items() if key[1]}
+                self._numbers[channel_facts.uuid] = {number for number, _ in channel_facts.chosen}
                 self._made.pop(channel_facts.uuid, None)
             channels = self._channels.setdefault(channel_facts.uuid, {})
             channels.update({channel_facts.number: channel_facts.name, **dict(channel_facts.siblings)})
             self._made.pop(channel_facts.uuid, None)
         if len(self._strangers) != strangers:
             self._name_nodes()
+            touched |= self._nodes.keys()
+        return touched
+
+    def _has_others(self, uuid: str, chosen: Mapping[int, str]) -> bool:
+        """Return True if the names that were chosen for a node are not those that are known here."""
+        return self._numbers.get(uuid, set()) != chosen.keys() or any(
+            self._chosen[uuid, number] != name.strip("/") for number, name in chosen.items()
+        )
 
     def _name_unverified(self, uuid: str, name: str) -> None:
         """Name an unverified node; an unproven name never renames another node."""
