@@ -33,6 +33,7 @@ FINE: Final = 0.01  # seconds of a bin of the last minute
 _WAITING = 4096  # blocks that wait to be taken in; a thread that brings more takes them in itself
 _EVERY = 0.5  # seconds
 _FEW: Final = 8  # instants of a block that are taken in one by one: numpy's calls cost more than so many samples
+_SLOW: Final = 25.0  # instants a second at most whose bins of the last minute stay few
 _EDGE: Final = 1e-6  # of a bin: a moment so short before an edge counts as behind it, as 0.01 is no binary fraction
 
 Key = tuple[str, int]
@@ -191,7 +192,8 @@ class History:
         known = self._streams.get(key)
         lost = max(0, block.index - known.expected) if known is not None and known.run == run else 0
         self._streams[key] = _Stream(run, block.index + len(block.time))
-        if len(block.time) <= _FEW:
+        # What a slow channel sent while nobody looked comes as one block: a ring for the minute would stay for ever.
+        if len(block.time) <= _FEW or len(block.time) - 1 <= _SLOW * float(block.time[-1] - block.time[0]):
             self._put_few(block, lost)
         else:
             self._put_many(block, lost)

@@ -229,3 +229,12 @@ def test_a_slow_channel_takes_half_of_the_memory_and_one_that_becomes_quick_lose
     assert fine["time"][:26] == [first + second for second in range(5, 31)]
     assert fine["low"][:25] == fine["high"][:25] == [float(second) for second in range(5, 30)]
     assert sum(fine["count"]) == 25 + 30_000
+
+
+@pytest.mark.parametrize(("rate", "kind"), [(8.1, FewBins), (1000.0, Bins)])
+def test_what_waited_of_a_slow_channel_makes_no_ring_of_its_minute(rate: float, kind: type) -> None:
+    """A ring takes 42 kB from then on, and on a busy machine messages of all wait at times."""
+    past = History()
+    past.block(block(NOW, [[float(number)] for number in range(40)], rate=rate))
+    assert sum(past.channel_history(NODE, 1, NOW - 1, NOW + 40)["count"]) == 40
+    assert type(past._channels[NODE, 1].minute) is kind
