@@ -49,11 +49,15 @@ It gets the question, and the error for one that cannot be asked.
 
 @dataclass(frozen=True)
 class AgreeResult:
-    """The key of the open session; ``fresh``: this run agreed on it."""
+    """The key of the open session; ``fresh``: this run agreed on it; ``listed``: and put the node onto the whitelist.
+
+    The entry was durable with the pending key, before its Confirm was sent.
+    """
 
     epoch: int
     key_id: str
     fresh: bool
+    listed: bool = False
 
 
 def open_session(station: Station, node: Conversation, *, word: bool = False) -> NodeKey | None:
@@ -505,7 +509,7 @@ def _agree_anew(
     station.run_in_background(
         record
     )  # the pending key opens a session as well: nothing that is read next depends on it
-    return AgreeResult(agreed.epoch, key_id, fresh=True)
+    return AgreeResult(agreed.epoch, key_id, fresh=True, listed=True)
 
 
 def _request(station: Station, node: Conversation, entry: WhitelistEntry, ca: bytes, teds: bytes) -> AgreedKey:

@@ -204,6 +204,8 @@ def provision(
 ) -> ProvisionResult:
     """Bring one node from any state to a verified datasheet; raises at the first step that fails.
 
+    The session ends with a run that went well.
+
     ``operator`` answers what a person has to decide. ``named``: a sheet or job names this very board, so it is
     whitelisted without a question. ``onward`` moves the conversation to another link after the agreement. ``line``
     gives the board a unit before the agreement, and records its evidence. A failure is in the audit log with its step.
@@ -265,6 +267,7 @@ class _Run:
                 cause = error.cause if isinstance(error, SessionLostError) else error
                 self.unit.failed(self.node, who, self.steps.done, self.steps.current, cause)
             raise
+        self.node.leave()  # while the last record goes to the disk, for which the result waits
         return done
 
     def keyed(self) -> IdentifiedNode:
@@ -340,10 +343,10 @@ class _Run:
         assert isinstance(prepared, PreparedOrder), "_choose() has asked"
         if prepared.profile is None and prepared.order.calibration is not None:  # of the type that this node has
             prepared = prepare(self.station, prepared.order, who.uuid)
-        known = self.station.nodes.get(who.uuid)
-        unknown = prepared.profile is None and (known is None or known.profile is None)
-        if unknown and who.state != NodeState.PROVISIONED and not prepared.order.adopt:
-            raise no_profile(who.uuid)
+        if prepared.profile is None and who.state != NodeState.PROVISIONED and not prepared.order.adopt:
+            known = self.station.nodes.get(who.uuid)
+            if known is None or known.profile is None:
+                raise no_profile(who.uuid)
         return named_for(self.station, who.uuid, prepared, keep=True)
 
     def _whitelist(self, who: IdentifiedNode) -> WhitelistEntry | None:
@@ -364,13 +367,15 @@ class _Run:
         return entry
 
     def _agree(self, who: IdentifiedNode, entry: WhitelistEntry | None) -> AgreeResult:
+        listed = False  # a key that was agreed on came with it: no need to wait for the record that is on its way
         try:
             with self.steps.deferred("agree") as step:
                 agreed = agree(self.station, self.node, who, newcomer=entry, take_over=self.operator.take_over)
+                listed = agreed.listed
                 step.result = DONE if agreed.fresh else NOTHING
                 step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"
         finally:
-            if self._enlisting is not None and self.station.pins.entry(who.uuid) is not None:
+            if self._enlisting is not None and (listed or self.station.pins.entry(who.uuid) is not None):
                 self.steps.finish(self._enlisting)
         self.steps.finish(step)
         return agreed

@@ -45,6 +45,22 @@ def test_following_the_log_gives_only_what_is_new(logged: Store) -> None:
     assert list(logged.audit.entries(after=6)) == []
 
 
+def test_an_entry_is_no_change_for_which_nodes_are_judged_anew(store: Store) -> None:
+    """Each of 200 nodes that join has an entry, and had the others' standing judged again with it."""
+    before = store.changes()
+    store.audit.append("measure", NODE, "joined")
+    assert store.changes() == before
+    with store.transaction():
+        store.audit.append("measure", NODE, "joined")
+        store.execute("INSERT INTO meta VALUES('decided', 'today')")
+        store.audit.append("revoke", NODE, "done")
+    decided = store.changes()
+    assert decided != before
+    with closing(Store.open(store.path.parent)) as other:
+        other.audit.append("measure", NODE, "joined")
+    assert store.changes() != decided, "what another process changed is not known"
+
+
 def test_an_empty_log_is_intact(store: Store) -> None:
     assert store.audit.check().intact
     assert store.audit.check().count == 0

@@ -126,7 +126,7 @@ class AuditLog:
     def append(self, act: str, uuid: bytes | None, outcome: str, detail: Mapping[str, Any] | None = None) -> None:
         """Add one entry; ``detail`` holds JSON values only and never a secret. Raises StoreError."""
         text = _encode(dict(detail or {}))
-        with self._database.together():
+        with self._database.together(), self._database.logging():
             last = self._database.first_row(_END)
             count, previous, noted = last or (0, self._root, self._noted())
             if self._read(noted) != (count, previous):  # goes on, but the loss is never forgotten

@@ -120,6 +120,7 @@ class Connection:
         self._steady: int | None = None
         self._reader: int | None = None
         self._taken_back = 0
+        self._logged = 0
         self._added = False
         self._spoilt = False
         self.commits_not_waited_for = 0
@@ -204,8 +205,20 @@ class Connection:
             raise newer_schema(self.path, version)
 
     def changes(self) -> tuple[int, int]:
-        """Return what differs after any change of the file, by this connection or another one."""
-        return self.version(), self._connection.total_changes
+        """Return what differs after any change of the file, by this connection or another one.
+
+        This connection's own entries of the audit log do not count: they record what was done, and decide nothing.
+        """
+        return self.version(), self._connection.total_changes - self._logged
+
+    @contextmanager
+    def logging(self) -> Iterator[None]:
+        """Leave what the block changes, in a transaction, out of :meth:`changes`."""
+        before = self._connection.total_changes
+        try:
+            yield
+        finally:
+            self._logged += self._connection.total_changes - before
 
     def state(self) -> tuple[int, int]:
         """Return what changes when another connection has changed the file, or this one took changes back.
