@@ -124,6 +124,17 @@ def test_the_update_rate_is_that_of_the_slowest_channel_of_a_joint(
     assert files["controller_manager"]["ros__parameters"]["update_rate"] == 10
 
 
+def test_the_set_point_is_the_state_of_a_joint_that_no_sensor_measures(
+    station: Station, board: Board, tmp_path: Path
+) -> None:
+    node = gripper(station, board, tmp_path)
+    topics = Topics(station_facts(station))
+    [joint] = ros2_control.joints(node, topics)
+    lines = ros2_control.xacro(node, [replace(joint, state={})], topics).splitlines()
+    states = [line.strip() for line in lines if "state_interface" in line]
+    assert states == [f'<state_interface name="{joint.command}"/>']
+
+
 def test_an_asset_shell_is_read_back_by_basyx_and_is_the_same_twice(
     station: Station, board: Board, tmp_path: Path
 ) -> None:

@@ -1215,6 +1215,55 @@ PATTERNS = (
         "tests/cli/test_configuration.py",
     ),
     Pattern(
+        "a board that kept nothing is not updated",
+        "_Update._prove",
+        "report is None or report.image != self._digest or FirmwareFlag.ON_TRIAL in report.flags",
+        "False",
+        "tests/provisioning/test_update.py",
+    ),
+    Pattern(
+        "only c shows that a board has restarted",
+        "_Update._restarted",
+        "not _same_power_up(before.c, node.open_counter)",
+        "True",
+        "tests/provisioning/test_update.py",
+    ),
+    Pattern(
+        "what a station signed before it lost the role may be good",
+        "_wrong_members",
+        "found is not None and 'sign' not in found.roles and (not (found.signed and found.signed[0]))",
+        "found is not None and 'sign' not in found.roles",
+        "tests/plant/test_jobs.py",
+    ),
+    Pattern(
+        "evidence that a lost office signed for does not hold",
+        "_wrong_members",
+        "signer != station",
+        "False",
+        "tests/plant/test_jobs.py",
+    ),
+    Pattern(
+        "a node that was carried to another bus has not left",
+        "LinkWatch._left",
+        "self._directory.seen(uuid).place == self.place",
+        "True",
+        "tests/ncap/test_watching.py",
+    ),
+    Pattern(
+        "without a sensor the set point is the state",
+        "_states",
+        "kind in joint.state or kind == joint.command",
+        "kind in joint.state",
+        "tests/describe/test_describe.py",
+    ),
+    Pattern(
+        "the sequence is on the disk before the signature leaves",
+        "_stage",
+        "station.flush()",
+        "None",
+        "tests/provisioning/test_exchanges.py",
+    ),
+    Pattern(
         "a hardware clock that is behind is reported too",
         "clock",
         "abs(drift) > _TOLERANCE_SECONDS",
@@ -1286,6 +1335,13 @@ C_PATTERNS = (
     ),
     CPattern(
         "ten WAITs are borne", "isotp.c", "line->out_waits > MOST_WAITS", "line->out_waits >= MOST_WAITS", _C_TESTS
+    ),
+    CPattern(
+        "ten WAITs of each block",
+        "isotp.c",
+        "line->out_due = now;\n        line->out_waits = 0;",
+        "line->out_due = now;",
+        _C_TESTS,
     ),
     CPattern(
         "a connection with a session is not dropped",

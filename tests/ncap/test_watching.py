@@ -175,6 +175,15 @@ def test_a_node_that_was_on_another_bus_meanwhile_is_shown_where_it_answers_now(
     assert watch._directory.seen(uuid).place == watch.place
 
 
+def test_a_node_that_was_carried_to_another_bus_has_not_left(watch: LinkWatch) -> None:
+    watch._for_strangers = SimpleNamespace(submit=lambda _work, _contact: None)  # type: ignore[assignment]
+    uuid = sighting(5).uuid.hex()
+    watch.on_sighting(sighting(5))
+    watch._directory.note(uuid, "came", place="can:y", present=True)
+    watch._gone(uuid)
+    assert watch._directory.seen(uuid).present, "its silence here is no news of it"
+
+
 @pytest.mark.parametrize("set_by", [-86_400.0, 86_400.0], ids=["back", "forward"])
 def test_a_clock_that_is_set_keeps_no_node_from_being_looked_at_again(
     watch: LinkWatch, monkeypatch: pytest.MonkeyPatch, set_by: float

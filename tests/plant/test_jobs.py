@@ -36,7 +36,7 @@ from teds_provision.protocol.messages.frames import SECURITY_CLASS, Function
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.job import CalibrationRule, Job, open_job, require_pattern, seal_job
-from teds_provision.protocol.plant.roster import Roster
+from teds_provision.protocol.plant.roster import Place, RemovedMember, Roster
 from teds_provision.provisioning.board_type import WrongBoardError
 from teds_provision.provisioning.build import BuildOrder, PreparedOrder, prepare
 from teds_provision.provisioning.operator import AcceptingOperator
@@ -597,6 +597,50 @@ def test_a_stolen_stations_evidence_does_not_hold_beside_a_roster(tmp_path: Path
         left = replace(roster, removed=(replace(west_left, why=why),))
         found = EvidenceAnchors(plant.north.identity.ca, roster=left).faults(document)
         assert (f"its station was removed: {why}" not in found) == holds, "a file cannot show when it was signed"
+    plant.close()
+
+
+@pytest.mark.parametrize(("place", "holds"), [((3, "ab" * 32), True), ((0, ""), False), (None, False)])
+def test_what_a_station_signed_before_it_lost_that_role_may_be_good(
+    tmp_path: Path, place: Place | None, holds: bool
+) -> None:
+    """A file shows no page: only a station whose signatures never counted cannot have made a good one."""
+    plant = Plant(tmp_path)
+    west = plant.member("west", "line", "sign")
+    members = {"registry": plant.roster.registry, "stations": {west.fingerprint: 3}}
+    line, board = LineRun(west, take_job(west, job_of(plant.north, **members))), make_board(1)
+    west.unlock()
+    build(line, board)
+    (row,) = west.plant.line.evidence(uuid=board.uuid)
+    roster = west.plant.roster
+    assert roster is not None
+    changed = tuple(
+        replace(member, roles=member.roles - {"sign"}, signed=place) if member.name == "west" else member
+        for member in roster.members
+    )
+    anchors = EvidenceAnchors(plant.north.identity.ca, roster=replace(roster, members=changed))
+    lacks = "the station that signed the datasheet does not have the role 'sign'"
+    assert anchors.faults(codec.read(row.document)) == ([] if holds else [lacks])
+    plant.close()
+
+
+def test_evidence_of_a_line_whose_office_was_lost_does_not_hold_beside_a_roster(tmp_path: Path) -> None:
+    plant = Plant(tmp_path)
+    west = plant.member("west", "line", "sign")
+    members = {"registry": plant.roster.registry, "stations": {west.fingerprint: 3}}
+    line, board = LineRun(west, take_job(west, job_of(plant.north, **members))), make_board(1)
+    west.unlock()
+    build(line, board)
+    (row,) = west.plant.line.evidence(uuid=board.uuid)
+    made = codec.read(row.document)
+    of_a_line = replace(made, facts=replace(made.facts, station=plant.north.fingerprint))  # west only signed for it
+    roster = west.plant.roster
+    assert roster is not None
+    (member,) = [member for member in roster.members if member.name == "west"]
+    left = RemovedMember("west", member.point, member.roles, "lost", (1, "ab" * 32))
+    others = tuple(other for other in roster.members if other is not member)
+    anchors = EvidenceAnchors(plant.north.identity.ca, roster=replace(roster, members=others, removed=(left,)))
+    assert "the station that signed the datasheet was removed: lost" in anchors.faults(of_a_line)
     plant.close()
 
 

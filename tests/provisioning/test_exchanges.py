@@ -54,6 +54,22 @@ def test_each_exchange_with_a_board_that_has_no_teds_is_there_for_a_reason(stati
             board.power_on()
 
 
+def test_the_sequence_is_on_the_disk_before_the_signature_that_has_it_leaves(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a loss of power the same sequence would be given a second time, to another datasheet."""
+    flush = station.flush
+    with asked() as words:
+
+        def noted() -> None:
+            flush()
+            words.append("on the disk")
+
+        monkeypatch.setattr(station, "flush", noted)
+        run(station, talk(board), BuildOrder(ANGLE))
+        assert words[words.index("[write 128]") - 1] == "on the disk"
+
+
 def test_each_exchange_with_a_board_that_brings_a_datasheet_and_measures_is_there_for_a_reason(
     station: Station, tmp_path: Path
 ) -> None:

@@ -27,9 +27,11 @@ from teds_provision.links import LinkSettings
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import Function, Reason, refusal, security_command
 from teds_provision.protocol.messages.smp import UPLOAD, SmpPacket, decode_packet
+from teds_provision.provisioning import update
 from teds_provision.provisioning.agree import reset_node
 from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.identify import identify
+from teds_provision.provisioning.image_manager import ImageManager
 from teds_provision.provisioning.progress import SilentReporter
 from teds_provision.provisioning.update import UpdateOrder, plan_update
 from teds_provision.station.firmware import firmware_of
@@ -126,6 +128,24 @@ def test_another_image_of_the_same_version_is_none_to_go_back_to(bench: UpdateBe
     assert bench.update(owner.image("1.0.0", counter=1, octets=700)).result == "updated"
 
 
+@pytest.mark.parametrize(("passed_over", "result"), [(1, "updated"), (9, "refused")])
+def test_a_board_that_did_not_restart_is_asked_once_more(
+    bench: UpdateBench, owner: Owner, monkeypatch: pytest.MonkeyPatch, passed_over: int, result: str
+) -> None:
+    monkeypatch.setattr(update, "_RESTART_SECONDS", 0.01)
+    restart, asked = ImageManager.restart, list[ImageManager]()
+
+    def maybe(manager: ImageManager) -> None:
+        asked.append(manager)
+        if len(asked) > passed_over:
+            restart(manager)
+
+    monkeypatch.setattr(ImageManager, "restart", maybe)
+    done = bench.update(owner.new)
+    assert (done.result, len(asked)) == (result, 2), "c of its sessions shows that it is the same start"
+    assert result == "updated" or "does not restart" in str(done.error)
+
+
 def test_another_owners_image_never_starts(bench: UpdateBench, owner: Owner) -> None:
     done = bench.update(owner.image("6.0.0", owner.rival, counter=9))
     assert (done.result, type(done.error)) == ("reverted", RevertedError)
@@ -206,6 +226,7 @@ def test_a_board_that_lost_power_on_trial_runs_its_old_image_and_takes_the_new_o
         ("values", "gives a valid value"),
         ("sequence", "lost key, epoch or sequence"),
         ("epoch", "lost key, epoch or sequence"),
+        ("confirms nothing", "did not keep the new image"),
         ("confirms itself", "confirmed itself before it was proven"),
     ],
 )
@@ -216,7 +237,7 @@ def test_an_image_that_does_not_prove_itself_is_reverted(
     board, slots = node.board, node._slots
     assert board is not None
     assert slots is not None
-    read = board.read
+    read, confirm = board.read, slots.confirm
 
     def spoil() -> None:
         """Do what the new image does wrong, and undo it when the old one runs."""
@@ -227,6 +248,8 @@ def test_an_image_that_does_not_prove_itself_is_reverted(
         elif sabotage in ("sequence", "epoch"):
             less: dict[str, Any] = {sabotage: 0}
             node.tim._flash = replace(flash, **less) if new else flash
+        elif sabotage == "confirms nothing":
+            slots.confirm = (lambda: True) if new else confirm  # type: ignore[method-assign, assignment]
         elif sabotage == "key":
             node.tim.key = SoftwareKey.generate() if new else key
         elif sabotage == "values":

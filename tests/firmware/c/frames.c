@@ -117,12 +117,14 @@ static void what_nobody_takes_up_is_given_up(void)
         rest_of_question(board);
         CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "asked anew it answers");
     }
-    for (int i = 0; i < 10; i++) {
-        in(board, TO_NODE, "\x31\x00\x00", 3, false);
+    for (int block = 1; block < 3; block++) { /* of each block */
+        for (int i = 0; i < 10; i++) {
+            in(board, TO_NODE, "\x31\x00\x00", 3, false);
+        }
+        CHECK(silent(board), "it waits on");
+        in(board, TO_NODE, "\x30\x01\x00", 3, false);
+        CHECK(out(board, &identifier, data) == 8 && data[0] == 0x20 + block, "ten WAITs are borne");
     }
-    CHECK(silent(board), "it waits on");
-    in(board, TO_NODE, "\x30\x01\x00", 3, false);
-    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x21, "ten WAITs are borne");
     for (int i = 0; i < 11; i++) {
         in(board, TO_NODE, "\x31\x00\x00", 3, false);
     }
