@@ -269,7 +269,7 @@ test-c: $(VENV)/.dev
 
 # 10 kHz of 16 bits for ten minutes on CAN FD and on 1 Mbit/s, and 200 nodes in C on one bus. Wants a machine for itself.
 firmware-soak: $(VENV)/.dev
-	SECONDS_OF_SOAK=$${SECONDS_OF_SOAK:-600} $(BIN)/python -m pytest tests/firmware/test_soak.py -m soak -s -rs
+	TEDS_C_WORDS=LEVEL=-O0 SECONDS_OF_SOAK=$${SECONDS_OF_SOAK:-600} $(BIN)/python -m pytest tests/firmware/test_soak.py -m soak -s -rs
 
 # Lines and branches of firmware/src that its tests reach, by gcov: the C tests, those in one process and the host port.
 # Three minutes; not the faulty nodes, which are copies. Goes on where a test fails; fails below 95 % of the branches.

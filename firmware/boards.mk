@@ -17,7 +17,7 @@ FD_gripper_servo := -DTEDS_CAN_FD=1 -DCONFIG_TEDS_NODE_CAN_FD=1
 
 $(BUILD)/boards/%: $(SOURCES) $(HEADERS) port/psa/teds_psa.c $(wildcard port/zephyr/*.[ch] $(STANDIN)/*.c $(STANDIN)/zephyr/*/*.h boards/*/src/*.[ch])
 	@mkdir -p $(@D)
-	$(CC) $(WARNINGS) $(LEVEL) -g -pthread $(OF_ZEPHYR) $(FD_$*) -Iinclude -Isrc -Iport/psa -Iport/zephyr -Iport/posix -I$(STANDIN) \
+	$(CC) $(WARNINGS) $(LEVEL) $(DEBUG) -pthread $(OF_ZEPHYR) $(FD_$*) -Iinclude -Isrc -Iport/psa -Iport/zephyr -Iport/posix -I$(STANDIN) \
 	  $(SOURCES) port/psa/teds_psa.c port/zephyr/node_thread.c port/zephyr/flash.c port/zephyr/firmware.c port/zephyr/can_bus.c \
 	  $(wildcard boards/$*/src/*.c) $(wildcard $(STANDIN)/*.c) \
 	  port/posix/bus.c port/posix/multicast.c port/posix/socketcand.c port/posix/pacing.c port/posix/flash_file.c \
@@ -38,10 +38,10 @@ esp32: $(BUILD)/boards/angle_sensor
 $(BUILD)/boards/angle_sensor: $(SOURCES) $(HEADERS) $(wildcard port/esp32/*.[ch] port/esp32/standin/* port/esp32/standin/*/*) \
   examples/AngleSensor/AngleSensor.ino
 	@mkdir -p $(BUILD)/boards/esp32
-	cd $(BUILD)/boards/esp32 && $(CC) $(WARNINGS) $(LEVEL) -g -DTEDS_CAN_FD=0 $(subst -I,-I$(CURDIR)/,$(OF_ESP32) $(INCLUDES)) -c \
+	cd $(BUILD)/boards/esp32 && $(CC) $(WARNINGS) $(LEVEL) $(DEBUG) -DTEDS_CAN_FD=0 $(subst -I,-I$(CURDIR)/,$(OF_ESP32) $(INCLUDES)) -c \
 	  $(addprefix $(CURDIR)/,$(SOURCES) port/bearssl/teds_bearssl.c port/esp32/teds_esp32.c port/esp32/standin/idf.c \
 	  port/posix/bus.c port/posix/multicast.c port/posix/socketcand.c port/posix/pacing.c)
-	$(CXX) -std=c++11 -Wall -Wextra -g -DTEDS_CAN_FD=0 $(OF_ESP32) $(INCLUDES) -include Arduino.h -xc++ examples/AngleSensor/AngleSensor.ino \
+	$(CXX) -std=c++11 -Wall -Wextra $(DEBUG) -DTEDS_CAN_FD=0 $(OF_ESP32) $(INCLUDES) -include Arduino.h -xc++ examples/AngleSensor/AngleSensor.ino \
 	  port/esp32/standin/arduino.cpp -xnone $(BUILD)/boards/esp32/*.o -o $@.new -lbearssl -lm
 	@mv $@.new $@
 

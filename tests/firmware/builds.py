@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 FIRMWARE = ROOT / "firmware"
 BUILD = FIRMWARE / os.environ.get("TEDS_C_BUILD", "build")
-WORDS = tuple(os.environ.get("TEDS_C_WORDS", "LEVEL=-O0").split(","))
+WORDS = tuple(os.environ.get("TEDS_C_WORDS", "LEVEL=-O0,HOST_LEVEL=-O0,DEBUG=-g1").split(","))
 """Where and how the tests build: make firmware-coverage has a place of its own."""
 AT_THE_GATE = os.environ.get("CI", "").lower() not in ("", "0", "false")
 

@@ -47,9 +47,7 @@ def test_each_public_header_compiles_by_itself_and_together_as_cpp(standard: str
 
 def test_a_cpp_program_links_with_the_library(tmp_path: Path) -> None:
     builds.need("g++", "gcc")
-    where = [f"-I{builds.FIRMWARE / folder}" for folder in (*FOLDERS, "src")]
-    sources = [*sorted((builds.FIRMWARE / "src").glob("*.c")), builds.FIRMWARE / "port/bearssl/teds_bearssl.c"]
-    run("gcc", "-std=c99", "-O0", *where, "-c", *map(str, sources), folder=tmp_path)
+    objects, words = builds.objects(1024, 4096)  # of another test
     main = tmp_path / "main.cpp"
     main.write_text(
         '#include "teds/node.h"\n#include "teds_bearssl.h"\n'
@@ -59,8 +57,10 @@ def test_a_cpp_program_links_with_the_library(tmp_path: Path) -> None:
         "        return 1;\n"
         "    return teds_node_init_as_built(&node, teds_built() + 1, &config, &port) == TEDS_E_BUILD ? 0 : 2;\n}\n"
     )
-    objects = sorted(map(str, tmp_path.glob("*.o")))
-    run("g++", "-std=c++11", *where, str(main), *objects, "-lbearssl", "-o", "program", folder=tmp_path)
+    asked = [word for word in words if word != "-std=c99"]
+    program = str(tmp_path / "program")
+    command = ["g++", "-std=c++11", *asked, str(main), *map(str, objects), "-lbearssl", "-o", program]
+    run(*command, folder=builds.FIRMWARE)
     run(str(tmp_path / "program"))
 
 
@@ -138,13 +138,26 @@ def consumer(folder: Path, library: str) -> None:
     (folder / "sizes.c").write_text(SIZES)
 
 
+COMPILER = """#!/bin/sh
+for word do
+    case $word in *.c) name=${word##*/}; touch "${name%.c}.o";; esac
+    [ "$before" != -o ] || touch "$word"
+    before=$word
+done
+"""
+"""What make sees of a compiler: an object of each source where it runs, and what is linked."""
+
+
 def test_objects_of_sources_that_have_another_name_now_are_in_no_library(tmp_path: Path) -> None:
-    """A renamed source was linked under both names: every symbol of it twice."""
-    builds.need("make", "gcc")
+    """A renamed source was linked under both names: every symbol of it twice. A stand-in for the compiler is enough."""
+    builds.need("make")
+    compiler = tmp_path / "compiler"
+    compiler.write_text(COMPILER)
+    compiler.chmod(0o755)
     library, objects = tmp_path / "host" / "memory-1024-4096.so", tmp_path / "host" / "memory-1024-4096"
 
     def make() -> int:
-        run("make", "-s", "-C", str(builds.FIRMWARE), f"BUILD={tmp_path}", "LEVEL=-O0", str(library))
+        run("make", "-s", "-C", str(builds.FIRMWARE), f"BUILD={tmp_path}", f"CC={compiler}", str(library))
         return library.stat().st_mtime_ns
 
     first = make()
