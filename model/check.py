@@ -101,8 +101,10 @@ HARMLESS = ("RECEIPT_ALL", "LATE", "MOVE_DUE", "IMPORT_REPLACES", "IMPORT_TWICE"
 """Rules of the code without which nothing goes wrong in the model, as another rule does the same (README)."""
 BY_TEST = {"M1", "LIFTED", "BACK_NO_ROTATION", "UNSETTLED", "M6", "PENDING", "LATE+MOVE_DUE", "HELD_BACK"}
 BY_TEST |= {"MOVE_ORDER", "EPOCH_BACK", "CONTINUED", "GIVEN_COMMIT", "SESSION", "ERASE"}
-"""Rules that ``--quick`` breaks, and those that ``--quicker`` breaks: one of each kind."""
-AT_THE_GATE = {"M1", "LIFTED", "EPOCH_BACK", "SESSION"}
+"""Rules that ``--quick`` breaks, and those that ``--quicker`` breaks: one of each kind.
+
+LIFTED is broken by tests/model/test_replay.py as well."""
+AT_THE_GATE = {"M1", "EPOCH_BACK", "SESSION"}
 FOUND = [Run(bounds, rule) for bounds, rules in BROKEN.items() for rule in rules.split()]
 FOUND += [Run(bounds, rule) for bounds, rules in PLANT_BROKEN.items() for rule in rules.split()]
 PLANT_RUNS = [Run(PlantBounds(3)), Run(PlantBounds(2, owners=2))]

@@ -101,6 +101,12 @@ def imports(tree: ast.AST) -> Iterator[tuple[str, int]]:
             yield from ((f"{node.module}.{alias.name}", node.lineno) for alias in node.names)
 
 
+@cache
+def imports_of(path: Path) -> list[tuple[str, int]]:
+    """Return what a module of the package imports; five rules ask."""
+    return list(imports(parsed(path)))
+
+
 def may_import(room: str) -> set[str]:
     files = set() if room in WITHOUT_FILES else {"files", "portable", "one_core"}
     return ARROWS[room] | files | {room, *_FOR_ALL, "__version__"}
@@ -111,7 +117,7 @@ def test_arrows_between_rooms_point_one_way() -> None:
         f"{name_of(path)}:{line} imports {name}, which {room_of(path)} may not"
         for path in MODULES
         if room_of(path) != "__init__"
-        for name, line in imports(parsed(path))
+        for name, line in imports_of(path)
         if name.startswith("teds_provision.") and name.split(".")[1] not in may_import(room_of(path))
     ]
     assert not wrong
@@ -160,7 +166,7 @@ def test_protocol_and_teds_do_no_io() -> None:
         f"{name_of(path)}:{line} imports {name}"
         for path in MODULES
         if room_of(path) in PURE
-        for name, line in imports(parsed(path))
+        for name, line in imports_of(path)
         if name.split(".")[0] in IO
     ]
     assert not wrong
@@ -254,7 +260,7 @@ def test_nothing_above_the_station_gets_its_tables() -> None:
     imported = [
         f"{name_of(path)}:{line} imports {name}"
         for path in above
-        for name, line in imports(parsed(path))
+        for name, line in imports_of(path)
         if name.startswith("teds_provision.station.store.") and name.rpartition(".")[2] in _FILE
     ]
     reached = [
@@ -354,7 +360,7 @@ def test_no_room_of_the_core_imports_an_optional_room() -> None:
     imported = [
         f"{name_of(path)}:{line} imports {name}"
         for path in core
-        for name, line in imports(parsed(path))
+        for name, line in imports_of(path)
         if name.startswith("teds_provision.") and name.split(".")[1] in OPTIONAL
     ]
     late = [

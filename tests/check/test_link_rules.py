@@ -48,16 +48,23 @@ def broken(report: CheckReport) -> dict[str, str]:
     return {check.rule: check.detail for check in report.checks if check.result == "failed"}
 
 
+BUS = pytest.param(
+    "can",
+    marks=pytest.mark.nightly(
+        "tests/check/test_node_check_cli.py::test_a_virtual_node_on_a_bus_keeps_every_rule: the same rules on the same "
+        "link, by command; tests/check/test_link_rules.py::test_a_fault_of_the_link_is_found[can-form fd]"
+    ),
+)
 FD = pytest.param(
     "fd",
     marks=pytest.mark.nightly(
-        "tests/check/test_link_rules.py::test_the_good_board_breaks_no_rule_of_its_link[can], and "
+        "tests/check/test_node_check_cli.py::test_a_virtual_node_on_a_bus_keeps_every_rule, and "
         "tests/check/test_link_rules.py::test_a_fault_of_the_link_is_found[can-form fd] breaks no other rule of FD"
     ),
 )
 
 
-@pytest.mark.parametrize("link", ["nfc", "can", FD])
+@pytest.mark.parametrize("link", ["nfc", BUS, FD])
 def test_the_good_board_breaks_no_rule_of_its_link(station: Station, link: str) -> None:
     report = checked(station, "", link, factory=True)
     assert broken(report) == {}

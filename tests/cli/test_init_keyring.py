@@ -15,17 +15,28 @@ from tests.vault.test_keyring_vault import Session
 pytestmark = pytest.mark.system
 
 RUN = """
-import io, os, subprocess
-def program(*words, passphrase=None):
-    command = [sys.executable, "-m", "teds_provision", "--json", "--home", str(home / "station")]
+import os
+from teds_provision.__main__ import main
+import teds_provision.cli.main
+def program(*words, passphrase=None):  # in a child that has imported the program already
+    command = ["teds-provision", "--json", "--home", str(home / "station")]
     read, write = os.pipe()
     if passphrase:
         os.write(write, passphrase.encode() + b"\\n")
         command += ["--passphrase-fd", str(read)]
     os.close(write)
-    done = subprocess.run([*command, *words], pass_fds=(read,), capture_output=True, text=True)
+    answer, stdout = os.pipe()
+    if not (child := os.fork()):
+        os.dup2(stdout, 1)
+        os.close(stdout)
+        os.close(answer)
+        sys.argv = [*command, *words]
+        main()
     os.close(read)
-    return [done.returncode, json.loads(done.stdout)]
+    os.close(stdout)
+    with os.fdopen(answer) as printed:
+        text = printed.read()
+    return [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), json.loads(text)]
 """
 WORDS = "four random words here"
 

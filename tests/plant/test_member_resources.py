@@ -79,8 +79,12 @@ SENDING = "select registry.send(gen_random_uuid(), %s, decode(repeat('00', %s), 
 
 def test_two_sessions_of_one_login_share_the_limit_of_what_waits(thief: Login) -> None:
     """Each counted what the other had not committed yet: six connections sent six times the limit."""
-    values = bytes.fromhex(thief.fingerprint), 60 << 20
-    with thief.connect() as first, thief.connect() as second:
+    values, send = (bytes.fromhex(thief.fingerprint), 60 << 10), "send(uuid, bytea, bytea, timestamptz)"
+    with (
+        thief.connect() as first,
+        thief.connect() as second,
+        stricter(thief.database, "> 268435456", "> 262144", function=send),
+    ):
         for _ in range(3):
             first.execute(SENDING, values)
         first.execute("begin")
@@ -128,9 +132,9 @@ def test_a_sort_ends_at_the_limit_of_temporary_files(thief: Login) -> None:
 
 
 @contextmanager
-def stricter(database: Database, limit: str, now: str) -> Iterator[None]:
-    """Give sweep() another limit, so that a test reaches it at once."""
-    found = database.cluster.psql("select pg_get_functiondef('registry.sweep()'::regprocedure)", database.name)
+def stricter(database: Database, limit: str, now: str, function: str = "sweep()") -> Iterator[None]:
+    """Give sweep(), or another function, another limit, so that a test reaches it at once."""
+    found = database.cluster.psql(f"select pg_get_functiondef('registry.{function}'::regprocedure)", database.name)
     assert limit in found
     database.sql(found.replace(limit, now))
     yield

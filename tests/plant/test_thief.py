@@ -253,6 +253,11 @@ def test_more_than_a_mebibyte_is_no_page(thief: Connection) -> None:
         append(thief, 1, b"", page("x" * (1 << 20)))
 
 
+@pytest.mark.nightly(
+    "tests/plant/test_member_resources.py::test_a_parcel_without_content_counts_for_16_kib fills the same 256 MiB with "
+    "rows that are empty; tests/plant/test_member_resources.py::test_two_sessions_of_one_login_share_the_limit_of_what_"
+    "waits counts octets"
+)
 def test_spam_ends_at_256_mebibytes(rig: Rig) -> None:
     spammer = rig.database.member()
     rig.database.sql(  # what waits already, without sending it
