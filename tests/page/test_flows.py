@@ -56,6 +56,7 @@ def test_from_an_empty_home_to_a_moving_plot(browser: Browser, fresh: Lab) -> No
         page.get_by_role("link", name="Measure").click()
         page.get_by_text("No groups yet").wait_for()
         make_group(page, "table", "shaker")
+        in_group(page, "table").get_by_label("Rate, Hz").fill("20")
         page.get_by_role("button", name="Start table").click()
         page.get_by_role("img", name="Plot of acceleration x, acceleration y, acceleration z").wait_for()
         until(lambda: received(page) > 50, "no points arrive")
@@ -105,6 +106,7 @@ def test_who_measures_says_whether_topics_may_move_actuators_and_when_these_are_
             make_group(page, "arm", "hand")
             card = in_group(page, "arm")
             card.get_by_text("More", exact=True).click()
+            card.get_by_label("Rate, Hz").fill("10")
             may = card.get_by_label("Allow topics to move actuators")
             assert may.is_checked()
             assert card.get_by_label("Dead-man, ms").get_attribute("placeholder") == "300"
@@ -143,7 +145,8 @@ def test_a_station_without_topics_says_that_it_takes_no_set_points(browser: Brow
     with opened(browser, lab, route=f"nodes/{lab.nodes['hand'].uuid}/live") as page:
         page.get_by_text("This station does not accept set points from topics").wait_for()
         assert page.get_by_label("Allow topics to move actuators").is_disabled()
-    with opened(browser, lab, route=f"nodes/{lab.nodes['slew'].uuid}/live") as page:
+        page.goto(f"{lab.url}/#/nodes/{lab.nodes['slew'].uuid}/live")
+        page.get_by_role("heading", name="slew").wait_for()
         page.get_by_role("button", name="Measure", exact=True).wait_for()
         assert not page.get_by_label("Allow topics to move actuators").is_visible(), "it has none"
 
@@ -291,6 +294,7 @@ def test_two_browsers_see_the_same_and_one_that_may_only_read_changes_nothing(br
         in_group(other, "both").wait_for()
         assert other.get_by_role("button", name="Start both").is_disabled()
         assert other.get_by_role("button", name="Discover").is_disabled()
+        in_group(page, "both").get_by_label("Rate, Hz").fill("20")
         page.get_by_role("button", name="Start both").click()
         until(lambda: received(other) > 20, "the second browser gets nothing")
         other.goto(f"{lab.url}/#/nodes/{lab.nodes['hand'].uuid}/datasheet")

@@ -31,13 +31,12 @@ def age(page: Page, key: str) -> float:
 
 def test_a_reload_loses_nothing_and_a_stretch_is_looked_at_closely(browser: Browser, lab: Lab) -> None:
     uuid = lab.nodes["hand"].uuid
-    lab.measure("hand", rate=50)
+    lab.measure("hand", rate=20)
     with opened(browser, lab, route=f"nodes/{uuid}/live") as page:
-        until(lambda: age(page, f"{uuid}/2") > 4)
+        until(lambda: age(page, f"{uuid}/2") > 2)
         page.reload()
-        until(lambda: age(page, f"{uuid}/2") > 4, "what was measured before the reload is gone")
-        assert age(page, f"{uuid}/2") > 4
-        page.locator(".rate").filter(has_text=re.compile(r"^(49|50)(\.\d)? Hz$")).first.wait_for()
+        until(lambda: age(page, f"{uuid}/2") > 2, "what was measured before the reload is gone")
+        page.locator(".rate").filter(has_text=re.compile(r"^(19|20)(\.\d)? Hz$")).first.wait_for()
         with client.connect(home=lab.station.home) as station:
             lost = station.measurements()[0]["nodes"][0]["lost"]
             assert sum(station.past(uuid, 2, points=3600)["lost"]) == pytest.approx(lost, abs=20), "as the report says"

@@ -39,7 +39,7 @@ def test_raw_numbers_are_shown_marked_until_there_is_a_calibration(browser: Brow
     fresh.run()
     uuid = node.uuid
     with opened(browser, fresh, route=f"nodes/{uuid}/live", width=1600) as page:
-        page.get_by_label("Rate, Hz").fill("50")
+        page.get_by_label("Rate, Hz").fill("20")
         page.get_by_role("button", name="Measure", exact=True).click()
         page.locator("tr .figure").filter(has_text=RAW).wait_for()
         assert page.locator("tr .value .unit").is_hidden(), "it is no angle"
@@ -47,14 +47,14 @@ def test_raw_numbers_are_shown_marked_until_there_is_a_calibration(browser: Brow
         page.locator(".card .peek b").filter(has_text=RAW).wait_for()
         page.locator("figcaption .unit", has_text="raw, not calibrated").wait_for()
         page.locator(".legend .figure").filter(has_text=RAW).wait_for()
-        until(lambda: len(drawn(page, uuid)) > 20)
+        until(lambda: len(drawn(page, uuid)) > 10)
         assert max(drawn(page, uuid)) > 360, "raw numbers, not degrees"
         page.get_by_text(re.compile(r"\d+ samples, (none|\d+) lost,.* \d+ invalid\.")).wait_for()
         text = page.locator(".mode .state").inner_text()
         assert len(re.findall("calibrat", text)) == 1, "one explanation"
         with opened(browser, fresh, route=f"nodes/{uuid}/live", width=360) as after:
             after.locator("tr .figure").filter(has_text=RAW).wait_for()
-            until(lambda: len(drawn(after, uuid)) > 40, "what was measured before it was opened")
+            until(lambda: len(drawn(after, uuid)) > 20, "what was measured before it was opened")
             assert max(drawn(after, uuid)) > 360
             assert after.evaluate("document.documentElement.scrollWidth <= innerWidth")
             with client.connect(home=fresh.station.home) as station:
@@ -63,7 +63,7 @@ def test_raw_numbers_are_shown_marked_until_there_is_a_calibration(browser: Brow
                 station.end_measurement(station.measurements()[0]["id"])
                 fresh.provision("bare", ANGLE)
                 until(lambda: station.node(uuid)["channels"][0]["problem"] is None)
-                station.request("POST", "/measurements", {"uuids": [uuid], "rate": 50})
+                station.request("POST", "/measurements", {"uuids": [uuid], "rate": 20})
             for shown in (page, after):
                 shown.locator("tr .figure").filter(has_text=VALUE).wait_for()
                 shown.locator("figcaption .unit", has_text="°").wait_for()
