@@ -53,7 +53,7 @@ def events(service: Service, kind: str, uuid: str) -> list[dict[str, Any]]:
 
 def test_with_yes_a_good_one_is_signed_and_measured_without_another_word(desk: Desk) -> None:
     node = brings(desk)
-    service = adopting(desk, "--yes", "--measure", "all", "--rate", 50)
+    service = adopting(desk, "--yes", "--measure", "all", "--rate", 20)
     with service.client() as asked:
         until(lambda: verdict(asked.node(node.uuid)) == "authentic" if known(service, node) else False)
         until(lambda: asked.node(node.uuid)["measurement"] is not None)
@@ -129,7 +129,7 @@ def test_yes_belongs_to_adopt(desk: Desk) -> None:
 def test_unverified_ones_are_measured_calibrated_and_everything_says_so(desk: Desk, tmp_path: Path) -> None:
     node = brings(desk)
     record = tmp_path / "record"
-    service = adopting(desk, "--unverified", "--rate", 50, "--record", record)
+    service = adopting(desk, "--unverified", "--rate", 20, "--record", record)
     with service.client() as asked:
         until(lambda: known(service, node) and asked.node(node.uuid)["measurement"] == "unverified")
         found = until(lambda: flowing(asked.node(node.uuid)), "no value comes")
@@ -177,7 +177,7 @@ def events_of(service: Service, node: Node) -> list[tuple[str, str]]:
 
 def test_one_that_is_adopted_by_a_command_beside_goes_on_as_what_is_trusted(desk: Desk) -> None:
     node = brings(desk)
-    service = adopting(desk, "--unverified", "--measure", "all", "--rate", 50)
+    service = adopting(desk, "--unverified", "--measure", "all", "--rate", 20)
     with service.client() as asked:
         until(lambda: known(service, node) and asked.node(node.uuid)["measurement"] == "unverified")
         service.station.ask("provision", node.uuid, "--adopt", "--yes", *desk.links.over("can"))
@@ -193,7 +193,7 @@ def test_one_that_is_adopted_by_a_command_beside_goes_on_as_what_is_trusted(desk
 
 def test_one_that_is_reset_while_it_is_measured_is_taken_up_again(desk: Desk) -> None:
     node = brings(desk)
-    service = adopting(desk, "--unverified", "--rate", 50)
+    service = adopting(desk, "--unverified", "--rate", 20)
     with service.client() as asked:
         until(lambda: known(service, node) and asked.node(node.uuid)["measurement"] == "unverified")
         node.press()

@@ -492,7 +492,8 @@ def test_a_virtual_transducer_is_made_from_a_document_under_a_new_uuid(
     gone = until(lambda: (node := asked.node(made["uuid"]))["present"] is False and node)
     assert (gone["name"], gone["retired"], gone["whitelisted"]) == (None, "decommissioned", False)
     refused(asked, 422, "refused", "POST", "/measurements", {"uuids": [made["uuid"]]})
-    asked.request("DELETE", f"/virtual/{virtual(service, 'load-cell', 'copy')}")
+    again = asked.request("POST", "/virtual", {"profile": "load-cell", "name": "copy", "source": "noise"})
+    asked.request("DELETE", f"/virtual/{again['uuid']}")
     refused(asked, 404, "not-found", "DELETE", f"/virtual/{made['uuid']}")
     refused(asked, 422, "usage", "POST", "/virtual", {"profile": "gripper", "source": "exec:true"})
     taken = refused(asked, 422, "usage", "POST", "/virtual", {"profile": "gripper", "name": "hand", "source": "noise"})
@@ -514,8 +515,9 @@ def test_a_virtual_transducer_is_either_measured_or_removed(service: Service, as
         return 200
 
     with ThreadPoolExecutor(2) as pool:
+        uuid = ""
         for _ in range(3):
-            uuid = virtual(service, "load-cell", "short")
+            uuid = uuid or virtual(service, "load-cell", "short")
             begun = pool.submit(ask, callers[0], "POST", "/measurements", {"uuids": [uuid], "rate": 20})
             ended = pool.submit(ask, callers[1], "DELETE", f"/virtual/{uuid}", None)
             there = [measurement["uuids"] for measurement in (begun.result(), asked.measurements())[1]]
@@ -524,7 +526,8 @@ def test_a_virtual_transducer_is_either_measured_or_removed(service: Service, as
                 asked.end_measurement(measurement["id"])
             if ended.result() == 409:
                 until(lambda uuid=uuid: asked.node(uuid)["measurement"] is None)
-                asked.request("DELETE", f"/virtual/{uuid}")
+            else:
+                uuid = ""
 
 
 def test_the_mode_that_holds_already_forgets_no_node(asked: Client, hand: str) -> None:
@@ -610,7 +613,7 @@ def test_a_namesake_that_comes_changes_no_name_that_is_being_published(
             found.setdefault(row["uuid"], set()).add(row["topic"])
         return found
 
-    made = asked.request("POST", "/measurements", {"uuids": [hand], "rate": 50})
+    made = asked.request("POST", "/measurements", {"uuids": [hand], "rate": 20})
     measured(asked, hand)
     before = topics()[hand]
     other = virtual(service, name="hand.")

@@ -165,7 +165,7 @@ def test_off_the_whitelist_it_is_let_go_and_measured_on(
 
 
 @pytest.mark.parametrize("how", ["daemon", "measurement", pytest.param("whitelist", marks=OFF_THE_LIST)])
-def test_without_leave_no_topic_is_listened_to(rig: Rig, master: Master, publishers: Publishers, how: str) -> None:  # noqa: F811
+def test_without_leave_no_topic_is_listened_to(rig: Rig, master: Master, how: str) -> None:  # noqa: F811
     master.start()
     ros = Ros1(master)
     if how == "whitelist":
@@ -174,10 +174,8 @@ def test_without_leave_no_topic_is_listened_to(rig: Rig, master: Master, publish
     more = {"actuators": False} if how == "measurement" else {}
     with listening(rig, ros, *words, **more) as service:
         until(lambda: "/bench/g/opening" in master.published(), "no topic")
+        until(lambda: service.client().status()["sinks"][0]["written"] > 40, "values of a second")
         assert TOPIC not in master.heard()
-        publishers.append(ros.publish())
-        time.sleep(2 * DEAD_MAN)
-        assert all(line["safe"] for line in Journal.of(rig).states())
         service.end()
 
 
@@ -211,17 +209,15 @@ def test_two_measurements_are_two_nodes_of_ros_and_neither_ends_the_other(tmp_pa
                 asked.request("POST", "/measurements", {"group": f"group {name}", "rate": 20})
 
             def sinks() -> list[dict[str, Any]]:
-                return [sink for sink in asked.request("GET", "/status")["sinks"] if sink["written"] > 200]
+                return [sink for sink in asked.request("GET", "/status")["sinks"] if sink["written"] > 40]
 
             until(lambda: len(sinks()) == 2, "both publish", 60)
             assert service.process is not None
             began = children(service.process.process.pid, "ros1_child.py")
-            nodes = master.tool("rosnode", "list").split() if Path("/usr/bin/rosnode").exists() else []
-            assert not nodes or {"/teds_provision_bench_group_g", "/teds_provision_bench_group_h"} <= set(nodes)
+            nodes = {name for publishers in master.published().values() for name in publishers}
+            assert {"/teds_provision_bench_group_g", "/teds_provision_bench_group_h"} <= nodes
             before = {sink["measurement"]: sink["written"] for sink in sinks()}
-            until(
-                lambda: all(sink["written"] > before[sink["measurement"]] + 100 for sink in sinks()), "both go on", 60
-            )
+            until(lambda: all(sink["written"] > before[sink["measurement"]] + 40 for sink in sinks()), "both go on", 60)
             assert children(service.process.process.pid, "ros1_child.py") == began
             assert len(began) == 2
             service.end()

@@ -58,8 +58,8 @@ class Lab:
         else:
             node.start("--source", "ramp:2", "--can", bus, nfc=False)
 
-    def start(self, *words: object) -> Service:
-        return self.service.start("--measure", "all", "--rate", 50, *words)
+    def start(self, *words: object, rate: int = 20) -> Service:
+        return self.service.start("--measure", "all", "--rate", rate, *words)
 
     def lines(self) -> list[dict[str, Any]]:
         """Return every line of the daemon until now."""
@@ -141,7 +141,7 @@ def test_what_is_there_is_measured_and_what_goes_comes_back(lab: Lab) -> None:
         [measurement] = asked.measurements()
         assert (measurement["match"], measurement["rate"], sorted(measurement["uuids"])) == (
             "all",
-            50,
+            20,
             sorted([left.uuid, right.uuid]),
         )
     lab.service.end()
@@ -399,7 +399,7 @@ def test_one_that_finds_no_room_on_the_bus_waits_until_another_one_leaves(lab: L
     right.kill()
     lab.service.desk.links = type(lab.desk.links)(lab.desk.links.nfc, f"{lab.desk.links.can}&bitrate=5000")
     try:
-        lab.start()
+        lab.start(rate=50)
         lab.comes(left)
         lab.power(right)
         until(lambda: lab.states(right)[-1:] == ["waiting"])
@@ -485,7 +485,7 @@ def test_actuators_of_who_comes_are_never_claimed(desk: Desk) -> None:
 
 def test_a_node_that_this_very_process_provisions_is_measured_at_once(desk: Desk) -> None:
     """Not when everybody is asked again, half a minute later."""
-    service = Service(desk, desk.station()).start("--measure", "all", "--rate", 50)
+    service = Service(desk, desk.station()).start("--measure", "all", "--rate", 20)
 
     names = iter(("first", "second", "third"))
 

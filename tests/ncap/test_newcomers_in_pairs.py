@@ -177,7 +177,7 @@ def test_a_writer_that_is_killed_gives_a_matched_node_back(lab: Lab) -> None:
 def test_who_is_renamed_leaves_or_joins_a_measurement_of_names(lab: Lab) -> None:
     left, right = lab.nodes
     station, over = lab.service.station, lab.desk.links.over("can")
-    lab.service.start("--measure", "name:arm-*", "--rate", 50)
+    lab.service.start("--measure", "name:arm-*", "--rate", 20)
     with lab.service.client() as asked:
         until(lambda: asked.node(right.uuid)["present"] and asked.node(left.uuid)["present"])
     assert lab.events_of() == []
@@ -201,7 +201,7 @@ def test_a_group_that_is_started_by_hand_and_measured_as_it_comes_has_each_node_
     left, right = lab.nodes
     station = lab.service.station
     station.ask("group", "create", "both", left.uuid, right.uuid)
-    lab.service.start("--measure", "both", "--rate", 50)
+    lab.service.start("--measure", "both", "--rate", 20)
     lab.comes(left)
     lab.comes(right)
     with lab.service.client() as asked:

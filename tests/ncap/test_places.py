@@ -20,7 +20,8 @@ from teds_provision.ncap.waits import USUAL
 from teds_provision.ncap.web.app import MOST_LISTENERS, OF_ONE_TOKEN, LiveSlots
 from teds_provision.ncap.web.tokens import Tokens, digest_of
 from teds_provision.station.store.lock import StoreLock
-from tests.ncap.service import Service
+from tests.ncap.service import Service, described, virtual
+from tests.ncap.test_guard import cookie_of
 from tests.pace import PATIENCE, until
 
 
@@ -130,12 +131,14 @@ def test_what_waits_for_the_stores_lock_holds_up_no_other_request(service: Servi
     assert 201 in answers
 
 
-@pytest.mark.link
-def test_the_log_names_who_asked_for_what_and_why_it_was_refused(service: Service) -> None:
-    from tests.ncap.service import virtual
-    from tests.ncap.test_guard import cookie_of
+@pytest.fixture(scope="module")
+def hand(service: Service) -> str:
+    """Return a virtual gripper of the daemon."""
+    return virtual(service)
 
-    hand = virtual(service)
+
+@pytest.mark.link
+def test_the_log_names_who_asked_for_what_and_why_it_was_refused(service: Service, hand: str) -> None:
     headers: dict[str, str | None] = {"Content-Type": "application/json"}
     bearer = {**headers, "Authorization": f"Bearer {service.token('robot 7')}"}
     page = {**headers, "Cookie": cookie_of(service), "Origin": service.url}
@@ -170,10 +173,7 @@ def test_the_log_names_who_asked_for_what_and_why_it_was_refused(service: Servic
 
 
 @pytest.mark.link
-def test_a_datasheet_as_a_json_document_is_what_the_description_says(service: Service) -> None:
-    from tests.ncap.service import described, virtual
-
-    hand = virtual(service, name="document")
+def test_a_datasheet_as_a_json_document_is_what_the_description_says(service: Service, hand: str) -> None:
     bearer: dict[str, str | None] = {"Authorization": f"Bearer {service.token('documents', '--read-only')}"}
     path = f"/nodes/{hand}/teds?format=json"
     answer = service.raw("GET", f"/api/v1{path}", bearer)

@@ -31,7 +31,7 @@ def test_outdated_firmware_is_not_measured_until_it_is_updated(desk: Desk, tmp_p
     assert measured.code == 6
     assert json.loads(measured.out.splitlines()[-1])["error"]["code"] == "firmware"
 
-    service = Service(desk, station, ("--require-firmware", "--measure", "all", "--rate", 50)).start()
+    service = Service(desk, station, ("--require-firmware", "--measure", "all", "--rate", 20)).start()
     service.process.wait_for(f"The firmware of node {node.uuid} is outdated")  # type: ignore[union-attr]
     ask = service.client()
     assert ask.node(node.uuid)["firmware"]["state"] == "outdated"

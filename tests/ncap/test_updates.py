@@ -294,7 +294,7 @@ def events_of(bench: Bench, node: Node) -> list[str]:
 def measured(bench: Bench) -> Iterator[Callable[[Node], dict[str, Any]]]:
     """Both boards are measured, each by its own measurement; gives how that goes for a board."""
     with bench.service.client() as asked:
-        ids = [asked.measure(node.uuid, rate=50)["id"] for node in bench.boards]
+        ids = [asked.measure(node.uuid, rate=20)["id"] for node in bench.boards]
 
         def report(node: Node) -> dict[str, Any]:
             every = [report for found in asked.measurements() for report in found["nodes"]]
@@ -338,7 +338,7 @@ def test_a_board_whose_actuator_is_in_use_is_refused(bench: Bench) -> None:
     with bench.service.client() as asked:
         for measurement in (False, True):
             if measurement:
-                asked.measure(hand)
+                asked.measure(hand, rate=20)
                 until(lambda: any(channel["last"] for channel in asked.node(hand)["channels"]))
             actuator = next(channel for channel in asked.node(hand)["channels"] if channel["kind"] == "actuator")
             asked.set(hand, actuator["number"], actuator["low"], hold=60)

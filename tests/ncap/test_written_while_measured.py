@@ -156,6 +156,10 @@ def test_blinking_costs_no_value(lab: Lab) -> None:
     lab.service.end()
 
 
+@pytest.mark.nightly(
+    "tests/ncap/test_newcomers_in_pairs.py::test_a_writer_that_is_killed_gives_a_matched_node_back, in a "
+    "measurement of all"
+)
 def test_a_writer_that_is_killed_gives_the_node_back(lab: Lab) -> None:
     lab.service.start()
     lab.measure()
@@ -185,6 +189,10 @@ def test_two_writers_have_it_and_it_comes_back_after_the_last(lab: Lab) -> None:
     lab.service.end()
 
 
+@pytest.mark.nightly(
+    "tests/ncap/test_newcomers.py::test_a_node_that_goes_while_its_writer_has_it_joins_when_it_comes_back, in a "
+    "measurement of all"
+)
 def test_a_node_that_goes_while_its_writer_has_it_is_measured_when_it_comes_back(lab: Lab) -> None:
     lab.service.start()
     lab.measure()
