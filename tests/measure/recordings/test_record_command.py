@@ -76,17 +76,17 @@ def test_a_recorder_that_is_killed_in_the_middle_leaves_what_info_and_convert_re
 
 
 def test_two_conversions_to_one_name_leave_one_whole_file(tmp_path: Path) -> None:
-    source = recorded(tmp_path / "run.mcap", [block(index=k) for k in range(0, 30_000, 3)])
+    source = recorded(tmp_path / "run.mcap", [block(index=k) for k in range(0, 15_000, 3)])
     words = [sys.executable, "-m", "teds_provision", "record", "convert", str(source), str(tmp_path / "to.csv")]
     both = [subprocess.Popen(words, env=unmeasured_environment(), stderr=subprocess.PIPE) for _ in range(2)]
     codes = sorted((process.communicate()[0], process.returncode)[1] for process in both)
     assert codes == [0, 2]
-    assert rows_in(tmp_path / "to.csv") == 30_000
+    assert rows_in(tmp_path / "to.csv") == 15_000
     assert {path.name for path in tmp_path.iterdir()} == {"run.mcap", "to.csv"}
 
 
 def test_what_a_killed_conversion_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
-    source = recorded(tmp_path / "run.mcap", [block(index=k) for k in range(0, 90_000, 3)])
+    source = recorded(tmp_path / "run.mcap", [block(index=k) for k in range(0, 45_000, 3)])
     words = [sys.executable, "-m", "teds_provision", "record", "convert", str(source), str(tmp_path / "to.csv")]
     killed = subprocess.Popen(words, env=unmeasured_environment())
     until(lambda: any(found.name.endswith(".teds-part") for found in tmp_path.iterdir()))
@@ -111,7 +111,7 @@ def test_show_speaks_peoples_units_and_json_speaks_si(tmp_path: Path) -> None:
 
 
 def test_a_file_that_may_not_grow_ends_a_conversion_with_words_and_leaves_nothing(tmp_path: Path) -> None:
-    source = recorded(tmp_path / "run.mcap", [block(index=k) for k in range(0, 30_000, 3)])
+    source = recorded(tmp_path / "run.mcap", [block(index=k) for k in range(0, 15_000, 3)])
     program = f"{sys.executable} -m teds_provision record convert {source} {tmp_path / 'to.csv'}"
     words = ["bash", "-c", f"ulimit -f 200; trap '' XFSZ; exec {program}"]
     done = subprocess.run(
