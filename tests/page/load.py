@@ -71,7 +71,7 @@ def run(browser: Browser, lab: Lab, seconds: float) -> Load:
         )
         beside = Listener(lab)
         beside.start()
-        with opened(browser, lab, route="measure") as page:
+        with opened(browser, lab, route="measure", smooth=True) as page:
             kept = station.request("POST", "/measurements", {"uuids": uuids, "rate": RATE})["id"]
             early = until(lambda: received_beyond(page, RATE * SHOWN), "no points arrive")
             early = until(lambda: received_beyond(page, early), "no more points arrive")  # counted just now
