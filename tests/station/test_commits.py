@@ -126,7 +126,7 @@ def test_the_key_is_on_the_disk_before_its_confirmation_leaves_and_the_sequence_
     assert of_teds[-3:] == ["on the disk", "TEDS 128 of channel 0", "the commit"]
     assert "TEDS 1 of channel 0" in of_teds[:-3]
     assert steps[steps.index("the key confirmation") - 1] == "commit"
-    assert steps[-4:-1] == ["to report its mode", "commit", "told"]
+    assert steps[-4:] == ["to report its mode", "to close the session", "commit", "told"], "Close rests on no record"
 
 
 def test_a_run_that_ends_early_is_on_the_disk_all_the_same(watched: StatementLog, synced: list[str]) -> None:
