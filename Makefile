@@ -1,7 +1,10 @@
 # Two commands: `make demo` shows the whole workflow on this machine, `make test` runs every check.
 # Both make their own virtual environment first; nothing else is needed but Python 3.11 to 3.13 with venv, and make.
 
-PYTHON ?= python3
+# Asked once, when an environment is made: python3, or the system's own if it is the faster one by far.
+ifndef PYTHON
+PYTHON = $(eval PYTHON := $(shell scripts/choose-python))$(PYTHON)
+endif
 VENV ?= .venv
 BIN := $(VENV)/bin
 # Compiled modules are kept: each of five pytests would else rewrite every assert again, 13 s of CPU each.
@@ -34,10 +37,10 @@ lint: $(VENV)/.dev
 types: $(VENV)/.dev
 	$(BIN)/mypy
 
-# Three times the cores: half of the time that a test takes is waiting for a node, a reader, a lock (4 on two cores: 47 %).
-# What holds a rule about time then runs three at a time: it waits for three quarters of its time.
-WORKERS ?= 6
-PUNCTUAL ?= 3
+# Four times the cores: half of the time that a test takes is waiting for a node, a reader, a lock; tests/dealing.py.
+# What holds a rule about time then runs five at a time: it waits for three quarters of its time.
+WORKERS ?= 8
+PUNCTUAL ?= 5
 USUAL := not soak and not machine and not rclpy and not nightly
 # Of what fails, up to three tests that run other processes get a second try, alone (tests/second_try.py).
 unit: $(VENV)/.dev
@@ -223,7 +226,7 @@ model: $(VENV)/.dev
 $(VENV)/.made:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' || \
 	  { echo "Python 3.11 to 3.13 is needed; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
-	@echo "Making the virtual environment $(VENV) …"
+	@echo "Making the virtual environment $(VENV) with $(PYTHON) …"
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --upgrade pip
 	@touch $@

@@ -23,6 +23,7 @@ from hypothesis import HealthCheck, settings
 
 from teds_provision.station.station import Station
 from tests.bench import Board, copied_station
+from tests.dealing import dealt
 from tests.firmware.c_node import OFFERS
 from tests.nightly import REFUSED, UNNAMED, refusals
 from tests.passphrase_costs import lower_costs
@@ -108,12 +109,13 @@ def node_kind() -> str:
     return "c" if ALL_IN_C else "python"
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> Generator[None, None, None]:
     """Let a rule about time be held by the best of three tries, as ``best_of`` does; every try is told (``-rR``).
 
     Nothing but these is tried again: a rule that says nothing about time fails at once. What needs of a node what the
-    one in C lacks is left out there. What is out of the gate names a test in it that holds the same rule.
+    one in C lacks is left out there. What is out of the gate names a test in it that holds the same rule. Workers get
+    what is left in an order in which each begins with what takes long.
     """
     if not any("::" in word for word in config.args):  # files are collected whole
         config.stash[REFUSED] = refusals(items)
@@ -124,6 +126,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.flaky(reruns=2))
             timed.add(item.path)
     config.stash[UNNAMED] = [path for path in timed if "mark.realtime" not in path.read_text(encoding="utf-8")]
+    yield  # -m and -k choose
+    workers = getattr(config, "workerinput", {}).get("workercount", 1)
+    if workers > 1:
+        items[:] = dealt(items, [item.nodeid for item in items], workers)
 
 
 @pytest.hookimpl(trylast=True)
