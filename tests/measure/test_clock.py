@@ -248,3 +248,13 @@ def test_wall_time_is_read_once() -> None:
         return float(abs(WallClock.now().unix(np.array([time.monotonic()]))[0] - time.time()))
 
     best_of(3, 0.5, off)
+
+
+def test_a_clock_that_turns_out_worse_than_it_said_is_judged_anew_and_no_liar() -> None:
+    """What was known of it before held for the drift that it reported then."""
+    node, clock = Node(3000), ClockMap()
+    assert clock.exchange(node.exchange(BOOT + SECOND))
+    clock.arrival(node.tick(BOOT + 11 * SECOND), BOOT + 11 * SECOND + node.delay())
+    worse = replace(node.exchange(BOOT + 11 * SECOND + SECOND // 10), drift=5000)
+    assert clock.exchange(worse), clock.lie
+    assert clock.lie == ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -228,7 +229,7 @@ def test_nodes_that_are_there_in_time_begin_at_one_moment_and_a_late_one_when_it
 
 def test_a_node_alone_waits_for_no_other_and_one_that_is_gone_is_not_waited_for() -> None:
     assert CommonStart({ONE}).start(ONE, clock(0)) == SOON
-    common = CommonStart({ONE, TWO}, waiting=60)
+    common = CommonStart({ONE, TWO}, waiting=math.inf)  # no wait is so long: it would raise
     common.drop_node(TWO)
     assert common.start(ONE, clock(0)) != SOON
 
@@ -285,3 +286,10 @@ def test_a_mark_names_its_holder_and_shows_one_that_was_killed(tmp_path: Path) -
     place.write_text("{}")  # what a process leaves that was killed
     with UsageLock(place, command="measure") as again:
         assert again.left_behind
+
+
+def test_of_too_many_nodes_the_one_that_was_heard_longest_ago_is_forgotten() -> None:
+    sightings, uuids = Presence(), [number.to_bytes(10, "big") for number in range(MOST + 1)]
+    for uuid in (*uuids[:MOST], uuids[0], uuids[MOST]):  # the first one answers again before one too many comes
+        sightings.add_sighting(seen(uuid, 7))
+    assert {sighting.uuid for sighting in sightings.all()} == {*uuids} - {uuids[1]}

@@ -9,11 +9,14 @@ from typing import Any, cast
 import pytest
 
 from teds_provision.errors import GarbledError
+from teds_provision.measure import node_supervisor
 from teds_provision.measure.blocks import NodeReport
 from teds_provision.measure.clock import HostClock
 from teds_provision.measure.node_supervisor import LOOK, NodeSupervisor
 from teds_provision.measure.request import Events, MeasurementRequest
 from teds_provision.measure.running.common_start import CommonStart
+from teds_provision.measure.running.measurement_job import MeasurementJob
+from teds_provision.station.store.records import KeptMeasurement
 
 UUID = bytes(range(10))
 
@@ -76,3 +79,52 @@ def test_announces_without_end_make_it_look_no_more_often(monkeypatch: pytest.Mo
 
     supervisor._watch(none, none, cast(Any, SimpleNamespace(require=require, mark="")), None)
     assert looks[-1] - looks[0] >= 0.9 * 4 * LOOK
+
+
+def supervisor_at(now: list[float], monkeypatch: pytest.MonkeyPatch, **request: Any) -> NodeSupervisor:
+    """Return a supervisor whose clock stands at ``now``, and which waits for nothing."""
+    monkeypatch.setattr(node_supervisor, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    events, none = Events(lambda _block: None, lambda _facts: None, lambda _report: None), cast(Any, None)
+    made = NodeSupervisor(none, none, UUID, MeasurementRequest(**request), HostClock(), events, CommonStart([UUID]))
+    monkeypatch.setattr(made, "_anew", SimpleNamespace(wait=lambda _seconds: False, set=lambda: None))
+    return made
+
+
+def test_a_node_is_asked_a_second_after_its_first_announce_however_many_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    supervisor = supervisor_at(now, monkeypatch)
+    monkeypatch.setattr(supervisor, "streams", SimpleNamespace(every=lambda: 10.0))
+    for _ in range(4):
+        supervisor._heard_announce()
+        assert not supervisor._doubted(now[0])
+        now[0] += 0.25
+    assert supervisor._doubted(now[0])
+    assert not supervisor._doubted(now[0] + 10.0), "once"
+
+
+def test_a_node_is_told_the_time_every_third_of_its_lease(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, told = [0.0], list[float]()
+    supervisor = supervisor_at(now, monkeypatch, lease=3)
+    streams = SimpleNamespace(
+        tell_time=lambda _trusted: told.append(now[0]), silent=lambda _now: 0.0, clock=SimpleNamespace(lie="")
+    )
+    monkeypatch.setattr(supervisor, "streams", streams)
+
+    def require() -> None:
+        now[0] += 0.25
+        if now[0] >= 4.0:
+            supervisor.stop()
+
+    none: Any = None
+    supervisor._watch(none, none, cast(Any, SimpleNamespace(require=require, mark="")), None)
+    assert told == [1.0, 2.0, 3.0, 4.0]
+
+
+def test_a_node_that_was_given_back_is_lent_no_more() -> None:
+    """It would never be let go when it is lost later, and not join again."""
+    station: Any = None
+    job = MeasurementJob(station, KeptMeasurement("run", uuids=(UUID,)))
+    assert job.suspend_node(UUID, "let go for write", 0.0)
+    assert job.lent == {UUID}
+    job.resume_node(UUID)
+    assert job.lent == set()

@@ -9,11 +9,12 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import NodeRefusedError
+from teds_provision.errors import NodeRefusedError, NodeSilentError
 from teds_provision.measure.blocks import Block, SetPointCommand
 from teds_provision.measure.topic_actuators import WATCHED, TopicActuators
 from teds_provision.measure.verified_session import VerifiedSession
 from teds_provision.protocol.messages.frames import Command, Function, Reason
+from teds_provision.protocol.operation.stream_commands import CLOCK
 from teds_provision.teds.calibration import fit
 from tests.measure.test_lookout import clock
 from tests.pace import until
@@ -147,3 +148,21 @@ def test_a_set_point_beyond_the_limits_moves_nothing_and_is_reported() -> None:
     scene.actuators.close()
     assert (scene.node.values, scene.applied, scene.messages) == (0, [], [])
     assert scene.warnings
+
+
+def test_after_a_lost_reply_one_clock_settles_that_no_value_is_on_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, asked = Scene(lambda: reply(1)), list[Command]()
+    request = scene.node.request
+
+    def with_one_lost(command: Command, doing: str, *, within: float | None = None) -> bytes:
+        asked.append(command)
+        if len(asked) == 2:  # the first value, after the claim
+            raise NodeSilentError("Its reply was lost.")
+        return request(command, doing, within=within)
+
+    monkeypatch.setattr(scene.node, "request", with_one_lost)
+    for _ in range(3):
+        scene.give(1)
+    scene.actuators.close()
+    assert (scene.actuators.refused, len(scene.applied)) == (1, 2)
+    assert [command == CLOCK for command in asked] == [False, False, True, False, False, False]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ from typing import Any, cast
 import pytest
 
 from teds_provision.measure.blocks import SetPointCommand
+from teds_provision.measure.verified_session import VerifiedSession
 from teds_provision.ncap.nodes.actuator_leases import ActuatorLeases, Measured, _HeldActuator, _SetPointOrder
 
 
@@ -78,3 +80,31 @@ def test_an_actuator_is_claimed_again_only_when_its_release_is_over() -> None:
     leases._run(after, 0.5, None)
     assert course == ["the one before ends", "claimed"]
     assert after.ended
+
+
+def test_a_first_set_point_is_held_for_its_time_from_when_it_was_applied() -> None:
+    """Until then it has fifteen seconds more, for a session that has to be opened."""
+    order, applied = _SetPointOrder(0.5, None, 1), {"value": 0.5}
+    held = _HeldActuator("ab", 1, time.monotonic() + 15.5, order, applied=applied, answered=1)
+    assert ActuatorLeases._answer(held, 1, 0.5)["applied"] == applied
+    assert held.until <= time.monotonic() + 0.5
+
+
+def test_the_session_of_a_nodes_actuators_ends_with_the_last_of_them() -> None:
+    ended: list[str] = []
+    none, the_session = cast(Any, None), cast(Any, object())
+
+    class Leases(ActuatorLeases):
+        @contextmanager
+        def _own_session(self, uuid: str) -> Iterator[VerifiedSession]:
+            yield the_session
+            ended.append(uuid)
+
+    leases = Leases(none, none, none, none, none, lambda _uuid: False, none)
+    with leases._session("ab") as first:
+        with leases._session("ab"):
+            pass
+        assert ended == []
+        with first("ab") as session:
+            assert session is the_session
+    assert ended == ["ab"]

@@ -19,10 +19,11 @@ from teds_provision.links.discovery import Sighting
 from teds_provision.measure.buses import Buses
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor, NodeLoan
-from teds_provision.ncap.membership import Member
+from teds_provision.ncap.membership import Member, Membership
 from teds_provision.ncap.nodes.actuator_leases import ActuatorLeases
 from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.node_jobs import NodeJobs, NodeLocks
+from teds_provision.ncap.running_measurement import RunningMeasurement
 from teds_provision.ncap.sinks import DaemonSinks
 from teds_provision.ncap.web import resources as web
 from teds_provision.ncap.web.guard import CALLER
@@ -221,3 +222,12 @@ def test_a_node_that_may_not_be_measured_is_ended_or_refused_by_its_own_supervis
     service.measurements.look_who_is_meant()
     assert followed.wait(10)
     assert [why[: len("This station holds no key of node")] for why in whys] == ended
+
+
+def test_a_node_that_had_just_arrived_when_a_measurement_ends_is_given_back(service: Service) -> None:
+    kept = KeptMeasurement("run", match="all")
+    running = RunningMeasurement(kept, Membership(0.0), kept)
+    service.locks.acquire(NODE, "measurement run", frozen=True)
+    running.membership.arrive(NODE, 0.0)
+    service.measurements._finish(running)
+    assert service.locks.holder(NODE) is None

@@ -274,3 +274,41 @@ def test_what_a_measurement_says_of_a_node_that_it_has_no_more_is_no_problem(wat
     station.close()
     assert problem is not None
     assert problem["message"] == "No message of the node came for 2.1 s"
+
+
+def test_a_link_that_was_back_is_tried_a_second_after_it_is_lost_again(
+    watch: LinkWatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The pause had grown with its absence before, up to half a minute."""
+    pauses, absent = list[float](), iter([True, True, False, True])
+
+    def open_place(*_words: Any) -> Reader:
+        if next(absent):
+            raise LinkError("No adapter there.")
+        return Reader()
+
+    def lost(_port: Any) -> None:
+        raise LinkError("The adapter was pulled.")
+
+    def wait(seconds: float) -> None:
+        pauses.append(seconds)
+        if len(pauses) == 4:
+            watch._stop.set()
+
+    monkeypatch.setattr(link_watch, "open_place", open_place)
+    monkeypatch.setattr(watch, "_watch", lost)
+    monkeypatch.setattr(watch, "_anew", SimpleNamespace(clear=lambda: None, wait=wait))
+    watch._run()
+    assert pauses == [1.0, 2.0, 1.0, 2.0]
+
+
+def test_a_reader_that_two_commands_borrowed_is_lent_until_both_gave_it_back(watch: LinkWatch) -> None:
+    watch.place = "nfc:x"
+    watch._free.set()
+    first, second = object(), object()
+    for command in (first, second):
+        assert watch.borrow(command)
+    watch.give_back(first)
+    assert watch._borrowers == {id(second)}
+    watch.give_back(second)
+    assert watch._borrowers == set()

@@ -250,7 +250,7 @@ class ActuatorLeases:
         finally:
             with shared.turn:
                 shared.users -= 1
-                if not shared.users:
+                if shared.users == 0:
                     shared.verified = None
                     shared.stack.close()
 

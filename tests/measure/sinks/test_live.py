@@ -470,3 +470,11 @@ def test_a_slow_carrier_loses_the_oldest_and_says_how_much() -> None:
     sink._items.clear()
     sink.close()
     assert dropped >= 300
+
+
+@pytest.mark.parametrize(("rate", "every"), [(1000, 1), (2000, 2)])
+def test_a_thousand_rows_a_second_go_out_and_no_more(rate: int, every: int) -> None:
+    times = 1_800_000_000 + np.arange(100) / rate
+    rows = GroupRows("crane", ((ARM, 1),), times, np.zeros((100, 1)), np.zeros((100, 1)))
+    sink = carried([rows])
+    assert [stamp for topic, stamp, *_ in sink.arrays if topic == "/bench/crane"] == times[::every].tolist()

@@ -1,0 +1,51 @@
+"""Updates that the service keeps, without boards: one that could not be kept, and how many that are over."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import StoreError
+from teds_provision.ncap.nodes import updates
+from teds_provision.ncap.nodes.update_actions import FOLDER, KEPT, UpdateAction, UpdateRequest
+from teds_provision.ncap.nodes.updates import Updates
+
+NODE = "ab" * 10
+
+
+def updates_of(folder: Path) -> Updates:
+    none: Any = None
+    quiet: Any = SimpleNamespace(home=folder, audit=lambda *_words, **_facts: None)
+    return Updates(quiet, none, none, none, bus_of=lambda _uuid: None, measured=none, lent=none, held=none)
+
+
+def test_an_update_that_could_not_be_kept_does_not_keep_others_waiting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = SimpleNamespace(version_text="1.1.0", digest=b"d", board=None, octets=b"x", security_counter=None)
+    monkeypatch.setattr(updates, "_image_of", lambda _octets: image)
+    made = updates_of(tmp_path)
+
+    def full(*_words: Any) -> None:
+        raise StoreError("The disk is full.")
+
+    monkeypatch.setattr(made._kept, "keep_new", full)
+    for _ in range(2):
+        with pytest.raises(StoreError):
+            made.begin(b"x", UpdateRequest((NODE,)), owner="a person")
+    assert made.all() == []
+
+
+def test_of_the_updates_that_are_over_the_newest_are_kept(tmp_path: Path) -> None:
+    (tmp_path / FOLDER).mkdir(mode=0o700)
+    made = updates_of(tmp_path)
+    names = [f"{number:02}" for number in range(KEPT + 2)]
+    for began, name in enumerate(names):
+        action = UpdateAction(name, UpdateRequest((NODE,)), {"version": "1.1.0"}, {}, "a person", None, float(began))
+        made._actions[name] = action
+        made._end(action, "done")
+    assert [action["id"] for action in made.all()] == names[:1:-1]
+    assert sorted(path.stem for path in (tmp_path / FOLDER).glob("*.json")) == names[2:]
