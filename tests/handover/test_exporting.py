@@ -11,8 +11,8 @@ import pytest
 
 from teds_provision.errors import NotFoundError, PolicyError, UsageError
 from teds_provision.handover.incoming import ImportPlan, plan_import
-from teds_provision.handover.outgoing import ExportOrder, plan_export
-from teds_provision.handover.pending import close, find_handover, undo
+from teds_provision.handover.outgoing import ExportOrder, _of_the_last_run, plan_export
+from teds_provision.handover.pending import BundleNotes, close, find_handover, undo
 from teds_provision.protocol.handover.bundle import open_bundle
 from tests.bench import Board, make_station
 from tests.handover.desk import Pair, everything, key_up, provisioned, session, trust
@@ -134,3 +134,13 @@ def test_the_bundle_says_what_the_profile_lists(pair: Pair) -> None:
     assert opened.bundle.expires - opened.bundle.created == timedelta(days=7)
     assert opened.station_signature is not None
     assert json.loads(path.read_bytes())["recipients"][0]["header"]["kid"] == pair.south.fingerprint
+
+
+def test_all_again_means_the_newest_open_move_with_all_that_its_command_made() -> None:
+    def notes(name: str, run: str = "") -> BundleNotes:
+        return BundleNotes((name,), name, "", "", run=run)
+
+    assert _of_the_last_run([]) == []
+    assert _of_the_last_run([notes("old"), notes("new")]) == [notes("new")]
+    old, new = notes("old", "run 1"), [notes(name, "run 2") for name in ("one", "two")]
+    assert _of_the_last_run([old, *new]) == new

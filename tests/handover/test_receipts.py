@@ -13,7 +13,7 @@ from teds_provision.handover.pending import close, find_handover, list_handovers
 from teds_provision.protocol.handover.receipt import open_receipt
 from teds_provision.provisioning.agree import agree
 from teds_provision.provisioning.identify import identify
-from teds_provision.station.store.records import WhitelistEntry
+from teds_provision.station.store.records import Tombstone, WhitelistEntry
 from tests.bench import make_station, talk
 from tests.handover.desk import Pair, everything, held, row, session, trust
 
@@ -136,3 +136,12 @@ def test_the_list_of_handovers(pair: Pair) -> None:
     assert (out.row.state, out.peers, out.count, out.expired) == ("open", ("south",), 1, False)
     assert (came.row.state, came.peers) == ("imported", ("north",))
     assert list_handovers(pair.north, datetime.now(UTC) + timedelta(days=8))[0].expired
+
+
+def test_a_receipt_deletes_nothing_of_a_node_that_rests_because_of_another_move(pair: Pair) -> None:
+    path, _ = pair.export("move")
+    taken = pair.take(path)
+    pair.north.policy.take_back([pair.board.uuid])
+    pair.north.policy.put_tombstone(Tombstone(pair.board.uuid, pair.south.fingerprint, "a later move"))
+    assert close(pair.north, taken.receipt).fresh
+    assert held(pair.north, pair.board) != []

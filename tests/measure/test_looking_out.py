@@ -9,15 +9,18 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from teds_provision.errors import AddressConflictError, LinkError
-from teds_provision.links.can.discovery import BELIEVED, SOON, CanDiscovery
+from teds_provision.links import discovery as links_discovery
+from teds_provision.links.can import discovery
+from teds_provision.links.can.discovery import BELIEVED, EACH, SOON, CanDiscovery
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
-from teds_provision.links.discovery import LEAST, BroadcastPace, Sighting
+from teds_provision.links.discovery import LEAST, MOST, BroadcastPace, Sighting
 from teds_provision.measure.presence import Presence
 from teds_provision.ncap.nodes.link_watch import MAX_PARALLEL, PresenceCheck
 from teds_provision.ncap.waits import USUAL
@@ -257,3 +260,27 @@ def test_who_is_held_is_not_asked_and_no_more_than_five_are_at_once() -> None:
     known = {uuid.hex(): last_heard(uuid, number, silence + number) for number, uuid in enumerate(uuids, 1)}
     found = asks(Bus(), known, held=uuids[-1].hex())
     assert list(found) == [uuid.hex() for uuid in reversed(uuids[-1 - MAX_PARALLEL : -1])]
+
+
+def test_a_node_that_starts_often_is_believed_again_ten_seconds_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, words = [100.0], Announce(0x21, NodeState.PROVISIONED, uuid_crc(ONE))
+    monkeypatch.setattr(discovery, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    looks = CanDiscovery.__new__(CanDiscovery)  # without its thread and its bus
+    looks._awaited = {}
+    assert [looks._believes(words) for _ in range(BELIEVED + 1)] == [True] * BELIEVED + [False]
+    now[0] += EACH
+    assert looks._believes(words)
+
+
+def test_the_pause_begins_again_once_no_node_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next one that was missing waited for what the absence of the one before had come to, up to 30 s."""
+    now = [0.0]
+    monkeypatch.setattr(links_discovery, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    pace = BroadcastPace(0.0)
+    for _ in range(5):
+        now[0] += MOST
+        assert pace.is_due(wanted=False, missing=True, poll=None)
+        pace.asked = now[0]
+    assert not pace.is_due(wanted=False, missing=False, poll=None)
+    now[0] += LEAST
+    assert pace.is_due(wanted=False, missing=True, poll=None)

@@ -1380,7 +1380,7 @@ PATTERNS = (
         "sign",
         "number > node_sequence",
         "number >= node_sequence",
-        "tests/provisioning/test_one_verdict.py",
+        "tests/provisioning/test_exchanges.py",
     ),
     Pattern(
         "a board that is asked once more has its time again",
@@ -1479,6 +1479,13 @@ PATTERNS = (
         "(now, 0)",
         "now, passed_over",
         "tests/station/test_pins.py",
+    ),
+    Pattern(
+        "a receipt deletes keys only while its own move rests",
+        "_delete_what_left",
+        "tombstone.handover_id != row.id",
+        "False",
+        "tests/handover/test_receipts.py",
     ),
 )
 

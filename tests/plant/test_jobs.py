@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -665,3 +666,16 @@ def test_a_clock_before_the_roster_counts_as_the_time_of_the_roster() -> None:
         created = datetime(2999, 1, 1, tzinfo=UTC)
 
     assert jobs.now_of(cast("Roster", _Roster())) == _Roster.created
+
+
+def test_a_board_that_is_done_takes_back_its_own_scan_alone() -> None:
+    """The next board's label is scanned while the one before is finished."""
+    first, second = bytes(10), bytes(range(10))
+    who: Any = SimpleNamespace(uuid=second, fingerprint="ab" * 32)
+    scans = Scans([])
+    scans.add_label(second.hex())
+    scans.clear(first)
+    scans.require(who)
+    scans.clear(second)
+    with pytest.raises(PolicyError, match="Scan the label"):
+        scans.require(who)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,10 +21,11 @@ from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import MOST_ANSWERS, RequestAheadError, answer
-from teds_provision.plant.sign_requests import OfficeRefusedError, OfficeSilentError, RemoteOffice, send
+from teds_provision.plant.sign_requests import Inbox, OfficeRefusedError, OfficeSilentError, RemoteOffice, send
 from teds_provision.plant.yield_stats import attempts_of, yield_stats
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, node_key_message, prove_message
 from teds_provision.protocol.plant import evidence as codec
+from teds_provision.protocol.plant.document import SIGN_REQUEST
 from teds_provision.protocol.plant.job import CalibrationRule, Job
 from teds_provision.protocol.plant.signing import (
     Answer,
@@ -498,3 +500,27 @@ def test_a_request_that_waited_a_day_is_judged_by_the_job_of_that_day(
     assert today.job is not None
     for station, units in ((desk.office, (0, 1)), (desk.line, (1, 1))):
         assert tuple(station.plant.line.count_units(job.id)[0] for job in (today.job, run.job)) == units
+
+
+def test_a_request_that_was_answered_is_taken_again_when_it_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same request is the same parcel."""
+    there = {"a parcel": SimpleNamespace(id="a parcel", octets=b"a request")}
+
+    class Post:
+        def new_parcels(self, _own: str, known: set[str]) -> list[Any]:
+            return [parcel for name, parcel in there.items() if name not in known]
+
+        def drop(self, name: str, _own: str) -> None:
+            del there[name]
+
+    station: Any = SimpleNamespace(identity=SimpleNamespace(fingerprint="ab" * 32))
+    transport: Any = Post()
+    monkeypatch.setattr(parcels, "received", lambda _station, _kind: [])
+    inbox = Inbox(station, transport, SIGN_REQUEST)
+    monkeypatch.setattr(inbox, "_opened", lambda octets: octets)
+    asked = dict(there)
+    for _ in range(2):
+        there.update(asked)
+        (come,) = inbox.collect()
+        assert inbox.collect() == [], "each is given once until it is dropped"
+        come.drop()

@@ -20,6 +20,7 @@ from teds_provision.protocol.handover.bundle import CONTENT_TYPE
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.plant.roster import Share
 from teds_provision.station.plant.line import SignRequestRow
+from teds_provision.station.plant.parcels import ParcelRow
 from teds_provision.station.station import Station
 from tests.cli.shell import call
 from tests.plant.handing import Plant, board_of
@@ -402,3 +403,19 @@ def test_a_job_travels_sealed_and_comes_out_as_it_was_signed(plant: Plant) -> No
     [(row, octets)] = parcels.received(plant["west"], "job")
     assert (row.peer, octets) == (plant["north"].fingerprint, signed)
     assert plant.transport.there == {}
+
+
+def test_what_waits_of_one_sender_keeps_no_other_out(plant: Plant) -> None:
+    from teds_provision.protocol.plant.document import JOB, sign_document
+
+    plant.roster(ROLES)
+    west, until = plant["west"], time_text(now(60))
+    for n in range(64):
+        row = ParcelRow(f"{n}", "in", plant["north"].fingerprint, "sign-request", "waiting", until)
+        west.plant.parcels.put(row, b"")
+    for sender, kept in (("north", 0), ("south", 1)):
+        signed = sign_document({"format": JOB.format, "id": sender}, plant[sender].vault.identity(), JOB)
+        sealed = jose.encrypt(signed, [west.point], cty=CONTENT_TYPE)
+        plant.transport.send(Parcel(sender, west.fingerprint, sealed, until, plant[sender].fingerprint))
+        sync(plant, "west")
+        assert len(parcels.received(west, "job")) == kept

@@ -10,7 +10,7 @@ import pytest
 
 from teds_provision import plant
 from teds_provision.errors import PolicyError
-from teds_provision.plant.apply_pages import alarm
+from teds_provision.plant.apply_pages import alarm, take_rosters
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.membership import FILES
 from teds_provision.plant.sync import acknowledge, sync
@@ -98,4 +98,16 @@ def test_a_request_and_a_roster_from_the_future_are_not_taken_and_the_message_na
         plant.membership.found_roster(south, transport, None)
     assert plant.membership.found_roster(made.north, transport, None).version == 2, "its own roster shows the time"
     south.close()
+    made.close()
+
+
+def test_two_rosters_of_a_version_are_an_alarm_until_the_next_version(tmp_path: Path) -> None:
+    made = Plant(tmp_path)
+    north = made.north
+    version = made.roster.version
+    for n, left in ((version, [version]), (version - 1, [])):
+        alarm(north, "two-rosters", "", n, "two rosters")
+        take_rosters(north, [])
+        assert [raised.n for raised in north.plant.alarms.all()] == left
+        north.plant.alarms.end_about("two-rosters", "")
     made.close()

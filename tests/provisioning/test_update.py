@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cbor2
@@ -499,3 +500,28 @@ def test_a_recorded_update_cannot_be_played_again_and_without_the_key_there_is_n
     assert bench.node.request("can:f2", plain.encode(), tapped=False) == refusal(Reason.NOT_PERMITTED).encode()
     assert bench.runs == before
     assert before[0] == "1.0.0"
+
+
+def test_a_board_that_is_asked_once_more_has_its_three_seconds_again(
+    bench: UpdateBench, owner: Owner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, asked, looks = [0.0], list[float](), list[float]()
+    restart, same = ImageManager.restart, update._same_power_up
+
+    def later(_seconds: float) -> None:
+        now[0] += 1.0
+
+    def maybe(manager: ImageManager) -> None:
+        asked.append(now[0])
+        if len(asked) > 1:
+            restart(manager)
+
+    def shown(before: bytes | None, after: bytes | None) -> bool:
+        looks.append(now[0])
+        return now[0] < 5.0 or same(before, after)
+
+    monkeypatch.setattr(update, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=later))
+    monkeypatch.setattr(update, "_same_power_up", shown)
+    monkeypatch.setattr(ImageManager, "restart", maybe)
+    assert bench.update(owner.new, wait=60.0).result == "updated"
+    assert (asked, looks) == ([0.0, 3.0], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0])

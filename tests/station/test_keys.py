@@ -9,7 +9,7 @@ import pytest
 
 from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.station.station import Station
-from teds_provision.station.store.records import KeyRecord, NodeRecord, StationRecord
+from teds_provision.station.store.records import Holder, KeyRecord, NodeRecord, StationRecord
 
 NODE = bytes(range(10))
 OTHER = bytes(range(1, 11))
@@ -200,3 +200,12 @@ def test_promoting_a_key_that_is_not_held_changes_nothing(station: Station) -> N
         station.keys.promote(NODE, "f" * 16)
     assert numbers(station) == [2, 1]
     assert station.keys.all_flags() == before
+
+
+def test_who_was_noted_as_holder_in_the_second_in_which_a_key_came_holds_it(station: Station) -> None:
+    """An import notes both at once: else a key that a removed station gave would count as one that it never had."""
+    at, uuid = ["2026-10-01T08:00:00Z", "2026-10-01T08:00:01Z", "2026-10-01T08:00:02Z"], bytes(10)
+    for digits, since in zip(("aa" * 32, "bb" * 32, "cc" * 32), at, strict=True):
+        station.keys.put_holder(Holder(uuid, digits, since))
+    key = KeyRecord(uuid, 1, "0" * 16, "active", 1, b"", "import", at[1])
+    assert station.keys.holders_of_key(key) == {"bb" * 32, "cc" * 32}

@@ -94,3 +94,14 @@ def test_how_nodes_are_detected_is_kept(station: Station, home: Path) -> None:
         station.measurements.detection = mode
         with Station.inspect(home) as again:
             assert again.measurements.detection == mode
+
+
+def test_of_two_measurements_of_a_group_the_newest_is_continued(station: Station) -> None:
+    station.groups.put(Group("hand", (ONE,)))
+    for day, rate in ((2, 200.0), (1, 100.0)):
+        kept = KeptMeasurement(f"m{day}", group="hand", rate=rate, created=f"2026-10-0{day}T08:00:00Z")
+        station.measurements.keep(kept)
+    continued = station.measurements.settings_to_continue("hand")
+    assert continued is not None
+    assert continued.rate == 200.0
+    assert station.measurements.settings_to_continue("foot") is None

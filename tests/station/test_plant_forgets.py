@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from teds_provision.station.plant.alarms import Alarm
 from teds_provision.station.station import Station
 from teds_provision.station.store.store import Store
 
@@ -33,3 +34,14 @@ def test_everything_of_a_registry_goes(station: Station, store: Store) -> None:
     station.plant.forget()
     left = {table: store.first_row(f"SELECT count(*) FROM {table}") for table in ROWS}
     assert {table for table, row in left.items() if row is None or row[0]} == set()
+
+
+def test_an_alarm_that_nobody_has_seen_keeps_its_time_when_it_happens_again(station: Station) -> None:
+    alarms, times = station.plant.alarms, ("2026-10-01T08:00:00Z", "2026-10-02T08:00:00Z", "2026-10-03T08:00:00Z")
+    first, again, later = (Alarm("junk", "ab" * 32, 3, "why", at) for at in times)
+    assert alarms.put(first, again=True)
+    assert not alarms.put(again, again=True), "it is reported to the plant once"
+    assert alarms.all() == [first]
+    assert alarms.see() == 1
+    assert alarms.put(later, again=True)
+    assert alarms.all() == [later]
