@@ -164,12 +164,14 @@ def update_at(
     *,
     timeout: float,
     release: Release | None = None,
+    is_ending: Callable[[], bool] = lambda: False,
 ) -> BoardUpdate:
     """Update one board over an open port; an error is part of the result.
 
     ``release`` has the board for the update alone, see :data:`Release`; without it ``station.released`` does.
+    ``is_ending`` returns True once the caller ends and goes on later: an error is then no result for the log.
     """
-    return _Update(station, port, timeout, uuid, order, reporter, release).run()
+    return _Update(station, port, timeout, uuid, order, reporter, release, is_ending).run()
 
 
 def update_boards(
@@ -351,9 +353,10 @@ class _Update(_Look):
         order: UpdateOrder,
         reporter: Reporter,
         release: Release | None = None,
+        is_ending: Callable[[], bool] = lambda: False,
     ) -> None:
         super().__init__(station, uuid, order)
-        self._port, self._timeout, self._reporter = port, timeout, reporter
+        self._port, self._timeout, self._reporter, self._is_ending = port, timeout, reporter, is_ending
         self._release: Release = release or (lambda uuid: station.released(uuid, "update"))
         self._octets = 0
         self._point = b""
@@ -378,7 +381,8 @@ class _Update(_Look):
         if error is not None:
             result = "reverted" if isinstance(error, RevertedError) else result_of(error)
         done = BoardUpdate(self._uuid, result, self._before, self._octets, time.monotonic() - began, error)
-        if result != "already" and not isinstance(error, LinkClosedError):  # the same call goes on later
+        cut = isinstance(error, LinkClosedError) or (error is not None and self._is_ending())
+        if result != "already" and not cut:  # what was cut goes on later
             facts = {"from": self._before, "to": self._order.image.version_text, "image": self._digest.hex()}
             with suppress(TedsProvisionError):  # a full disk must not hide what happened
                 self._station.audit(

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
-from teds_provision.errors import StoreError
+from teds_provision.errors import LinkError, StoreError
 from teds_provision.ncap.nodes import updates
-from teds_provision.ncap.nodes.update_actions import FOLDER, KEPT, UpdateAction, UpdateRequest
+from teds_provision.ncap.nodes.update_actions import FOLDER, KEPT, BoardRow, UpdateAction, UpdateRequest
 from teds_provision.ncap.nodes.updates import Updates
 
 NODE = "ab" * 10
@@ -49,3 +50,26 @@ def test_of_the_updates_that_are_over_the_newest_are_kept(tmp_path: Path) -> Non
         made._end(action, "done")
     assert [action["id"] for action in made.all()] == names[:1:-1]
     assert sorted(path.stem for path in (tmp_path / FOLDER).glob("*.json")) == names[2:]
+
+
+def test_an_update_that_runs_learns_that_the_service_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What fails from then on is no result of the board: the log called it lost, and it was updated after the start."""
+    (tmp_path / FOLDER).mkdir(mode=0o700)
+    made, ends = updates_of(tmp_path), list[bool]()
+    port = SimpleNamespace(place="can:x", capabilities=SimpleNamespace(max_parallel=1))
+    policy = SimpleNamespace(require_whitelisted=lambda _uuid: None)
+    monkeypatch.setattr(made._station, "policy", policy, raising=False)
+    monkeypatch.setattr(made, "_live", SimpleNamespace(event=lambda *_words, **_facts: None))
+    monkeypatch.setattr(made, "_bus_of", lambda _uuid: port)
+
+    def update_at(*_words: Any, is_ending: Callable[[], bool], **_facts: Any) -> None:
+        ends.append(is_ending())
+        made.stop()
+        ends.append(is_ending())
+        raise LinkError("Its bus is closed.")
+
+    monkeypatch.setattr(updates, "update_at", update_at)
+    row, image = BoardRow(NODE), cast(Any, object())
+    action = UpdateAction("00", UpdateRequest((NODE,)), {"version": "1.1.0"}, {NODE: row}, "a person", None, 0.0)
+    assert made._update(action, image, NODE).result == "lost"
+    assert ends == [False, True]

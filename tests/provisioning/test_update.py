@@ -34,13 +34,13 @@ from teds_provision.provisioning.conversation import Conversation
 from teds_provision.provisioning.identify import identify
 from teds_provision.provisioning.image_manager import ImageManager
 from teds_provision.provisioning.progress import SilentReporter
-from teds_provision.provisioning.update import UpdateOrder, plan_update
+from teds_provision.provisioning.update import UpdateOrder, plan_update, update_at
 from teds_provision.station.firmware import firmware_of
 from teds_provision.station.station import Station
 from teds_provision.teds.image import SECURITY
 from tests.bench import PASSPHRASE
 
-from .update_bench import Owner, StationKilledError, UpdateBench
+from .update_bench import BenchPort, Owner, StationKilledError, UpdateBench
 
 
 @pytest.fixture(scope="module")
@@ -525,3 +525,17 @@ def test_a_board_that_is_asked_once_more_has_its_three_seconds_again(
     monkeypatch.setattr(ImageManager, "restart", maybe)
     assert bench.update(owner.new, wait=60.0).result == "updated"
     assert (asked, looks) == ([0.0, 3.0], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
+
+
+@pytest.mark.parametrize(("ends", "logged"), [(False, ["lost"]), (True, [])])
+def test_a_board_whose_update_is_cut_by_the_end_of_the_service_is_not_lost(
+    bench: UpdateBench, owner: Owner, ends: bool, logged: list[str]
+) -> None:
+    """Whatever the error is that ends it then: the service goes on with the board at its next start."""
+    bench.station.unlock()
+    bench.present = False
+    port: Any = BenchPort(bench)
+    order = UpdateOrder(owner.new, wait=5.0)
+    done = update_at(bench.station, port, bench.uuid, order, SilentReporter(), timeout=1.0, is_ending=lambda: ends)
+    assert done.result == "lost"
+    assert [entry.outcome for entry in bench.station.audit_log.entries() if entry.act == "update"] == logged

@@ -329,6 +329,7 @@ class Updates:
                     _RowReporter(row, lambda: self._publish_progress(action, row), lambda: self._publish(action, row)),
                     timeout=_WAITED_FOR,
                     release=self._alone,
+                    is_ending=self._closing.is_set,
                 )
         except TedsProvisionError as error:
             return _ended(uuid, error, began)
