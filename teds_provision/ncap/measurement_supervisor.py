@@ -482,6 +482,7 @@ class MeasurementSupervisor:
                 job = self._job_of(loan.uuid)
             if job is not None:
                 job.resume_node(bytes.fromhex(loan.uuid))
+                self.look_who_is_meant()  # a beginning forgets that it was to end, renamed by its borrower, say
                 return
         if self._directory.seen(loan.uuid).present:
             self.on_sighting(loan.uuid)

@@ -7,6 +7,13 @@ from tests.mutants.changes import CPattern, Pattern
 PATTERNS = (
     # keys and their life (steps, station, handover)
     Pattern("a pending key out of a backup is no rotation", "_activate", "station.keys.restored(uuid)", "False"),
+    Pattern(
+        "a node that returns is selected again",
+        "MeasurementSupervisor.return_node",
+        "self.look_who_is_meant()",
+        "None",
+        "tests/ncap/test_newcomers_in_pairs.py",
+    ),
     Pattern("an imported key that opens is no rotation", "_activate", "record.source == 'agreement'", "True"),
     Pattern(
         "Identify alone makes no node new",

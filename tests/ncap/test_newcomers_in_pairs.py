@@ -174,6 +174,27 @@ def test_a_writer_that_is_killed_gives_a_matched_node_back(lab: Lab) -> None:
     lab.service.end()
 
 
+def test_a_node_that_left_its_group_while_a_command_had_it_is_not_measured_on(lab: Lab) -> None:
+    """The measurement followed the store while the node was away: what it was told then ended with its return."""
+    left, right = lab.nodes
+    station = lab.service.station
+    station.ask("group", "create", "both", left.uuid, right.uuid)
+    lab.service.start("--measure", "both", "--rate", 20)
+    lab.comes(left)
+    lab.comes(right)
+    words = [sys.executable, "-c", HOLDER, str(station.home), right.uuid]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "True\n"
+        station.ask("group", "remove", "both", right.uuid, left.uuid)
+        until(lambda: lab.states(left)[-1] == "left")  # in the same look at the store
+        assert right.uuid in running(lab)["uuids"], "its place is kept for it"
+        holder.kill()
+    until(lambda: right.uuid not in running(lab)["uuids"], lambda: f"{lab.states(right)} {running(lab)}")
+    assert lab.states(right)[-1] == "left"
+    lab.service.end()
+
+
 def test_who_is_renamed_leaves_or_joins_a_measurement_of_names(lab: Lab) -> None:
     left, right = lab.nodes
     station, over = lab.service.station, lab.desk.links.over("can")
@@ -186,7 +207,10 @@ def test_who_is_renamed_leaves_or_joins_a_measurement_of_names(lab: Lab) -> None
     lab.comes(right)
     words[3] = "right"
     assert station.ask("provision", right.uuid, *words)["verdict"] == "authentic"
-    until(lambda: lab.states(right)[-1] == "left" and right.uuid not in running(lab)["uuids"])
+    until(
+        lambda: lab.states(right)[-1] == "left" and right.uuid not in running(lab)["uuids"],
+        lambda: f"{lab.states(right)} {running(lab)}",
+    )
     assert lab.states(left) == []
     lab.service.end()
 

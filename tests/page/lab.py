@@ -202,5 +202,6 @@ def opened(
         print(f"{page.url}\n{page.locator('body').inner_text()}")  # what a person would have seen
         raise
     finally:
+        page.unroute_all(behavior="ignoreErrors")  # what a route still fetches ends with its page
         context.close()
     assert not wrong, wrong
