@@ -178,15 +178,15 @@ def test_a_node_that_left_its_group_while_a_command_had_it_is_not_measured_on(la
     """The measurement followed the store while the node was away: what it was told then ended with its return."""
     left, right = lab.nodes
     station = lab.service.station
-    station.ask("group", "create", "both", left.uuid, right.uuid)
-    lab.service.start("--measure", "both", "--rate", 20)
+    station.ask("group", "create", "leaving", left.uuid, right.uuid)
+    lab.service.start("--measure", "leaving", "--rate", 20)
     lab.comes(left)
     lab.comes(right)
     words = [sys.executable, "-c", HOLDER, str(station.home), right.uuid]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "True\n"
-        station.ask("group", "remove", "both", right.uuid, left.uuid)
+        station.ask("group", "remove", "leaving", right.uuid, left.uuid)
         until(lambda: lab.states(left)[-1] == "left")  # in the same look at the store
         assert right.uuid in running(lab)["uuids"], "its place is kept for it"
         holder.kill()
