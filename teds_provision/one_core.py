@@ -7,7 +7,7 @@ time for the same work (docs/internals/speed.md).
 The core is one of those that the process may use (``taskset``, ``CPUAffinity=``, a cpuset), of the fastest kind, on
 which others have little to do; every two or three seconds their work is looked at. If they take a core, the threads go
 to a free one, and if they take all, to all: a thread that waits for its turn on one core of a busy machine waits twice
-as long as one that gets the next turn anywhere, and where no core sleeps, none has to be woken. If somebody else gives
+as long as one that gets the next turn anywhere, and where none sleeps, none has to be woken. If another process gives
 the process other cores meanwhile, it stays as it was put. Processes are started in ``with every_core():``, so that they
 get all cores back. Linux alone; where the kernel's figures cannot be read, nothing is changed.
 """
@@ -141,7 +141,7 @@ class OneCore:
         return self._left
 
     def look(self) -> None:
-        """Go where a core is free; stay as placed if somebody else placed the threads."""
+        """Move to a free core; stay if another process has placed the threads."""
         with self._guard:
             if self._left:
                 return
@@ -181,7 +181,7 @@ class OneCore:
         return self._cores if self.core is None else {self.core}
 
     def leave(self) -> None:
-        """Give every thread all cores back that the process had, unless somebody else has placed it."""
+        """Give every thread all cores back that the process had, unless another process has placed it."""
         self._end.set()
         with self._guard:
             if not self._left:

@@ -192,7 +192,7 @@ class History:
         known = self._streams.get(key)
         lost = max(0, block.index - known.expected) if known is not None and known.run == run else 0
         self._streams[key] = _Stream(run, block.index + len(block.time))
-        # What a slow channel sent while nobody looked comes as one block: a ring for the minute would stay for ever.
+        # What a slow channel sent during a pause comes as one block: a ring for the minute would stay for ever.
         if len(block.time) <= _FEW or len(block.time) - 1 <= _SLOW * float(block.time[-1] - block.time[0]):
             self._put_few(block, lost)
         else:

@@ -59,7 +59,7 @@ _Shown = Callable[[int, Identity], object]
 
 
 def _ignore(*_: object) -> None:
-    """Show nobody."""
+    """Show no node."""
 
 
 def _patience(left: float, known: int) -> float:
@@ -304,7 +304,7 @@ class CanPort(MeasuringLink):
     def _everyone(
         self, known: FunctionalAnswers, longest: float, notice: NoticeSink, silence: float, show: _Shown
     ) -> FunctionalAnswers:
-        """Ask everyone, of many until nobody new answers; return who is ``known`` with who answered."""
+        """Ask all nodes, of many until no new one answers; return ``known`` with those that answered."""
         began = time.monotonic()
         found = known
         for number in range(_ROUNDS_OF_MANY):
