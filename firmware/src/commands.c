@@ -96,7 +96,7 @@ static int spare_actuators(const teds_node *node)
     return 0;
 }
 
-/* While a stream runs, plain Read and List beyond one a second get 17, together and over all links. */
+/* While a stream runs, plain Read, List and About beyond one a second get 17, together and over all links. */
 static int hold_strangers_back(teds_node *node)
 {
 #if TEDS_OPERATION
@@ -129,7 +129,10 @@ static int permit_plain_security(teds_node *node, const teds_command *command, c
         return !teds_in_factory(node) && teds_any_on(node, origin->link) ? 0 : -TEDS_WRONG_STATE;
     case TEDS_IDENTIFY: return 0;
     case TEDS_ABOUT: /* by radio a board with a key would be recognised by it */
-        return teds_in_factory(node) || origin->arrival->kind == TEDS_CAN ? 0 : -TEDS_NOT_PERMITTED;
+        if (!teds_in_factory(node) && origin->arrival->kind != TEDS_CAN) {
+            return -TEDS_NOT_PERMITTED;
+        }
+        return hold_strangers_back(node);
     case TEDS_PROVE: return spare_actuators(node);
     case TEDS_RESET:
     case TEDS_LOCATE: return teds_in_factory(node) ? 0 : -TEDS_NOT_PERMITTED;

@@ -192,6 +192,7 @@ class CBench(reference.Bench):
         limits = {**_PREPARED, **self.limits}
         flash: Flash = self.memory.state
         slow = not limits.pop("quick_points", True)
+        firmware = limits.pop("firmware", None)
         room = {} if {"sessions", "streams"} & limits.keys() else {"sessions": 8, "streams": 8}
         assert limits.pop("sessions", 2) == limits.pop("streams", 2) == 2
         if not hasattr(self, "tim"):
@@ -200,6 +201,9 @@ class CBench(reference.Bench):
             self._put: object = None
         node: MeasuringMemoryNode = self.tim  # type: ignore[assignment]
         node.slow(slow)
+        if firmware is not None:
+            report = firmware.about().encode()[1:]
+            node.has_firmware(lambda what, _argument, _octets: report if what == "a" else b"")
         node.connected.clear()
         node.set_channels()
         assert node.start() == 0

@@ -48,6 +48,8 @@ _FIRMWARE: Final = frozenset({Function.ABOUT, Function.LOCATE, Function.MANAGE})
 _SESSION_ALONE: Final = frozenset({Function.CLOSE, Function.MANAGE})
 _IN_FACTORY: Final = frozenset({Function.RESET, Function.LOCATE})
 """Plain commands that only a node without a key runs."""
+_HELD_BACK: Final = frozenset({Function.LIST, Function.ABOUT})
+"""Plain commands of class 128 whose replies cost a stream's time."""
 _PLAIN_ALONE: Final = frozenset({Function.OPEN, Function.SEALED})
 _CHANGES: Final = frozenset(
     {(COMMON, TedsFunction.WRITE), (COMMON, TedsFunction.UPDATE), (SECURITY_CLASS, Function.SET_CAN_ADDRESS)}
@@ -59,7 +61,7 @@ _STORED: Final = _CHANGES | {
 _DURING_UPLOAD: Final = frozenset({(COMMON, TedsFunction.WRITE), (EITHER, OPERATE_FUNCTION)})
 """Commands that an upload of any session delays."""
 _STRANGER_SECONDS: Final = 1.0
-"""While a stream runs, plain Read and List are answered once in so many seconds."""
+"""While a stream runs, plain Read, List and About are answered once in so many seconds."""
 
 
 @dataclass
@@ -119,7 +121,7 @@ class Permission:
             raise CommandRefusedError(Reason.WRONG_STATE)
         if function == Function.PROVE or (function == Function.OPEN and len(payload) == OPEN_OCTETS):
             self._spare_actuators()
-        if function == Function.LIST:
+        if function in _HELD_BACK:
             self._hold_strangers_back()
 
     def _permitted_plain(self, function: Function, origin: Origin) -> None:
@@ -156,7 +158,7 @@ class Permission:
             raise CommandRefusedError(Reason.BUSY)
 
     def _hold_strangers_back(self) -> None:
-        """Refuse plain Read and List beyond one a second with 17 while a stream runs, all links together."""
+        """Refuse plain Read, List and About beyond one a second with 17 while a stream runs, all links together."""
         if self.role is None or not self.role.streams.running:
             return
         now = self.clock()

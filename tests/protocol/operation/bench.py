@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
@@ -110,7 +111,7 @@ class FakeHardware:
 class Bench:
     """One node with hardware and any number of stations by link; real time and ticks run together."""
 
-    def __init__(self, *, teds: dict[BlockId, bytes] | None = None, **limits: int | bool) -> None:
+    def __init__(self, *, teds: dict[BlockId, bytes] | None = None, **limits: Any) -> None:
         self.hardware = FakeHardware()
         own = {(number, 3): channel_teds(facts) for number, facts in self.hardware.channels.items()}
         blocks = {SECURITY: bytes.fromhex(KAT["security_teds"]), **own, **(teds or {})}
@@ -134,7 +135,7 @@ class Bench:
             self.memory,
             lambda: self.hardware.tick / SECOND,
             hardware=self.hardware,
-            **self.limits,  # type: ignore[arg-type]
+            **self.limits,
         )
 
     # -- stations --------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from teds_provision.protocol.messages.firmware import ABOUT, FirmwareReport
 from teds_provision.protocol.messages.frames import (
     Function,
     Reason,
@@ -267,6 +268,16 @@ def test_but_not_if_an_actuator_is_claimed() -> None:
 # -- no stranger stops a motor -----------------------------------------------------------------------------------------
 
 
+class Reporting:
+    """Firmware that reports, and blinks for nobody."""
+
+    def about(self) -> FirmwareReport:
+        return FirmwareReport("board/loadcell", (1, 2, 3), 4)
+
+    def locate(self, seconds: int) -> None:
+        raise AssertionError
+
+
 def long_open(bench: Bench) -> int | None:
     session = StationSession(K, UUID)
     counter = bench.plain(session.request_counter(), "can:f5")
@@ -290,19 +301,20 @@ def test_point_arithmetic_for_strangers_waits_while_an_actuator_is_claimed(quick
 
 
 def test_strangers_read_once_a_second_while_a_stream_runs() -> None:
-    bench = Bench().open().operate(1)
-    assert [bench.plain(READ).ok for _ in range(3)] == [True] * 3
+    bench = Bench(firmware=Reporting()).open().operate(1)
+    assert [bench.plain(command).ok for command in (READ, LIST, ABOUT, READ)] == [True] * 4
     assert bench.send(SubscribeCommand(0, StreamKind.PERIODIC, 1, 0, 100 * MS, 0, (1,)).command()).ok
-    asked = [bench.plain(READ), bench.plain(LIST, "nfc"), bench.plain(READ, "can:f2")]
-    assert [reply.reason for reply in asked] == [None, Reason.BUSY, Reason.BUSY], "together and over all links"
+    asked = [bench.plain(READ), bench.plain(LIST, "nfc"), bench.plain(READ, "can:f2"), bench.plain(ABOUT, "can:f3")]
+    assert [reply.reason for reply in asked] == [None, *[Reason.BUSY] * 3], "together and over all links"
     bench.later(999 * MS)
     assert bench.plain(LIST).reason == Reason.BUSY
+    assert bench.plain(ABOUT, "nfc").reason == Reason.NOT_PERMITTED, "which takes no stranger's turn"
     bench.later(1 * MS)
-    assert bench.plain(LIST).ok
-    assert bench.send(READ).ok, "inside the session"
+    assert bench.plain(ABOUT).ok, "a refused one does not begin the second again"
+    assert bench.plain(READ).reason == Reason.BUSY
+    assert [bench.send(command).ok for command in (READ, LIST, ABOUT)] == [True] * 3, "inside the session"
     bench.idle()
-    assert bench.plain(READ).ok
-    assert bench.plain(READ).ok
+    assert [bench.plain(command).ok for command in (READ, LIST, ABOUT, READ)] == [True] * 4
 
 
 # -- the rest ----------------------------------------------------------------------------------------------------------
