@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from teds_provision.errors import AddressConflictError, LinkError, NoNodeError
 from teds_provision.links.discovery import Sighting
@@ -41,7 +43,8 @@ class Presence:
     _announced: dict[bytes, tuple[Place, Callable[[], None], Callable[[], None]]] = field(default_factory=dict)
     _placed: dict[Place, set[bytes]] = field(default_factory=dict)  # of those the nodes at each place,
     _digested: dict[int, set[bytes]] = field(default_factory=dict)  # and by the CRC that an Announce has of a UUID
-    _missing: dict[bytes, int] = field(default_factory=dict)
+    _missing: Counter[bytes] = field(default_factory=Counter)  # of the nodes that threads wait for: how many do
+    _missing_crcs: Counter[int] = field(default_factory=Counter)  # the same by the CRC that an Announce has of a UUID
     _unseen: set[bytes] = field(default_factory=set)  # those that a thread waited for, and that were not seen since
     _welcome: frozenset[int] = frozenset()  # CRCs of UUIDs that are measured as soon as they come
     _reported: dict[str, float] = field(default_factory=dict)  # what was noted, and when
@@ -122,7 +125,7 @@ class Presence:
     def is_awaited(self, announce: Announce) -> bool:
         """Return True if a thread waits for the node that this claims to be."""
         with self._turn:
-            return any(uuid_crc(uuid) == announce.crc for uuid in self._missing)
+            return announce.crc in self._missing_crcs
 
     def expect(self, uuids: Iterable[bytes]) -> None:
         """Name nodes to be asked at once when they announce themselves, although no thread waits for one."""
@@ -154,24 +157,30 @@ class Presence:
     def find(self, uuid: bytes, *, seconds: float, stop: threading.Event, fresh: float = 0.0) -> Sighting:
         """Wait for a node that was seen after ``fresh`` (time.monotonic); raises NoNodeError, AddressConflictError."""
         until = time.monotonic() + seconds
-        with self._turn:
-            self._missing[uuid] = self._missing.get(uuid, 0) + 1
-            try:
-                while True:
-                    found = self._best(uuid, fresh)
-                    if found is not None:
-                        return found
-                    if uuid not in self._unseen:
-                        self._unseen.add(uuid)
-                        self.gone += 1
-                    left = until - time.monotonic()
-                    if left <= 0 or stop.is_set():
-                        raise self._nobody(uuid, seconds)
-                    self._turn.wait(min(left, 0.2))
-            finally:
-                self._missing[uuid] -= 1
-                if not self._missing[uuid]:
-                    del self._missing[uuid]
+        with self._turn, self._waited_for(uuid):
+            while True:
+                found = self._best(uuid, fresh)
+                if found is not None:
+                    return found
+                if uuid not in self._unseen:
+                    self._unseen.add(uuid)
+                    self.gone += 1
+                left = until - time.monotonic()
+                if left <= 0 or stop.is_set():
+                    raise self._nobody(uuid, seconds)
+                self._turn.wait(min(left, 0.2))
+
+    @contextmanager
+    def _waited_for(self, uuid: bytes) -> Iterator[None]:
+        """Count a thread that waits for a node; it has the turn at the beginning and at the end."""
+        crc = uuid_crc(uuid)
+        self._missing[uuid] += 1
+        self._missing_crcs[crc] += 1
+        try:
+            yield
+        finally:
+            _take_one(self._missing, uuid)
+            _take_one(self._missing_crcs, crc)
 
     def search_again(self, sighting: Sighting) -> None:
         """Record that it was not that node, or is gone from there, and search again."""
@@ -230,6 +239,13 @@ class Presence:
             hint="Check its power, the bit rate and the address; teds-provision identify --via can lists the"
             " nodes that answer.",
         )
+
+
+def _take_one(counts: Counter[Any], key: object) -> None:
+    """Count one less; what is not counted any more goes."""
+    counts[key] -= 1
+    if not counts[key]:
+        del counts[key]
 
 
 def _discard(index: dict[_Key, set[bytes]], key: _Key, uuid: bytes) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +20,9 @@ from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.measure.sinks.names import Topics
 from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
-from tests.measure.sinks.parts import ANGLE
+from teds_provision.teds.units import parse_units
+from tests.measure.sinks.parts import ANGLE, block
+from tests.measure.sinks.test_live import Carrier
 from tests.work import steps_of
 
 SIZES = (20, 200, 2000)
@@ -60,6 +63,22 @@ def test_an_announce() -> None:
         def announce() -> None:
             presence.announced("can:x", Announce(7, 2, uuid_crc(uuid_of(9))))
             assert sorted(noticed) == [uuid_of(7), uuid_of(9)], "by its address, and by its digest"
+
+        return announce
+
+    flat(beside)
+
+
+def test_an_announce_while_nodes_are_waited_for() -> None:
+    def beside(size: int) -> Callable[[], object]:
+        presence, waits = Presence(), ExitStack()
+        for number in range(size):
+            waits.enter_context(presence._waited_for(uuid_of(number)))
+
+        def announce() -> None:
+            assert presence.is_awaited(Announce(9, 2, uuid_crc(uuid_of(size - 1))))
+            assert not presence.is_awaited(Announce(9, 2, uuid_crc(uuid_of(size))))
+            assert waits
 
         return announce
 
@@ -135,3 +154,41 @@ def test_a_stranger_that_gives_its_name_up_is_announced_again() -> None:
     sink._learn((replace(facts_of(2), node="node 1"),))
     assert sink._left == ["node_1"]
     assert {uuid for uuid, _ in sink._owed_entities} == {uuid_of(1).hex(), uuid_of(2).hex()}
+
+
+@pytest.mark.parametrize("kinds", [("sensor",), ("actuator", "sensor")], ids=["a sensor", "a joint"])
+def test_the_topics_of_a_node_that_joins_ros(kinds: tuple[str, ...]) -> None:
+    def channels(number: int) -> tuple[ChannelFacts, ...]:
+        radians = parse_units("rad")
+        return tuple(replace(facts_of(number), number=1 + n, kind=kind, units=radians) for n, kind in enumerate(kinds))
+
+    def beside(size: int) -> Callable[[], object]:
+        sink = Carrier([])
+        sink._prepare((), StationFacts("bench", nodes=nodes(size), each_node=True))
+        for number in range(size):
+            sink._process_item(channels(number))
+        sink._process_item(block([[1]], uuid=uuid_of(3).hex()))
+
+        def join() -> None:
+            sink._process_item(channels(size))
+            assert f"/bench/node_{size}/teds" in sink.words
+            assert list(sink._scalars) == [uuid_of(3).hex()], "what another node's topics are is not asked anew"
+            assert (len(sink._joints) == size + 1) is (len(kinds) > 1)
+
+        return join
+
+    flat(beside)
+
+
+def test_a_joint_that_gets_another_name_is_found_under_it_alone() -> None:
+    def facts(number: int, *chosen: tuple[int, str]) -> ChannelFacts:
+        return facts_of(number, kind="actuator", units=parse_units("rad"), chosen=chosen)
+
+    sink = Carrier([])
+    sink._prepare((facts(0), facts(1), facts(2)), StationFacts("bench", nodes=nodes(2), each_node=True))
+    sink._process_item((facts(1, (0, "arm")),))
+    assert [joint.name for joint in sink._joints] == ["arm", "node_0", "node_2"]
+    sink._process_item((facts(1, (0, "leg")), facts(2, (0, "arm"))))
+    assert [(joint.name, joint.uuid) for joint in sink._joints] == [
+        ("arm", uuid_of(2).hex()), ("leg", uuid_of(1).hex()), ("node_0", uuid_of(0).hex()),
+    ]  # fmt: skip

@@ -1369,6 +1369,13 @@ PATTERNS = (
         "tests/measure/sinks/test_live.py",
     ),
     Pattern(
+        "a datasheet on a topic follows the name that its node got by another one",
+        "TopicSink._learn",
+        "uuid not in own",
+        "False",
+        "tests/measure/sinks/test_live.py",
+    ),
+    Pattern(
         "a node that was given back is lent no more",
         "MeasurementJob.resume_node",
         "self.lent.discard(uuid)",

@@ -24,7 +24,8 @@ import json
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from bisect import bisect_left, insort
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -91,15 +92,17 @@ class TopicSink(ThreadedSink):
         super().__init__(name)
         self._commands = commands
         self._station = StationFacts("")
-        self._facts: dict[tuple[str, int], ChannelFacts] = {}
+        # By node, as those below: a node that joins costs no look at the others.
+        self._facts: dict[str, dict[int, ChannelFacts]] = {}
         self._topics = Topics(self._station)
-        self._scalars: dict[tuple[str, int, tuple[int, ...]], _Scalars] = {}
+        self._scalars: dict[str, dict[tuple[int, tuple[int, ...]], _Scalars]] = {}
         self._reports: dict[str, NodeReport] = {}
         self._arrays: dict[tuple[tuple[str, int], ...], float] = {}  # time of the last row that went out
-        self._labels: dict[tuple[tuple[str, int], ...], list[str]] = {}
-        self._joints: list[Joint] = []
+        self._labels: dict[str, dict[tuple[tuple[str, int], ...], list[str]]] = {}  # by GroupRows.group
+        self._joints: list[Joint] = []  # by name; a new list for each change, as other threads read it
+        self._joints_of: dict[str, list[Joint]] = {}
         self._newest: dict[tuple[str, int], float] = {}  # of what joints need
-        self._described: set[str] = set()  # nodes whose datasheet is on a topic
+        self._described: dict[str, str] = {}  # topic on which a node's datasheet is
         self._sent = 0
         self._second = 0.0
         self.refused_commands = 0
@@ -160,17 +163,26 @@ class TopicSink(ThreadedSink):
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
         self._station = station
         self._topics = Topics(station)
-        self._facts = {channel_facts.key: channel_facts for channel_facts in facts}
+        self._take_facts(facts)
         self._topics.learn(facts)
+        self._find_joints(self._facts)
 
     def _begin(self) -> None:
-        self._announce(tuple(self._facts.values()))
+        self._announce(self._every_fact())
+
+    def _every_fact(self) -> list[ChannelFacts]:
+        return [facts for channels in self._facts.values() for facts in channels.values()]
+
+    def _take_facts(self, facts: Iterable[ChannelFacts]) -> None:
+        for channel_facts in facts:
+            self._facts.setdefault(channel_facts.uuid, {})[channel_facts.number] = channel_facts
 
     def write(self, block: Block) -> None:
         """Queue samples of one stream; those before their topics are due are left out here."""
         if self._station.scalar_rate <= 0:
             return
-        scalars = self._scalars.get((block.uuid, block.stream, block.channels))
+        streams = self._scalars.get(block.uuid)
+        scalars = None if streams is None else streams.get((block.stream, block.channels))
         if scalars is None or time.monotonic() >= scalars.due:
             super().write(block)
 
@@ -183,25 +195,45 @@ class TopicSink(ThreadedSink):
             self._announce(changed)
 
     def _learn(self, item: NodeReport | ClockSet | tuple[ChannelFacts, ...]) -> list[ChannelFacts]:
-        """Keep a report or facts; gives the facts that are new."""
+        """Keep a report or facts; gives the facts that are new, and those of nodes that have another name now."""
         if isinstance(item, ClockSet):
             self._arrays.clear()  # else no row would go out until a clock that was put back had caught up
             return []
         if isinstance(item, NodeReport):
             self._reports[item.uuid] = item
             return []
-        changed = [facts for facts in item if self._facts.get(facts.key) != facts]
-        self._facts.update((facts.key, facts) for facts in changed)
-        before = {uuid: self._topics.of_node(uuid, "teds") for uuid in self._described}
-        self._topics.learn(changed)
-        for uuid, topic in before.items():
-            if topic != self._topics.of_node(uuid, "teds"):  # under another name: the old sheet must not be found
-                self._described.discard(uuid)
+        changed = [facts for facts in item if self._facts.get(facts.uuid, {}).get(facts.number) != facts]
+        self._take_facts(changed)
+        touched, own = self._topics.learn(changed), {facts.uuid for facts in changed}
+        for uuid in touched:
+            topic = self._described.get(uuid)
+            if topic is not None and topic != self._topics.of_node(uuid, "teds"):  # the old sheet must not be found
+                del self._described[uuid]
                 self._retire(topic)
-        self._joints = joints_of(self._facts.values(), self._topics)
-        self._labels.clear()
-        self._scalars.clear()
+                if uuid not in own:
+                    changed += self._facts[uuid].values()
+            self._scalars.pop(uuid, None)
+            self._labels.pop(uuid, None)
+        if not self._station.each_node:
+            self._labels.clear()
+        self._find_joints(touched)
         return changed
+
+    def _find_joints(self, uuids: Iterable[str]) -> None:
+        """Find the joints of some nodes anew."""
+        found = {uuid: joints_of(self._facts.get(uuid, {}).values(), self._topics) for uuid in uuids}
+        changed = [uuid for uuid, joints in found.items() if joints != self._joints_of.get(uuid, [])]
+        if not changed:
+            return
+        joints = self._joints.copy()
+        for uuid in changed:
+            for joint in self._joints_of.pop(uuid, ()):
+                del joints[bisect_left(joints, joint.name, key=_name_of)]
+        for uuid in changed:
+            self._joints_of[uuid] = found[uuid]
+            for joint in found[uuid]:
+                insort(joints, joint, key=_name_of)
+        self._joints = joints
 
     def _announce(self, facts: Sequence[ChannelFacts]) -> None:
         """Publish metadata, parameters and command topics of channels; again after a reconnection."""
@@ -209,18 +241,14 @@ class TopicSink(ThreadedSink):
         for array in () if self._station.test_pattern else map(self._array_topic, sorted(whole)):
             for topic in (array, f"{array}/age"):
                 self._advertise(topic, JOINT_STATE)
-        self._joints = joints_of(self._facts.values(), self._topics)
         if self._joints and not self._station.test_pattern:
             self._advertise(self._topics.of_station(STATES), JOINT_STATE)
             if self._commands is not None:
                 self._listen_joints(self._topics.of_station(COMMANDS))
-        by_node: dict[str, list[ChannelFacts]] = {channel_facts.uuid: [] for channel_facts in facts}
-        for channel_facts in self._facts.values():
-            if channel_facts.uuid in by_node:
-                by_node[channel_facts.uuid].append(channel_facts)
-        for uuid, channels in by_node.items():
-            self._described.add(uuid)
-            self._latched(self._topics.of_node(uuid, "teds"), json.dumps(self._metadata(uuid, channels)))
+        for uuid in dict.fromkeys(channel_facts.uuid for channel_facts in facts):
+            channels = list(self._facts[uuid].values())
+            topic = self._described[uuid] = self._topics.of_node(uuid, "teds")
+            self._latched(topic, json.dumps(self._metadata(uuid, channels)))
             for channel_facts in channels:
                 self._parameter(self._topics.channel(*channel_facts.key), facts_as_json(channel_facts))
                 if channel_facts.kind == "actuator" and self._commands is not None:
@@ -247,10 +275,10 @@ class TopicSink(ThreadedSink):
         # A test pattern is no measurement: it goes to recorders, which mark it, and to no topic, which cannot.
         if rate <= 0 or block.test_pattern or not len(block.time):
             return
-        key = block.uuid, block.stream, block.channels
-        if key not in self._scalars:
-            self._scalars[key] = self._scalars_of(block)
-        scalars = self._scalars[key]
+        streams, key = self._scalars.setdefault(block.uuid, {}), (block.stream, block.channels)
+        if key not in streams:
+            streams[key] = self._scalars_of(block)
+        scalars = streams[key]
         now = time.monotonic()
         if now < scalars.due:
             return
@@ -277,7 +305,8 @@ class TopicSink(ThreadedSink):
 
     def _scalars_of(self, block: Block) -> _Scalars:
         channels = []
-        known = [self._facts.get((block.uuid, n), ChannelFacts(block.uuid, "", n, "")) for n in block.channels]
+        own = self._facts.get(block.uuid, {})
+        known = [own.get(number) or ChannelFacts(block.uuid, "", number, "") for number in block.channels]
         for column, facts in enumerate(known):
             if not is_range(facts):
                 topic = self._topics.channel(block.uuid, facts.number)
@@ -307,11 +336,11 @@ class TopicSink(ThreadedSink):
         if rows.test_pattern:
             return
         topic = self._array_topic(rows.group)
-        names = self._labels.get(rows.channels)
+        labels = self._labels.setdefault(rows.group, {})
+        names = labels.get(rows.channels)
         if names is None:
             prefix = f"/{self._topics.station}/"
-            names = [self._topics.channel(*key).removeprefix(prefix) for key in rows.channels]
-            self._labels[rows.channels] = names
+            names = labels[rows.channels] = [self._topics.channel(*key).removeprefix(prefix) for key in rows.channels]
         last = self._arrays.get(rows.channels, -math.inf)
         for k, stamp in enumerate(rows.time.tolist()):
             if stamp - last < 1 / ROWS - 1e-6:
@@ -361,15 +390,16 @@ class TopicSink(ThreadedSink):
 
     def _statuses(self, rate: float) -> list[DiagnosticEntry]:
         found = [self._status(report) for report in self._reports.values()]
-        for uuid in sorted({facts.uuid for facts in self._facts.values() if facts.unsigned}):
+        every = self._every_fact()
+        for uuid in sorted({facts.uuid for facts in every if facts.unsigned}):
             name = f"{self._topics.node(uuid)}: datasheet"
             found.append(DiagnosticEntry(WARN, name, "unsigned: raw values only, not published on any topic", uuid))
-        for uuid in sorted({facts.uuid for facts in self._facts.values() if facts.unverified}):
+        for uuid in sorted({facts.uuid for facts in every if facts.unverified}):
             name = f"{self._topics.node(uuid)}: datasheet"
             found.append(
                 DiagnosticEntry(WARN, name, "unverified: values are calibrated by an unsigned datasheet", uuid)
             )
-        for facts in self._facts.values():
+        for facts in every:
             if facts.overdue:
                 name = f"{self._topics.node(facts.uuid)}: calibration of {facts.label}"
                 found.append(DiagnosticEntry(WARN, name, f"due since {facts.due}", facts.uuid))
@@ -403,3 +433,7 @@ class TopicSink(ThreadedSink):
             self.refused_commands += 1
             return
         self._commands(SetPointCommand(uuid, channel, value, time.monotonic()))
+
+
+def _name_of(joint: Joint) -> str:
+    return joint.name

@@ -385,6 +385,12 @@ def test_a_node_under_another_name_leaves_no_datasheet_under_the_old_one() -> No
     assert list(sink.words) == ["/bench/left_arm/teds"]
 
 
+def test_a_namesake_that_joins_leaves_each_datasheet_under_the_name_that_its_node_has_now() -> None:
+    other = "f" * 20
+    sink = carried([[replace(ANGLE, uuid=other)]], facts=[ANGLE], station=replace(STATION, nodes={}))
+    assert list(sink.words) == [f"/bench/arm_{other[:8]}/teds", f"/bench/arm_{ARM[:8]}/teds"]
+
+
 def test_an_unsigned_datasheet_is_reported_in_diagnostics_and_metadata() -> None:
     bare = ChannelFacts(ARM, "arm", 1, "angle", unsigned=True)
     sink = carried([block([[1]], [[np.nan]], [[False]])], facts=[bare, FORCE])

@@ -156,7 +156,7 @@ class ChildSink(TopicSink):
                 self._announced = True
                 self._set_state("running")
                 self._pause = BACK_OFF[0]
-                self._announce(tuple(self._facts.values()))
+                self._announce(self._every_fact())
             return self._child is not None
         if child is not None:
             self._lost(self._cause(child.returncode))
