@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
@@ -71,18 +71,18 @@ def test_an_announce() -> None:
 
 def test_an_announce_while_nodes_are_waited_for() -> None:
     def beside(size: int) -> Callable[[], object]:
-        presence, waits = Presence(), ExitStack()
+        presence = Presence()
         for number in range(size):
-            waits.enter_context(presence._waited_for(uuid_of(number)))
+            stack.enter_context(presence._waited_for(uuid_of(number)))
 
         def announce() -> None:
             assert presence.is_awaited(Announce(9, 2, uuid_crc(uuid_of(size - 1))))
             assert not presence.is_awaited(Announce(9, 2, uuid_crc(uuid_of(size))))
-            assert waits
 
         return announce
 
-    flat(beside)
+    with ExitStack() as stack:
+        flat(beside)
 
 
 def described(size: int, names: dict[tuple[str, int], str]) -> Measurement:
@@ -157,7 +157,7 @@ def test_a_stranger_that_gives_its_name_up_is_announced_again() -> None:
 
 
 @pytest.mark.parametrize("kinds", [("sensor",), ("actuator", "sensor")], ids=["a sensor", "a joint"])
-def test_the_topics_of_a_node_that_joins_ros(kinds: tuple[str, ...]) -> None:
+def test_the_topics_of_a_node_that_joins_ros(kinds: tuple[Literal["actuator", "sensor"], ...]) -> None:
     def channels(number: int) -> tuple[ChannelFacts, ...]:
         radians = parse_units("rad")
         return tuple(replace(facts_of(number), number=1 + n, kind=kind, units=radians) for n, kind in enumerate(kinds))
